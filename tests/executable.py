@@ -26,7 +26,7 @@ def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[s
     What is to be refused is refused in this process, which saves the start of another one.
     """
     words = [str(EXECUTABLE), *map(str, arguments)]
-    if code in (1, 2):
+    if code in (1, 2, 70):
         done = _here(words)
     else:
         done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)

@@ -200,16 +200,18 @@ def unwrapped(angle: FloatArray, turn: float = TURN) -> FloatArray:
 
 
 def wraps(angle: FloatArray) -> IntArray:
-    """Rows in which an angle [rad] begins a turn anew: it jumps by nearly one, but else goes on as around.
+    """Rows in which an angle [rad] begins a turn, or two, anew: it jumps by nearly that, but else goes on as around.
 
     A step of nearly a turn from rest, and steps at random, are none.
     """
     rows = np.flatnonzero(np.isfinite(angle))
-    if len(rows) < 4 or np.ptp(angle[rows]) > TURN * (1.0 + 1e-6):
+    turns = math.ceil(np.ptp(angle[rows]) / TURN - 1e-6) if len(rows) > 3 else 0
+    if turns not in (1, 2):
         return rows[:0]
     step = np.diff(angle[rows])
-    jumps = np.flatnonzero(np.abs(step) > _JUMP)
-    rest = np.pad(np.abs(step - TURN * np.round(step / TURN)), 2, mode="edge")
+    jumps = np.flatnonzero(np.abs(step) > turns * _JUMP)
+    turn = turns * TURN
+    rest = np.pad(np.abs(step - turn * np.round(step / turn)), 2, mode="edge")
     beside = np.max([rest[jumps + place] for place in (0, 1, 3, 4)], axis=0)
     true = (beside < _STEP) & (rest[jumps + 2] <= _ALIKE * beside + 1.0 / DEG)
     return rows[jumps + 1] if len(jumps) and true.mean() > 0.9 else rows[:0]

@@ -71,3 +71,23 @@ def test_rows_that_are_left_out_are_on_the_screen_and_in_json(log: Path) -> None
     summary = json.loads((log / "result/summary.json").read_text(encoding="utf-8"))
     assert summary["commands"] == {"used": 1132}
     assert summary["rows"]["camera"] == {"fused": 898, "rejected": 15, "duplicate": 1, "invalid": 1}
+
+
+@pytest.mark.parametrize("command", ["init", "fuse"])
+def test_an_exception_that_nobody_foresaw_is_a_line_for_a_report(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It names what was being read, the exception, where it happened and what to send; exit code 70."""
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("float division\nby zero")
+
+    monkeypatch.setattr("pumafuse.discovery.contents._part", broken)
+    for name in ("command", "encoder"):
+        (tmp_path / f"{name}.csv").write_text("time_s,x_mm\n0,1\n1,2\n")
+    done = pumafuse(command, tmp_path, "-o", tmp_path / "out", code=70)
+    (line,) = done.stderr.splitlines()
+    assert f"{command} {tmp_path} -o {tmp_path / 'out'}: unexpected ZeroDivisionError: float division by zero" in line
+    assert f"reading {tmp_path / 'command.csv'}." in line
+    assert "please report it with this line and the log" in line and "discovery/contents.py:" in line
+    assert done.stdout == "" and not (tmp_path / "out").exists()

@@ -688,7 +688,8 @@ def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
     "column",
     [
         *("speed_m_s", "velocity[0]", "orientation.x", "frame", "quality", "twist.linear.x", "actual_qd_0"),
-        *("current_1", "qx", "qvel_0", "field.velocity0", "vx", "setpoint.vz", "ay"),
+        *("current_1", "qx", "qvel_0", "field.velocity0", "vx", "setpoint.vz", "ay", "az", "motor_amps", "thrust_2"),
+        *("moment[1]", "pwm.3", "delta_x_mm", "sd_x_mm", "rel_yaw_deg", "T [°C]", "success_rate", "delta_q_reset[0]"),
     ],
 )
 def test_what_is_no_position_is_left_out(column: str) -> None:
@@ -696,10 +697,89 @@ def test_what_is_no_position_is_left_out(column: str) -> None:
     assert names.no_position(column)
 
 
-@pytest.mark.parametrize("column", ["q_d_0", "qd_0", "current_position.x", "current_x_mm", "ax1", "v_x"])
+@pytest.mark.parametrize(
+    "column",
+    [
+        *("q_d_0", "qd_0", "current_position.x", "current_x_mm", "ax1", "v_x"),
+        *("az_deg", "az [deg]", "ay_cmd_rad", "load_x_mm", "index_mcp_deg", "vx_mm.1"),
+    ],
+)
 def test_what_may_be_a_position_is_not(column: str) -> None:
-    """A desired joint, and where the tool is at present."""
+    """A desired joint, where the tool is at present, and whatever has a unit of positions."""
     assert not names.no_position(column)
+
+
+@pytest.mark.parametrize(("column", "is_time"), [("t_deg", False), ("t", True), ("t_s", True), ("stamp [mm]", False)])
+def test_a_unit_of_positions_is_of_no_clock(column: str, is_time: bool) -> None:
+    """A robot's axis may be called T."""
+    assert names.is_time(column) is is_time
+
+
+def of_roles(found: Survey) -> list[list[str]]:
+    """The columns of the commands and of each sensor."""
+    assert found.roles is not None
+    streams = (found.roles.command, *found.roles.sensors)
+    return [[one.column for (one,) in stream.axes.values()] for stream in streams]
+
+
+@pytest.mark.parametrize(
+    ("desired", "measured"),
+    [
+        ("j_d[{}]", "j[{}]"),
+        ("q_d{}", "q{}"),
+        ("theta_d_{}", "theta_{}"),
+        ("q_d{}_rad", "q{}_rad"),
+        ("q_d[{}]", "s.q[{}]"),
+    ],
+)
+def test_desired_values_are_the_commands_of_those_beside_them(desired: str, measured: str, tmp_path: Path) -> None:
+    """Elements of lists and numbered names, with rates and a constant between them."""
+    t, u, _, _ = recorded()
+    z = path(t - LAG) + np.random.default_rng(2).normal(0.0, 1e-4, u.shape)
+    columns = {"t_s": t, "success_rate": np.ones(len(t))}
+    columns |= {measured.format(n): z[:, n] for n in range(3)} | {f"dq[{n}]": np.gradient(u[:, n], t) for n in range(3)}
+    write(tmp_path / "log.csv", columns | {desired.format(n): u[:, n] for n in range(3)})
+    found = survey(tmp_path / "log.csv")
+    assert of_roles(found) == [[name.format(n) for n in range(3)] for name in (desired, measured)]
+    assert [one.correlation > 0.99 for one in found.relations.values()] == [True] * 3
+
+
+def test_of_two_sources_of_desired_values_the_earlier_one_is_the_commands(tmp_path: Path) -> None:
+    """A header that is there twice: the second one is sent a row before the first one acts."""
+    t, u, _, _ = recorded()
+    z = path(t - LAG) + np.random.default_rng(2).normal(0.0, 1e-4, u.shape)
+    header = ["t_s", *(f"{name}[{n}]" for name in ("state.p", "p_d", "p_d") for n in range(3))]
+    rows = np.column_stack([t, z, path(t - 0.01), u])
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header=",".join(header), comments="", fmt="%.9f")
+    found = survey(tmp_path / "log.csv")
+    assert of_roles(found) == [[f"p_d[{n}].1" for n in range(3)], [f"state.p[{n}]" for n in range(3)]]
+    assert {axis for _, axis in found.relations} == {"joint0", "joint1", "joint2"}
+
+
+def test_torques_and_attitudes_that_move_alike_are_no_sensors(tmp_path: Path) -> None:
+    """A torque follows one axis well and the others badly; four columns of length 1 are a quaternion."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    turned = np.column_stack([0.1 * u, np.sqrt(1.0 - (0.01 * u**2).sum(axis=1))])
+    write(log / "JQ_com.csv", {"t_s": t, **{f"p{n}": u[:, n] for n in range(3)}})
+    write(log / "JQ_state.csv", {"t_s": s, **{f"p{n}": z[:, n] for n in range(3)}})
+    write(log / "MT.csv", {"t_s": s, **{f"p{n}": [-9.0, 30.0, 2.0][n] * (z[:, n] - u[:, 0]) for n in range(3)}})
+    write(log / "attitude.csv", {"t_s": t, **{f"o[{n}]": turned[:, n] for n in range(4)}})
+    found = survey(log)
+    assert of_roles(found) == [["p0", "p1", "p2"]] * 2
+    assert found.roles is not None and [one.name for one in found.roles.sensors] == ["JQ_state"]
+    assert {why for part in found.parts for why in part.left_out.values()} == {"of a quaternion"}
+
+
+@pytest.mark.parametrize("nested", [[["hip", "Knee", "lArmYaw"]], {"axes": {"hip": 0, "Knee": 1, "lArmYaw": 2}}])
+def test_names_of_lerobot_are_found_where_converters_write_them(nested: Any, tmp_path: Path) -> None:
+    """A list in a list, or a table of places; in radians, as they are joints."""
+    lerobot(tmp_path / "set")
+    info = {"features": {"action": {"names": nested}, "observation.state": {"names": nested}}}
+    (tmp_path / "set" / "meta" / "info.json").write_text(json.dumps(info))
+    run = survey(tmp_path / "set").run
+    assert run.kinds == dict.fromkeys(("hip", "Knee", "lArmYaw"), "angle")
 
 
 def test_doubts_are_said_with_their_numbers(tmp_path: Path) -> None:

@@ -294,11 +294,15 @@ def within(yaw: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("rate", [-200.0, -60.0, 45.0, 600.0])
 @pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_angles_that_begin_anew_are_known(rate: float, noise: float) -> None:
-    """Slowly and fast, also where noise goes to and fro across the turn: every row in which a turn is counted."""
+@pytest.mark.parametrize("turns", [1, 2])
+def test_angles_that_begin_anew_are_known(rate: float, noise: float, turns: int) -> None:
+    """Slowly and fast, also where noise goes to and fro across the turn: every row in which a turn is counted.
+
+    Some drivers count two turns.
+    """
     time = np.arange(500) * T
     whole = 100.0 + rate * time + 25.0 * np.sin(3.0 * time) + noise * np.random.default_rng(5).normal(size=500)
-    rows = wraps(within(whole) * DEG)
+    rows = wraps(turns * within(whole) * DEG)
     counted = np.flatnonzero(np.diff(np.floor((whole + 180.0) / 360.0))) + 1
     assert rows.tolist() == counted.tolist() and len(rows) > 0
     np.testing.assert_allclose(np.diff(unwrapped(within(whole) * DEG)), np.diff(whole) * DEG, atol=1e-9)

@@ -412,15 +412,15 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(
     assert capfd.readouterr() == ("", "")
 
 
-def test_two_columns_of_one_name_are_in_the_way_of_nobody_else(tmp_path: Path) -> None:
-    """It is said that none of them is used, and who asks for one is refused; the others are read."""
+def test_the_second_column_of_a_name_gets_a_number(tmp_path: Path) -> None:
+    """As pandas counts them; it is said, and a unit is known with the number, too."""
     path = tmp_path / "log.csv"
-    path.write_text("t_s,x_mm,q,q,,\n0,1,2,3,4,5\n")
+    path.write_text("t_s,x_mm,q,q,,,q,x_mm\n0,1,2,3,4,5,6,7\n")
     table = tables.read(path)
-    assert table.numbers("x_mm")[0].tolist() == [1e-3]
-    assert table.notes == ("log.csv: two columns are named 'q': neither is used",)
-    assert list(table.columns) == ["t_s", "x_mm", "column 5", "column 6"]
-    assert "two columns are named 'q'" in refusal(lambda: table.plain("q"))
+    assert [table.numbers(name)[0].tolist() for name in ("x_mm", "x_mm.1")] == [[1e-3], [7e-3]]
+    assert [table.plain(name)[0].tolist() for name in ("q", "q.1", "q.2")] == [[2], [3], [6]]
+    assert table.notes == ("log.csv: headers that are there twice: q, x_mm; the second of each is called .1",)
+    assert list(table.columns) == ["t_s", "x_mm", "q", "q.1", "column 5", "column 6", "q.2", "x_mm.1"]
 
 
 @pytest.mark.parametrize("rest", ["0", "0,000"])

@@ -3,6 +3,7 @@
 import atexit
 import gc
 import os
+import shlex
 import signal
 import sys
 import warnings
@@ -12,7 +13,7 @@ from typing import Annotated, Literal
 import typer
 from typer import Argument, BadParameter, Option
 
-from ..errors import PumafuseError, PumafuseWarning
+from ..errors import PumafuseError, PumafuseWarning, printable
 
 # With matrices of 5 by 5 the threads of a BLAS only wait for each other, ten times as long on a busy machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -386,7 +387,8 @@ def demo(
 def main() -> None:
     """Run the command line.
 
-    Exit codes: 0 done, 1 data or configuration is wrong, 2 usage, 3 a check asked for failed, 130 interrupted.
+    Exit codes: 0 done, 1 data or configuration is wrong, 2 usage, 3 a check asked for failed, 70 a fault of pumafuse
+    itself (sysexits.h: EX_SOFTWARE), 130 interrupted.
     """
     warnings.showwarning = _one_line
     warnings.simplefilter("always", PumafuseWarning)
@@ -413,6 +415,34 @@ def main() -> None:
             typer.echo(f"pumafuse: {error.filename or 'standard output'}: {error.strerror}", err=True)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what its buffer holds would fail once more at exit
         sys.exit(1)
+    except Exception as error:
+        typer.echo(f"pumafuse: {_unexpected(error)}", err=True)
+        sys.exit(70)
+
+
+def _unexpected(error: Exception) -> str:
+    """What to say of an exception that nobody foresaw: one line that tells what was being read, and where it happened.
+
+    That is the innermost file or folder that a function was called with.
+    """
+    import traceback
+    from importlib.metadata import version
+
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    given = [next((one for one in frame.f_locals.values() if isinstance(one, Path)), None) for frame in frames]
+    read = next((f", reading {path}" for path in reversed(given) if path is not None and path.exists()), "")
+    package = Path(__file__).parents[1]
+    where = [
+        f"{Path(one.filename).relative_to(package)}:{one.lineno}"
+        for one in traceback.extract_tb(error.__traceback__)
+        if Path(one.filename).is_relative_to(package)
+    ]
+    return printable(
+        f"{shlex.join(sys.argv[1:])}: unexpected {type(error).__name__}: {error}{read}. This is a fault of pumafuse:"
+        f" please report it with this line and the log, or a part that shows it ({version('pumafuse')};"
+        f" {', '.join(where)})",
+        2000,
+    )
 
 
 def _end(number: int, _frame: object) -> None:

@@ -35,6 +35,7 @@ _TEXTS = (".txt", ".dat", ".lvm")  # tables, too; in a folder they may be anythi
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
 _FEWEST_ROWS = 10
+_UNIT = 1e-3  # from 1, of the length of a quaternion in a text
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
 _MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
@@ -208,23 +209,22 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
     signals, left_out, joints, times = list[Signal](), dict[str, str](), _joints(table), list[str]()
     counts = {name for name in table.columns if _counts(table, name) is not None}
     for path, where in product(_numeric_paths(table), _axes_in_rows(table)):
-        name = _called(path, where)
+        name, listed = _called(path, where), labels.get(leaf(path), [])
         if path in where:
             continue
         if names.is_time(path):
             times.append(path)
         elif path in counts:
             left_out[path] = "rises evenly: a count or a clock"
-        elif why := names.no_position(name):
+        elif why := names.no_position(name) or names.no_position(names.label_of(path, listed) or ""):
             left_out[name] = why
         elif len(signals) == _MOST_COLUMNS:
             left_out[name] = f"more than {_MOST_COLUMNS} columns"
-        elif isinstance(
-            found := _signal(table, path, where, place, labels.get(leaf(path), []), joints.get(path)), Signal
-        ):
+        elif isinstance(found := _signal(table, path, where, place, listed, joints.get(path)), Signal):
             signals.append(found)
         elif found:
             left_out[name] = found
+    signals = _without_quaternions(signals, left_out)
     clock, notes = _clock(table, signals, sorted(counts))
     if clock is None and rate:
         clock = _counted(table, rate)
@@ -239,6 +239,18 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
         left_out={path: why for path, why in left_out.items() if path not in mine},
         notes=(*notes, *(() if clock is None else clock.notes), *place.notes, *table.notes),
     )
+
+
+def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
+    """Columns that are no quaternion, which are four of one list, of length 1 in each row."""
+    lists = dict[str, list[Signal]]()
+    for one in signals:
+        lists.setdefault(leaf(one.column) if one.column.endswith("]") else "", []).append(one)
+    for listed, four in lists.items():
+        size = np.linalg.norm([one.plain for one in four], axis=0)
+        if listed and len(four) == 4 and bool((np.abs(size[np.isfinite(size)] - 1.0) < _UNIT).all()):
+            left_out |= {one.name: "of a quaternion" for one in four}
+    return [one for one in signals if one.name not in left_out]
 
 
 def _joints(table: Table) -> dict[str, str]:
@@ -633,9 +645,11 @@ def _feature_names(info: Any) -> dict[str, list[str]]:
     features: Any = info.get("features") if isinstance(info, dict) else None  # pyright: ignore
     for key, feature in cast(dict[str, Any], features if isinstance(features, dict) else {}).items():
         given: Any = cast(dict[str, Any], feature).get("names") if isinstance(feature, dict) else None
-        listed: Any = next(iter(cast(dict[str, Any], given).values()), None) if isinstance(given, dict) else given
-        if isinstance(listed, list):
-            found[key] = [str(label) for label in cast(list[Any], listed)]
+        inside: Any = given
+        while isinstance(inside, dict | list) and inside:  # a list in a list, as Unitree's converter writes it
+            listed = cast(list[Any], inside)
+            inside = cast(Any, inside[0] if isinstance(inside, list) else next(iter(cast(Any, inside).values())))
+            found[key] = [str(label) for label in listed]  # also of { x = 0, y = 1 }
     return found
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import NO_STAMP, BoolArray, FloatArray, TimeArray
 
-_EARLIEST, _LATEST = -1.0, 2.0  # s, of a lag
+_EARLIEST, LATEST = -1.0, 2.0  # s, of a lag
 _BEYOND = 1e9  # m or rad, where no robot goes
 _COARSE, _FINE = 0.01, 0.001  # s, steps of a lag
 # s, over which changes are taken: long where noise is large; from the mean where it is most of the run, as on a path at
@@ -125,7 +125,7 @@ def _at_span(
         norm = np.sqrt(np.einsum("ij,ij->i", others, others) * float(mine @ mine))
         return (others @ mine) / np.where(norm > 0.0, norm, np.inf)
 
-    coarse, every = np.arange(_EARLIEST, _LATEST, _COARSE), max(1, len(change) // _FEW)
+    coarse, every = np.arange(_EARLIEST, LATEST, _COARSE), max(1, len(change) // _FEW)
     found = correlations(coarse, every)
     if not np.abs(found).any():
         return None
@@ -139,7 +139,8 @@ def _at_span(
     slope = float(other @ change) / float(other @ other)
     kept = _without_few(change - slope * other, other)
     other, change = other[kept], change[kept]
-    return lag, float(other @ change) / math.sqrt(float(other @ other) * float(change @ change)), slope
+    power = math.sqrt(float(other @ other) * float(change @ change))
+    return (lag, float(other @ change) / power, slope) if power > 0.0 else None
 
 
 def scatter(value: FloatArray) -> float:

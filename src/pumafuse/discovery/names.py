@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Container
 from typing import Literal, TypeAlias
 
 from ..logs.columns import leaf
@@ -22,7 +23,7 @@ _ROLES: dict[Role, frozenset[str]] = {
     "reference": words_in("truth reference ref ground gt groundtruth"),
     "command": words_in(
         "command commands commanded cmd goal goals target targets desired des demand demanded setpoint setpoints set sp"
-        " soll sol planned action control ctrl input inputs"
+        " soll sol planned action control ctrl input inputs com wanted reqd requested"
     ),
     "sensor": _DEVICES
     | words_in(
@@ -44,13 +45,16 @@ _SILENT = (
     )
 )
 _NO_POSITIONS = words_in(
-    "velocity velocities vel speed dq qvel dot acceleration accelerations acc accelerometer ddq qdd qacc jerk effort"
-    " efforts torque torques tau force forces momentum current currents voltage power pressure mode scaling bits"
-    " temperature temperatures temp quality confidence covariance orientation rotation quaternion twist index id seq"
-    " sequence count status valid std sd sigma latency duration error header stamp nanosec layout frame done reward"
-    " task episode tick time timestamp"
+    "velocity velocities vel speed speeds rate rates omega gyro dq qvel dot acceleration accelerations acc accel"
+    " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tau moment moments force forces wrench"
+    " thrust thrusts momentum current currents curr amp amps amperes voltage volt volts power pwm duty load pressure"
+    " mode scaling bits temperature temperatures temp quality confidence covariance orientation rotation quaternion"
+    " quat twist index id seq sequence count status valid std sd sigma latency duration error header stamp nanosec"
+    " layout frame done reward task episode tick time timestamp reset"
 )
-# Words that are something else only without a number: ax1 is an axis.
+_SPREADS = words_in("std sd sigma error covariance")  # in the unit of a position, and none
+_CHANGES = words_in("delta relative rel incremental increment diff")
+# Words that are something else only without a number and without a unit: ax1 and az_deg are axes.
 _WHOLE = {**dict.fromkeys(words_in("vx vy vz ax ay az"), "a rate"), **dict.fromkeys(words_in("qx qy qz qw"), "turning")}
 _TRANSLATIONS = {"tx": "x", "ty": "y", "tz": "z"}
 _POSITIONS = words_in("position positions pos pose")  # current_position is one
@@ -65,6 +69,9 @@ _TIMES = frozenset(one for one in _TIME_UNITS if len(one) > 2) | words_in(
 _COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
 _WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")
 _DIGITS = "0123456789"
+_DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
+_DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
+_BRACKETED = re.compile(rf"[\[(] *(mm|m|um|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 _SLIDING = words_in("slide slider prismatic linear rail gantry")
 _UNITS = {
@@ -76,8 +83,9 @@ _UNITS = {
     "mrad": "mrad",
 }
 _TURNING = re.compile(
-    r"joint|jnt|dof|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper"
-    r"|^([amj](_?d)?_?\d+|q(_?d)?_?\d*)$"
+    r"joint|jnt|dof|shoulder|elbow|wrist|waist|hip|knee|ankle|neck|angle|theta|yaw|pitch|roll|heading|azimuth|motor"
+    r"|servo|pan|tilt|lift|flex|gripper|^([amj](_?d)?_?\d+|q(_?d)?_?\d*)$",
+    re.IGNORECASE,
 )
 
 
@@ -117,8 +125,8 @@ def is_part(column: str) -> bool:
 
 
 def is_time(column: str) -> bool:
-    """Whether a column is called as stamps are."""
-    return not _TIMES.isdisjoint(words(column))
+    """Whether a column is called as stamps are; ``t_deg`` is an axis."""
+    return not _TIMES.isdisjoint(words(column)) and not unit_of(column)
 
 
 def time_unit_of(column: str) -> str:
@@ -138,18 +146,45 @@ def tells_apart(column: str) -> bool:
 
 
 def no_position(column: str) -> str | None:
-    """What a column is by its name, if that is no position."""
+    """What a column is by its name, if that is no position; a unit of positions wins over words."""
     kind, unit, found = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
-    if "qd" in found and role_words(column):  # as UR calls it: target_qd_0 beside target_q_0
+    if not _CHANGES.isdisjoint(found):
+        return "relative: a change, no position"
+    known = kind is not None or _BRACKETED.search(column) is not None
+    if not known and "qd" in found and role_words(column):  # as UR calls it: target_qd_0 beside target_q_0
         return "velocity"
-    if whole := next((_WHOLE[one] for one in found if one in _WHOLE), None):
+    if whole := None if known else next((_WHOLE[one] for one in found if one in _WHOLE), None):
         return whole
     found = [one.rstrip(_DIGITS) for one in found]
-    whats = [one for one in found if one in _NO_POSITIONS]
-    if whats == ["current"] and (kind or not _POSITIONS.isdisjoint(found)):
+    whats = [one for one in found if one in (_SPREADS if known else _NO_POSITIONS)]
+    if whats == ["current"] and not _POSITIONS.isdisjoint(found):
         return None
     of_unit = f"in {unit.strip('_').replace('_', '/')}" if unit is not None and kind is None else None
-    return next(iter(whats), of_unit)
+    return next(iter(whats), "in °C or °/s" if "°" in column and not known else of_unit)
+
+
+def family(column: str, columns: Container[str]) -> tuple[str, str, str]:
+    """What columns of one source share, whose names have no words of roles: list, copy of a header, desired values.
+
+    Args:
+        column: Its name or field path.
+        columns: The names beside it, without what is before their last point.
+
+    Returns:
+        The list that it is an element of (``state.q``); the number of the copy (``.1``); for desired values beside
+        measured ones, as ``q_d[0]`` beside ``q[0]`` or ``q_d1`` beside ``q1``, the name of these. Each may be empty.
+    """
+    base, _, number = column.rpartition(".")
+    copy = f".{number}" if number.isdigit() and last(base) in columns else ""
+    base = base if copy else column
+    match = _DESIRED.fullmatch(last(base))
+    measured = f"{match[1]}{match[2]}" if match else ""
+    return leaf(base) if re.search(r"\w\[\d+\]$", base) else "", copy, measured if measured in columns else ""
+
+
+def last(column: str) -> str:
+    """What is behind the last point of a field path that is before a letter."""
+    return re.sub(r"^.*\.(?=[A-Za-z_])", "", column)
 
 
 def unit_of(column: str) -> str:
@@ -157,7 +192,7 @@ def unit_of(column: str) -> str:
     unit = ending(leaf(column))
     if unit is not None and kind_of(leaf(column)) is not None:
         return unit[1:]
-    if "°" in column:
+    if _DEGREES.search(column):
         return "deg"
     *before, last = words(column) or [""]  # also that of `x [mm]`
     return _UNITS.get(last, "") if before else ""
@@ -182,9 +217,9 @@ def axis_of(column: str, labels: list[str]) -> str:
     """
     label = None if unit_of(column) else re.search(r"\[([^\]]*)\]$", column)
     if label and label[1].isdigit():
+        if (told := label_of(column, labels)) is not None:
+            return plain(re.sub(r"\.pos$", "", told))
         place = int(label[1])
-        if place < len(labels):
-            return plain(re.sub(r"\.pos$", "", labels[place]))
         spatial = place < 3 and not {"translation", "translations"}.isdisjoint(words(column))
         return "xyz"[place] if spatial else f"joint{place}"
     if label:
@@ -197,6 +232,12 @@ def axis_of(column: str, labels: list[str]) -> str:
     if kept and all(word.isdigit() for word in kept):
         kept = ["joint", *kept]
     return plain("_".join(kept)) or "position"
+
+
+def label_of(column: str, labels: list[str]) -> str | None:
+    """What the element of a list is called, where the log says so."""
+    place = re.search(r"\[(\d+)\]$", column)
+    return labels[int(place[1])] if place and int(place[1]) < len(labels) else None
 
 
 def plain(name: str) -> str:

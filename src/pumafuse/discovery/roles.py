@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,11 +16,11 @@ from ..logs.run import Run, Source
 from ..units import AN, OF_KIND, TURN, Kind, kind_of
 from . import names
 from .contents import Part, Signal, without_clock
-from .following import Following, following
+from .following import LATEST, Following, following
 from .names import Role
 
-_FOLLOWS = 0.5  # correlation of changes from which one signal is said to follow another
-_SAME = 0.8  # from which it is taken for the same axis under another name
+_SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
+_GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
@@ -178,14 +179,21 @@ def another_clock(source: Source, command: Source) -> str:
 
 
 def _streams(part: Part) -> list[Stream]:
-    """The columns of a part, those apart whose names say that they are something else."""
+    """The columns of a part, those apart whose names say that they are something else, or another list."""
     if part.clock is None:
         return []
-    groups: dict[str, list[Signal]] = {}
+    groups: dict[tuple[str, str, str, bool], list[Signal]] = {}
+    beside = {names.last(one) for one in (*(signal.column for signal in part.signals), *part.left_out)}
     for signal in part.signals:
-        groups.setdefault("_".join(dict.fromkeys(names.role_words(signal.name))), []).append(signal)
+        called = "_".join(dict.fromkeys(names.role_words(signal.name)))
+        listed, copy, measured = names.family(signal.column, beside)
+        if copy or measured:
+            signal = replace(signal, axis=names.axis_of(measured or signal.column.removesuffix(copy), []))
+        groups.setdefault((called, listed, copy, bool(measured)), []).append(signal)
+    roles = Counter(key for key, *_ in groups)
     found = list[Stream]()
-    for key, signals in groups.items():
+    for (key, listed, copy, desired), signals in groups.items():
+        wanted = ("command" if desired else None, f"'{signals[0].column}' is of desired values, by its name")
         own = (names.column_role(signals[0].name), f"its columns are called '{key.replace('_', ' ')}'")
         file = (names.role_of(part.stem), f"it is called '{printable(part.stem)}'")
         clock = (
@@ -195,8 +203,9 @@ def _streams(part: Part) -> list[Stream]:
         by_type = ("command" if part.type.endswith("JointTrajectory") else None, f"its messages are {part.type}")
         by_state = ("sensor" if part.type.endswith("JointState") else None, f"its messages are {part.type}")
         order = (own, file, clock) if len(groups) > 1 else (file, own, clock)
-        role, why = next((one for one in (*order, by_type, by_state) if one[0]), (None, ""))
-        name = key if len(groups) > 1 and key else names.plain(part.stem)
+        role, why = next((one for one in (wanted, *order, by_type, by_state) if one[0]), (None, ""))
+        name = key if roles[key] == 1 else names.plain(f"{listed or key or part.stem}{copy}")
+        name = name if len(groups) > 1 and name else names.plain(part.stem)
         found.append(Stream(name or "log", role, why, part, _axes(signals)))  # pyright: ignore[reportArgumentType]
     return found
 
@@ -243,8 +252,8 @@ def _apart(stream: Stream) -> list[Stream]:
         if shared:
             every = sorted(set[tuple[str, ...]]().union(*shared.values()))
             ways.append([of(word, every), *(of(other, rests) for other, rests in shared.items())])
-    behind = [_followers(way[0], way) for way in ways]
-    return ways[int(np.argmax(behind))] if any(behind) else [stream]
+    best = max(ways, key=lambda way: _followers(way[0], way), default=[stream])
+    return best if len(best) > 1 and _followers(best[0], best)[0] else [stream]
 
 
 def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream: Stream) -> bool:
@@ -274,7 +283,7 @@ def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
     candidates = (called or [one for one in streams if one.role != "sensor"])[:_MOST_CANDIDATES]
     followers = {one.name: _followers(one, streams) for one in candidates}
     best = max(candidates, key=lambda one: followers[one.name], default=None)
-    if best is None or (not called and not followers[best.name]):
+    if best is None or (not called and not followers[best.name][0]):
         what = ", ".join(printable(one.part.label) for one in streams)
         raise RunError(
             f"{log}: which numbers are the commands? None is called command, goal, target, desired, setpoint or action,"
@@ -283,26 +292,31 @@ def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
     return best, best.why or "others follow it"
 
 
-def _followers(leader: Stream, streams: Sequence[Stream]) -> float:
-    """How many axes of others run behind a stream, each as far as its motion is the same."""
-    count = 0.0
+def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]:
+    """How many axes of others run behind a stream, each as far as its motion is the same; and by how much, in all [s].
+
+    The number is rounded: of commands and the same ones later on, those that are sent first are followed as well.
+    """
+    count = late = 0.0
     for other in streams:
         if other is not leader and other.role != "command":
             axes, _ = _matched(leader, other)
-            for axis in axes:
-                found = _relation(leader, axis, replace(other, axes=axes), axis)
-                if found is not None and abs(found.correlation) >= _FOLLOWS and found.lag > _AT_ONCE:
-                    count += abs(found.correlation)
-    return count
+            for found in _relations(leader, replace(other, axes=axes)):
+                if abs(found.correlation) >= _SAME and found.lag > _AT_ONCE:
+                    count, late = count + abs(found.correlation), late + found.lag
+    return round(count, 1), late
 
 
 def _follows(command: Stream, stream: Stream) -> str:
-    """By how much a stream follows the commands, in words; empty if it does not."""
-    for axis in stream.axes:
-        found = _relation(command, axis, stream, axis)
-        if found is not None and abs(found.correlation) >= _FOLLOWS:
-            return f"{found.lag * 1e3:.0f} ms late"
-    return ""
+    """By how much a stream that nothing names follows the commands, in words; empty if it does not.
+
+    Positions do on most axes, later, and all with one gain; torques and currents do not.
+    """
+    found = _relations(command, stream)
+    behind = [one for one in found if one.correlation >= _SAME and -_AT_ONCE < one.lag < LATEST]
+    gains = [one.slope for one in behind]
+    alike = len(behind) > len(found) / 2 and max(gains) < _GAINS * min(gains)
+    return f"{float(np.median([one.lag for one in behind])) * 1e3:.0f} ms late" if alike else ""
 
 
 def _copies(command: Stream, stream: Stream) -> bool:
@@ -317,10 +331,14 @@ def _copies(command: Stream, stream: Stream) -> bool:
 
 
 def _relation(leader: Stream, axis: str, follower: Stream, other: str) -> Following | None:
-    if axis not in leader.axes or other not in follower.axes:
-        return None
     first, second = leader.source, follower.source
     return following((first.stamp, first.values[axis]), (second.stamp, second.values[other]))
+
+
+def _relations(leader: Stream, follower: Stream) -> list[Following]:
+    """How the axes of a stream follow those of another of the same names."""
+    shared = [axis for axis in follower.axes if axis in leader.axes]
+    return [found for axis in shared if (found := _relation(leader, axis, follower, axis)) is not None]
 
 
 def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal]], str]:

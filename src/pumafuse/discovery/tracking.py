@@ -126,7 +126,7 @@ class Tracking:
         left = off - found @ known
         wanders = float(np.std([piece.mean() for piece in np.array_split(left, _PIECES)]))
         # at a distance from the start that hardly changes, the constant is as uncertain as the slope
-        chance = wanders * math.sqrt(len(left) * float(np.linalg.inv(gram)[0, 0]))
+        chance = wanders * math.sqrt(len(left) * float(np.linalg.pinv(gram, hermitian=True)[0, 0]))
         error = max(chance, _MODEL * float(np.ptp(led)))
         return float(found[0]) if abs(found[0]) > _FAR * error else 0.0
 

@@ -396,8 +396,8 @@ class Topic:
 
 
 def leaf(path: str) -> str:
-    """A field path without the choice of an element at its end: the name that may carry a unit."""
-    return re.sub(r"(\[[^\]]*\])+$", "", path)
+    """A field path without an element, or the number of a copy, at its end: the name that may carry a unit."""
+    return re.sub(r"(\[[^\]]*\]|(?<=.)\.\d+)+$", "", path)
 
 
 def without_sentinels(values: FloatArray) -> tuple[FloatArray, float | None]:

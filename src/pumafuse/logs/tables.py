@@ -232,6 +232,13 @@ def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
         table, more = _parsed(path, text.decode("cp1252").encode())
         more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
     names = [name or _column(n) for n, name in enumerate(table.column_names)]
+    if repeated := sorted(_repeated(names)):
+        twice = ", ".join(map(shortened, repeated))
+        more = [f"{path.name}: headers that are there twice: {twice}; the second of each is called .1", *more]
+        count = Counter[str]()
+        for place, name in enumerate(names):
+            names[place] = f"{name}.{count[name]}" if count[name] else name  # as pandas calls them
+            count[name] += 1
     return pa.table([_listed(one) for one in table.columns], names), [*more, *notes]
 
 
