@@ -1,0 +1,179 @@
+"""Commands that nobody sent, and values that a sensor repeats: left out, counted, named; nothing else is."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.arrays import FloatArray
+from pumafuse.logs.screening import Habit
+
+PERIOD, LAG = 0.025, 0.075  # s
+TIME = PERIOD * np.arange(2400)
+PATH = 0.4 * np.sin(0.9 * TIME) + 0.15 * np.sin(2.3 * TIME)  # m
+CONFIG = pf.FusionConfig(
+    arm=pf.ArmModel(
+        name="gantry",
+        update_period=PERIOD,
+        delay=LAG / 2,
+        axes={"slide": pf.AxisModel(plant=pf.FirstOrder(time_constant=LAG / 2))},
+    ),
+    process={"slide": pf.Process(input_noise=1e-5, drift=1e-4)},
+    start=pf.Start(offset_sd=1e-2),
+    sensors={"rule": pf.Sensor(sd=1e-3, gate=6.0)},
+)
+
+
+def followed(command: FloatArray, step: float = 0.0, noise: float = 1e-3) -> FloatArray:
+    """What a sensor gives, 4 ms after each command [m]: held commands through a delay and a lag, by finer steps."""
+    fine = np.repeat(command, 25)  # 1 ms
+    late, position = np.concatenate([np.full(37, fine[0]), fine[:-37]]), np.empty(len(fine))
+    position[0] = fine[0]
+    for k in range(1, len(fine)):
+        position[k] = position[k - 1] + (late[k] - position[k - 1]) / 38.0
+    value = position[4::25] + noise * np.random.default_rng(3).standard_normal(len(command))
+    return np.rint(value / step) * step if step else value
+
+
+def fused(command: FloatArray, value: FloatArray, **more: object) -> tuple[pf.Estimates, str]:
+    run = pf.Run.from_arrays(TIME, {"slide": command}, {"rule": (TIME + 0.004, {"slide": value})})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        est = pf.fuse(run, CONFIG, **more)  # type: ignore[arg-type]
+    return est, " / ".join(est.notes)
+
+
+VALUE = followed(PATH)
+STRAY: dict[str, dict[int, float]] = {
+    "one of another unit": {700: 1000.0 * PATH[700]},
+    "zeros": {80: 0.0, 900: 0.0, 901: 0.0},
+    "a sign": {1500: -PATH[1500]},
+    "two that differ": {411: 3.0, 412: -7.0},
+    "one good between two": {1200: 5.0, 1202: 5.0},
+}
+
+
+@pytest.mark.parametrize("name", STRAY)
+@pytest.mark.parametrize("mode", ["filtered", "as-live"])
+def test_values_that_nobody_sent_are_not_used(name: str, mode: str) -> None:
+    """Counted and named with the first row; the run is fused as if their rows were not there, to the bit."""
+    command = PATH.copy()
+    rows = list(STRAY[name])
+    command[rows] = list(STRAY[name].values())
+    est, notes = fused(command, VALUE, rate=50.0, mode=mode)
+    assert est.command_counts == {"used": 2400 - len(rows), "stray": len(rows)}
+    assert "slide that leaps away" in notes and f"first: row {rows[0] + 1}" in notes
+    run = pf.Run.from_arrays(
+        np.delete(TIME, rows), {"slide": np.delete(PATH, rows)}, {"rule": (TIME + 0.004, {"slide": VALUE})}
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        wanted = pf.fuse(run, CONFIG, rate=50.0, mode=mode)  # type: ignore[arg-type]
+    assert est["slide"].position.tolist() == wanted["slide"].position.tolist()
+
+
+def pulse(length: int) -> FloatArray:
+    return np.where((np.arange(2400) >= 800) & (np.arange(2400) < 800 + length), PATH[795] + 0.5, PATH)
+
+
+RESTING = np.where(np.arange(2400) < 1000, 0.01 * np.sin(TIME), 0.01 * np.sin(TIME[1000]))
+REAL: dict[str, FloatArray] = {
+    "steps": np.repeat(0.05 * np.array([0, 1, 0, 4, 0, 8, 1, 0]), 300),
+    "a jump that stays": np.where(TIME > 30.0, PATH + 0.8, PATH),
+    "to zero and stays": np.where(TIME > 30.0, 0.0, PATH),
+    "three values": pulse(3),
+    "coarse": np.rint(PATH / 0.02) * 0.02,
+    "dither": 1e-3 * np.rint(np.random.default_rng(0).standard_normal(2400)),
+    "an angle that begins anew": np.mod(7.0 * PATH + np.pi, 2.0 * np.pi) - np.pi,
+    "a pulse of two that the arm follows": RESTING + np.where(np.isin(np.arange(2400), [1500, 1501]), 0.2, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_commands_are_used(name: str) -> None:
+    """Steps, jumps, pulses that the arm follows, quanta: every command counts."""
+    est, notes = fused(REAL[name], followed(REAL[name]))
+    assert "stray" not in notes and "stray" not in est.command_counts
+
+
+@pytest.mark.parametrize("stuck", [0.0, None])
+def test_a_sensor_that_froze_is_held(stuck: float | None) -> None:
+    """Its value until then counts once; one that it leaps to, never: errors stay within the bars, with when."""
+    value = VALUE.copy()
+    value[700:1100] = value[699] if stuck is None else stuck
+    est, notes = fused(PATH, value)
+    assert est.counts["rule"] == {"fused": 2000, "held": 400}
+    assert "from 17.50 to 27.48 s" in notes
+    right = fused(PATH, VALUE)[0]["slide"].position
+    assert np.abs(est["slide"].position - right).max() < 4.0 * est["slide"].position_sd.max()
+
+
+def test_a_sensor_slower_than_its_rows_counts_at_its_own_rate() -> None:
+    """Each value four times: the estimate is that of the values given once, to the bit."""
+    slow = np.repeat(VALUE[::4], 4)
+    est, notes = fused(PATH, slow)
+    assert est.counts["rule"] == {"fused": 600, "held": 1800} and "gives each value 4 times" in notes
+    run = pf.Run.from_arrays(TIME, {"slide": PATH}, {"rule": (TIME[::4] + 0.004, {"slide": VALUE[::4]})})
+    assert est["slide"].position.tolist() == pf.fuse(run, CONFIG)["slide"].position.tolist()
+
+
+@pytest.mark.parametrize("step", [1e-5, 2e-3, 5e-2])
+def test_a_sensor_without_noise_at_rest_is_not_held(step: float) -> None:
+    """Moves with rests between them, and a slow one, in steps of 0.01 to 50 mm: all count."""
+    rests = np.clip(np.sin(0.4 * TIME) * 3.0, -1.0, 1.0) * 0.3
+    for path in (rests, 1e-3 * TIME, np.repeat(rests[::300], 300)):
+        est, notes = fused(path, followed(path, step, noise=0.0))
+        assert "held" not in est.counts["rule"], notes
+
+
+def test_a_habit_is_of_values_that_are_held_not_of_rests_and_coarse_steps() -> None:
+    """Long rests are few rows of equal values; a slow motion through coarse steps changes by one step at a time."""
+    rng = np.random.default_rng(1)
+
+    def times(value: FloatArray) -> int:
+        begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)
+        return Habit.of(np.abs(np.diff(value[begin])), np.diff(begin)).times
+
+    moves = np.concatenate([np.zeros(900), np.cumsum(rng.uniform(0.0, 20.0, 100)), np.full(500, 1e3)])
+    assert times(np.rint(moves)) == times(np.rint(0.2 * np.arange(1000))) == 1
+    assert times(np.repeat(rng.standard_normal(300), 3)) == 3
+
+
+def live(command: FloatArray, value: FloatArray) -> tuple[FloatArray, pf.LiveEstimator, list[str]]:
+    said = list[str]()
+    found, estimator = np.empty(len(command)), pf.LiveEstimator(CONFIG, on_notice=said.append)
+    for k, t in enumerate(TIME.tolist()):
+        estimator.command(t, slide=float(command[k]))
+        estimator.measurement(t + 0.004, "rule", slide=float(value[k]))
+        found[k] = estimator.estimate().axes["slide"].position
+    return found, estimator, said
+
+
+def test_live_a_doubtful_command_waits_for_the_next() -> None:
+    """Stray ones are never followed, and named; a jump that stays is, once the next ones are there, as recorded."""
+    clean, _, _ = live(PATH, VALUE)
+    command = PATH.copy()
+    command[[700, 1300, 1301]] = 400.0, 0.9, -0.8
+    found, estimator, said = live(command, VALUE)
+    assert estimator.health().commands["stray"] == 3 and any("slide at 17.500 s leaps" in one for one in said)
+    assert np.abs(found - clean).max() < 0.02  # one or two commands are missing
+    jump = REAL["a jump that stays"]
+    found, estimator, said = live(jump, followed(jump))
+    assert estimator.health().commands["stray"] == 0 and not said
+    est, _ = fused(jump, followed(jump))
+    assert abs(estimator.estimate(float(TIME[-1])).axes["slide"].position - est["slide"].position[-1]) == 0.0
+
+
+@pytest.mark.parametrize("stuck", [0.0, None])
+def test_live_a_sensor_that_froze_is_held(stuck: float | None) -> None:
+    """The estimate goes on with the commands, and the axis is stale; said once, and counted."""
+    value = VALUE.copy()
+    value[700:1100] = value[699] if stuck is None else stuck
+    found, estimator, said = live(PATH, value)
+    clean, _, _ = live(PATH, VALUE)
+    assert np.abs(found - clean).max() < 5e-3
+    assert estimator.health().sensors["rule"].outcomes["held"] >= 398
+    assert any("'rule' repeats its value of slide" in one for one in said)
