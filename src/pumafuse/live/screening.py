@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import ALWAYS, NEVER
-from ..logs.screening import BRIEF, FAR, MOST_STRAY, USUAL, Habit, leaps, returns
+from ..logs.screening import BRIEF, FAR, MOST_STRAY, Habit, leaps, returns, usual_of
 from .commands import Commands, number
 
 _REMEMBERED, _LOOKED_AT = 256, 64  # steps of an axis; after so many new ones the usual one is worked out anew
@@ -53,8 +53,8 @@ class Steps:
             return
         self.usual = max(self.usual, _BELIEVED * self.pace)
         if self._new >= _LOOKED_AT:
-            steps = sorted(self._recent)
-            self._new, self.usual = 0, max(steps[int(USUAL * len(steps))], _BELIEVED * steps[-1])
+            steps = np.array(self._recent)
+            self._new, self.usual = 0, max(usual_of(steps), _BELIEVED * float(steps.max()))
 
     def leapt(self, value: float) -> bool:
         """Whether the next value is many times the usual step away."""
