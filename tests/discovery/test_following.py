@@ -21,7 +21,7 @@ def stamped(t: FloatArray) -> TimeArray:
     return 1_790_000_000_000_000_000 + np.rint(t * 1e9).astype(np.int64)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(derandomize=True, max_examples=25, deadline=None)
 @given(
     lag=st.floats(-0.3, 0.8),
     gain=st.one_of(st.floats(0.5, 2.0), st.floats(-2.0, -0.5)),
@@ -34,7 +34,7 @@ def test_lag_gain_and_level_are_found(lag: float, gain: float, level: float, rat
     draw = np.random.default_rng(seed)
     t, s = np.arange(0.0, 40.0, 0.02), np.arange(1.0, 39.0, 1.0 / rate)
     z = gain * path(s - lag) + level + draw.normal(scale=3e-4, size=len(s))
-    z[draw.random(len(s)) < 0.01] += 0.02
+    z[draw.choice(len(s), len(s) // 100, replace=False)] += 0.02
     found = following((stamped(t), path(t)), (stamped(s), z))
     assert found is not None
     assert found.lag == pytest.approx(lag, abs=0.006 if rate > 5.0 else 0.015)  # 190 measurements
