@@ -4,6 +4,10 @@ import os
 import signal
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("same", derandomize=True, deadline=None)  # the same examples each time, on any machine
+settings.load_profile("same")
 
 
 def pytest_configure(config: pytest.Config) -> None:

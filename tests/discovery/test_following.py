@@ -21,7 +21,7 @@ def stamped(t: FloatArray) -> TimeArray:
     return 1_790_000_000_000_000_000 + np.rint(t * 1e9).astype(np.int64)
 
 
-@settings(derandomize=True, max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     lag=st.floats(-0.3, 0.8),
     gain=st.one_of(st.floats(0.5, 2.0), st.floats(-2.0, -0.5)),

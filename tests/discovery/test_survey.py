@@ -841,7 +841,7 @@ def test_a_column_whose_name_is_damaged_is_a_line(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(derandomize=True, deadline=None, max_examples=300, suppress_health_check=list(HealthCheck))
+@settings(max_examples=300, suppress_health_check=list(HealthCheck))
 def test_a_damaged_table_is_surveyed_or_refused_in_a_line(seed: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     """Bytes of a file with nested columns replaced, its end cut off: never a traceback."""
     folder = tmp_path_factory.getbasetemp() / "damaged"

@@ -44,7 +44,7 @@ def superposed(plant: PLANTS, acting: TimeArray, value: FloatArray, time: TimeAr
     return plant.step_response(since) @ np.diff(value, prepend=0.0)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=100)
 @given(PLANT, st.sampled_from([1.0, 0.9]), st.integers(0, 10**6), st.integers(0, 40), st.integers(0, 60))
 def test_commands_superpose(plant: PLANTS, gain: float, seed: int, commands: int, times: int) -> None:
     """Any commands at irregular times, asked for at any times, also at one instant, in stamps of a real clock."""

@@ -146,7 +146,7 @@ def transitions(draw: st.DrawFn) -> tuple[float, float, float]:
 
 
 @pytest.mark.long
-@settings(derandomize=True, deadline=None, max_examples=1500)
+@settings(max_examples=1500)
 @given(transitions())
 @example((9997.97309637579, 0.999999999998836, 147.78737883089568))
 @example((29562.580357190545, 1.0 - 2**-53, 1e5))
@@ -166,7 +166,7 @@ def test_a_transition_over_any_interval(omega: float, zeta: float) -> None:
             check(found(*made), wanted(*made), 2e-15 * blurred(*made), 1e-13)
 
 
-@settings(derandomize=True, deadline=None, max_examples=1000)
+@settings(max_examples=1000)
 @given(transitions())
 def test_process_noise_is_a_covariance(made: tuple[float, float, float]) -> None:
     """Q11 and Q22 are never negative, and no correlation is beyond 1 by more than an ulp or two."""
@@ -198,7 +198,7 @@ def test_nothing_happens_in_no_time() -> None:
 # ---- first order ----------------------------------------------------------------------------------------------------
 
 
-@settings(derandomize=True, deadline=None, max_examples=1000)
+@settings(max_examples=1000)
 @given(powers(-6.0, 3.0), powers(-9.0, 5.0))
 def test_any_lag_is_that_of_the_plant(tau: float, t: float) -> None:
     """Φ = e^(−t/τ) to an ulp of 1, Q = (1 − e^(−2t/τ)) / 2τ to 2e-15 of itself."""
@@ -262,7 +262,7 @@ def decaying(draw: st.DrawFn) -> tuple[PLANTS, float, float]:
     return plant, decay, min(max(t, 1e-9), 1e3)
 
 
-@settings(derandomize=True, deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(decaying())
 def test_any_response_to_a_decaying_input(made: tuple[PLANTS, float, float]) -> None:
     """Position and rate over ω to 1e-13, wherever the input's pole lies and however long the interval is."""
@@ -293,7 +293,7 @@ def test_an_input_that_stays_is_a_step_and_one_that_is_gone_at_once_is_nothing(p
 # ---- a smooth disturbance -------------------------------------------------------------------------------------------
 
 
-@settings(derandomize=True, deadline=None, max_examples=500)
+@settings(max_examples=500)
 @given(powers(-4.0, 5.0), powers(-9.0, 5.0))
 @example(0.5, 1.0 - 1e-15)  # where a series ends
 @example(0.5, 1.0 + 1e-15)

@@ -61,7 +61,7 @@ def test_biases_are_conditional_means(case: Case, mode: Mode) -> None:
     check(case, mode=mode)
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(cases())
 def test_any_bias_is_estimated_like_the_conditional_gaussian(case: Case) -> None:
     """Random plants, noise and sensors, most with a bias: nothing deviates from the joint Gaussian."""

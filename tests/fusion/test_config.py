@@ -111,7 +111,7 @@ configurations = st.builds(
 )
 
 
-@settings(derandomize=True, deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(config=configurations)
 def test_what_is_saved_is_loaded_to_the_last_bit(tmp_path: Path, config: FusionConfig) -> None:
     """Saved and loaded, any configuration is equal, its arm and the order of its sensors included."""

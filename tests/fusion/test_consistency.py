@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 from scipy.special import chdtrc, chdtri
@@ -267,7 +267,6 @@ def test_a_prior_too_wide_for_double_precision_is_said(moving: pf.Run, prior: st
     assert all("is 2.0e+06 times its noise" in note for note in notes)
 
 
-@settings(derandomize=True, deadline=None)
 @given(st.integers(1, 10_000_000), st.floats(1e-6, 1.0 - 1e-6), st.floats(0.0, 30.0))
 def test_chi_square_is_scipys(degrees: int, share: float, times: float) -> None:
     """Quantiles to 1e-10, and the tail to 1e-7 of itself wherever a double holds it."""

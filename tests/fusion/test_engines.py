@@ -196,7 +196,7 @@ def test_both_engines_make_the_same_of_any_log() -> None:
     """Random axes, delays, gains, noise, sensors, gates, outliers, gaps: every fate and estimate is the same."""
     seen = dict.fromkeys(Outcome, 0)
 
-    @settings(derandomize=True, deadline=None, max_examples=12)
+    @settings(max_examples=12)
     @given(logs())
     def check(log: tuple[Run, pf.FusionConfig, float | None]) -> None:
         got, wanted = both(*log)

@@ -283,7 +283,7 @@ def edges(draw: st.DrawFn) -> tuple[Edge, float | None]:
 
 
 @pytest.mark.long
-@settings(derandomize=True, deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(edges())
 def test_extremes_may_meet(made: tuple[Edge, float | None]) -> None:
     """Any of them together: estimates stay numbers, and the same bits come again."""

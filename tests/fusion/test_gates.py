@@ -388,7 +388,7 @@ def check_log(rows: list[Row], sensors: dict[str, Sensor], as_live: bool) -> Non
     check_estimates(estimates, rows, sensors, as_live)
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(logs(), st.booleans())
 def test_any_log_is_decided_as_the_rule_says(log: tuple[list[Row], dict[str, Sensor]], as_live: bool) -> None:
     """Outcomes, innovations, estimates and error bars are those worked out by hand, with all that had arrived."""

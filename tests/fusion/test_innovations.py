@@ -61,7 +61,7 @@ def check(run: Run, config: FusionConfig) -> Results:
     return found
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(cases())
 def test_innovations_of_any_run_are_those_of_its_fusion(case: Case) -> None:
     """Random plants, noise and sensors, gates narrow enough to reject."""

@@ -363,7 +363,7 @@ def cases(draw: st.DrawFn) -> Case:
     )  # fmt: skip
 
 
-@settings(derandomize=True, deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(cases(), st.sampled_from(["filtered", "as_live"]))
 def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
     """Random plants, delays, gains, noise and sensors: nothing deviates from the joint Gaussian."""

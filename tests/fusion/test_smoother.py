@@ -76,7 +76,7 @@ def tame(case: Case) -> Case:
     return replace(case, seen=seen, process=process, offset_sd=min(case.offset_sd, 5e-3))
 
 
-@settings(derandomize=True, deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(cases())
 def test_any_run_is_smoothed_like_the_conditional_gaussian(case: Case) -> None:
     """Random plants, delays, gains, gaps, noise and sensors: nothing deviates from the joint Gaussian."""
@@ -161,7 +161,7 @@ def test_a_reacquired_gate_is_a_jump_of_the_offset(mode: str) -> None:
     assert rows[Outcome.REACQUIRED] == {("tracker", 26), ("tracker", 36)}
 
 
-@settings(derandomize=True, deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(cases(), st.sampled_from(["filtered", "smoothed"]))
 def test_any_gated_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
     """Gates narrow enough to reject and to re-acquire."""

@@ -38,7 +38,7 @@ def dependence(values: np.ndarray, cells: Sequence[str]) -> Dependence:
 # ---- one factor -----------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=25)
 @given(st.lists(st.integers(1, 7), min_size=2, max_size=5), st.integers(0, 10**6), st.floats(0.0, 3.0))
 def test_the_i_ratio_is_f_over_its_95_percent_point(sizes: list[int], seed: int, apart: float) -> None:
     """Mean squares between and within, unbalanced groups too; scipy's `f_oneway` says the same."""

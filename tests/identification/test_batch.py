@@ -63,7 +63,7 @@ def unpacked(trials: list[Trial], plant: tuple[float, float], delays: np.ndarray
 # ---- one shape ------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=40)
 @given(st.floats(0.005, 0.15), st.floats(0.0, 2.0), st.floats(0.0, 0.1), st.integers(0, 50))
 def test_a_point_is_plain_regression_in_each_row(q: float, ratio: float, delay: float, seed: int) -> None:
     """Height and residuals as `lstsq` has them from the response and a one, weighted; the padding stays 0."""

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -25,7 +25,6 @@ def scattered(seed: int, n: int, between: float, sd: np.ndarray) -> np.ndarray:
 # ---- one mean -------------------------------------------------------------------------------------------------------
 
 
-@settings(deadline=None, derandomize=True)
 @given(NORMAL)
 def test_a_mean_has_the_textbooks_interval(values: np.ndarray) -> None:
     """Student's, as scipy computes it."""

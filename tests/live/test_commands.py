@@ -22,7 +22,7 @@ COMMANDS = st.lists(
 )
 
 
-@settings(derandomize=True, deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(COMMANDS, st.integers(5, 25), st.integers(0, 25), st.booleans())
 def test_any_order_of_commands_has_the_one_that_was_in_force(
     commands: list[tuple[int, tuple[int, int], tuple[float, float]]], window: int, back: int, forgets: bool

@@ -105,7 +105,7 @@ def test_what_comes_too_late_has_come_and_says_how_late() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
-@settings(derandomize=True, deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(any_stream())
 def test_what_counts_is_what_became_of_a_row_in_the_end(drawn: tuple[pf.FusionConfig, pf.Run, int]) -> None:
     """Whatever comes late, commands too: NIS and outcomes are those of the innovations of the whole run."""

@@ -104,7 +104,7 @@ def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(drawn=any_stream())
 def test_a_record_fuses_to_the_last_estimates(tmp_path_factory, drawn) -> None:
     """Any axes, gaps, repeated commands, in a random order of arrival: the record gives live's last estimates."""

@@ -146,7 +146,7 @@ def test_any_clock_gives_the_same_estimates(stamp: int) -> None:
 # ---- any stream -----------------------------------------------------------------------------------------------------
 
 
-@settings(derandomize=True, deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(any_stream())
 def test_any_order_of_arrival_gives_the_same_window(
     drawn: tuple[pf.FusionConfig, pf.Run, int],
@@ -166,7 +166,7 @@ def test_any_order_of_arrival_gives_the_same_window(
         assert shuffled.estimate(time) == in_order.estimate(time)
 
 
-@settings(derandomize=True, deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(any_stream())
 def test_a_window_of_a_millisecond_is_enough_for_a_stream_in_order(
     drawn: tuple[pf.FusionConfig, pf.Run, int],
@@ -182,7 +182,7 @@ def test_a_window_of_a_millisecond_is_enough_for_a_stream_in_order(
     assert counted(narrow) == counted(wide)
 
 
-@settings(derandomize=True, deadline=None, max_examples=120)
+@settings(max_examples=120)
 @given(any_stream())
 def test_any_stream_is_fused_as_offline(drawn: tuple[pf.FusionConfig, pf.Run, int]) -> None:
     """In any order of arrival: the same outcomes and, at every command, the same bits."""

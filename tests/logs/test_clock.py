@@ -22,7 +22,7 @@ from refusals import one_line
 SECOND = 1_000_000_000
 TICK = 28_000_000
 
-properties = settings(derandomize=True, deadline=None, max_examples=50)
+properties = settings(max_examples=50)
 
 
 def source(stamp: Sequence[int], label: str) -> Source:
@@ -131,7 +131,7 @@ wild = st.builds(
 )
 
 
-@settings(derandomize=True, deadline=None, max_examples=1000)
+@settings(max_examples=1000)
 @given(wild)
 def test_any_stamps_are_stray_as_a_walk_from_row_to_row_finds_them(stamp: list[int]) -> None:
     """Only rows near a step back are looked at; that misses none and finds no other."""

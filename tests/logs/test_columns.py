@@ -20,7 +20,7 @@ from refusals import one_line
 GIGA = 10**9
 LAST = 4_599_999_999 * GIGA  # ns, within reach
 EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)  # noqa: UP017 - beside timezone(…)
-properties = settings(derandomize=True, deadline=None, max_examples=50)
+properties = settings(max_examples=50)
 
 names = st.sampled_from(["x", "position", "höhe", "a b", "0"])
 shapes: st.SearchStrategy[Any] = st.recursive(

@@ -87,7 +87,7 @@ def check(source: Source, placed: Placed, wanted: Path2D, tangential: np.ndarray
         np.testing.assert_allclose(found, right, rtol=0, atol=EXACT)
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(paths(), directions)
 def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], positive: str) -> None:
     """Radial = r, tangential = ±R0·(θ − θ0) over several turns, a sensor's turns those of the commands; and back."""
@@ -98,7 +98,7 @@ def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], posit
         check(source, placed, wanted, arc, wanted.radius)
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(paths(), directions, st.floats(-720.0, 720.0))
 def test_rotated_axes_are_a_fixed_rotation(drawn: tuple[Path2D, Path2D], positive: str, azimuth: float) -> None:
     """(x + iy)·e^(−i·azimuth) = radial ± i·tangential: to the left of radial, or to its right; and back to x, y."""
@@ -230,7 +230,7 @@ def test_the_frame_of_the_run_beats_that_of_fusion_toml(
     assert (est.cartesian["x"][0], est.cartesian["y"][0]) == pytest.approx((0.1, 0.5))
 
 
-@settings(derandomize=True, deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(st.lists(st.floats(0.2, 1.5), min_size=8, max_size=8), st.floats(0.3, 0.65))
 def test_tangential_noise_grows_as_the_lever_shortens(seen: list[float], start: float) -> None:
     """S = P + (sd·R0/r)² on tangential, P + sd² on radial; P is what the measurements before leave of the offset.

@@ -18,7 +18,7 @@ SECOND = 1_000_000_000
 PERIOD = 0.028
 TICK = 28_000_000
 
-properties = settings(derandomize=True, deadline=None, max_examples=50)
+properties = settings(max_examples=50)
 
 
 refusal = partial(one_line, RunError)

@@ -224,7 +224,7 @@ def test_a_database_that_ends_within_a_page_says_how_to_read_what_is_there(tmp_p
     ],
 )
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(derandomize=True, deadline=None, max_examples=40, suppress_health_check=list(HealthCheck))
+@settings(max_examples=40, suppress_health_check=list(HealthCheck))
 def test_bytes_that_are_wrong_are_never_more_than_a_line(kind: str, seed: int, tmp_path_factory: Any) -> None:
     """Some bytes of a file replaced by others: rows or one line; where the format has checksums, right rows."""
     folder = tmp_path_factory.getbasetemp() / f"wrong-{kind}"

@@ -55,7 +55,7 @@ def sources(draw: st.DrawFn, axes: tuple[str, ...]) -> Source:
     return source(stamp, values)
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(sources(("radial", "vertical")), sources(("radial",)), sources(("vertical", "radial")))
 def test_any_rows_come_back_to_the_last_bit(command: Source, eye: Source, ear: Source) -> None:
     """Stamps to the ns, lengths to the nm; missing stamps and values stay missing, order and axes stay."""

@@ -29,9 +29,7 @@ EPOCH_NS = 1_700_000_000_123_456_789  # int64 ns of today: float64 there has a g
 LAST_S = 4_599_999_999  # the last whole second within reach
 FIRST_BLOCK = 1 << 20  # pyarrow guesses types from blocks of this size
 
-properties = settings(
-    derandomize=True, deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+properties = settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def csv(folder: Path, text: str | bytes, name: str = "log.csv") -> Table:

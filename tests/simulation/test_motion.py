@@ -129,7 +129,7 @@ def off_exact(
 LAGS = st.one_of(st.none(), st.floats(0.002, 0.2))
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=30)
 @given(w=st.floats(5.0, 300.0), z=st.floats(0.05, 5.0), lag=LAGS, delay=st.floats(0.0, 0.2), recovery=LAGS)
 def test_any_linear_axis_follows_its_differential_equation(
     w: float, z: float, lag: float | None, delay: float, recovery: float | None

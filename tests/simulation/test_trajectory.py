@@ -40,7 +40,7 @@ def test_a_raster_goes_to_and_fro_at_constant_speed() -> None:
     assert len(x) == int(np.ceil(length / speed / PERIOD - 1e-9)) + 1
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=60)
 @given(st.integers(0, 30), st.integers(1, 300))
 def test_a_raster_covers_its_height(lines: int, pitch_mm: int) -> None:
     """A height of k pitches has k + 1 lines, whatever binary fractions make of the millimetres."""
@@ -115,7 +115,7 @@ def test_a_sweep_has_the_frequency_it_says(start: float, end: float) -> None:
         assert np.trapezoid(start * (end / start) ** (at / 10.0), at) == pytest.approx(1.0, rel=1e-3)
 
 
-@settings(max_examples=50, deadline=None, derandomize=True)
+@settings(max_examples=50)
 @given(st.integers(1, 400), st.sampled_from([0.004, 0.028, 0.001, 0.0125]))
 def test_a_duration_of_whole_periods_ends_on_its_tick(count: int, period: float) -> None:
     """No tick more and none less, whatever binary fractions make of n · T."""

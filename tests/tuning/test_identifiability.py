@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import pumafuse as pf
@@ -20,7 +20,6 @@ def free(count: int) -> list[Parameter]:
     return parameters(CONFIG, CONFIG, {"radial": ["tracker"], "vertical": ["tracker"]}, ("noise",))[:count]
 
 
-@settings(derandomize=True, deadline=None)
 @given(st.integers(1, 6), st.integers(0, 2**32 - 1))
 def test_a_covariance_is_the_inverse_of_the_information(count: int, seed: int) -> None:
     """However far its scales are apart: I C = 1 to 1e-6."""

@@ -116,7 +116,7 @@ def problems(draw: st.DrawFn) -> tuple[Derivatives, np.ndarray, np.ndarray, np.n
     return Derivatives(rng.standard_normal(count) * scale, information, information), low, high, damping
 
 
-@settings(derandomize=True, deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(problems())
 def test_a_step_is_the_best_there_is_in_its_box(
     problem: tuple[Derivatives, np.ndarray, np.ndarray, np.ndarray],
