@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -94,3 +95,24 @@ def test_gates_are_for_what_leaves_its_neighbours_far(spoilt: object, gate: floa
     value = spoilt(z + np.random.default_rng(2).normal(0.0, 0.01, len(t)))
     _, sensors = guess(survey(log(tmp_path, value, u)))
     assert sensors["actual"].gate == gate
+
+
+def test_a_camera_whose_latency_steps_tells_nothing_of_the_arms_lag(tmp_path: Path) -> None:
+    """40 ms late, from 18 s on 90 ms: said, with its sd, and the arm's lag is right to 2 ms beside an encoder."""
+    rng, folder = np.random.default_rng(4), tmp_path / "mount"
+    folder.mkdir()
+    t, u, z = swings(1800)
+    late = np.where(t < 18.0, 0.04, 0.09)
+    seen = np.interp(t - late, t, z) + rng.normal(0.0, 0.3, len(t))
+    tables = {"command": u, "encoder": z + rng.normal(0.0, 0.05, len(t)), "camera": seen}
+    for name, value in tables.items():
+        rows = slice(None, None, 3 if name == "camera" else 1)
+        table = np.column_stack((t, value))[rows]
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="time_s,z_mm", comments="", fmt="%.6f")
+    _, sensors = guess(survey(folder))
+    (doubt,) = sensors["camera"].doubts
+    assert doubt.startswith("the latency of camera steps from ")
+    assert [float(one) for one in re.findall(r"[\d.]+", doubt)][:3] == pytest.approx([40.0, 90.0, 18.0], abs=2.0)
+    assert sensors["camera"].latency_sd == pytest.approx(0.035, abs=0.002)  # RMS of 0 and 50 ms
+    pumafuse("fuse", folder, "-o", tmp_path / "out")
+    assert pf.ArmModel.load(tmp_path / "out" / "arm.toml").lag_of("z") == pytest.approx(LATE, abs=2e-3)

@@ -158,6 +158,8 @@ def _fusion_toml(arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
         lines += ["", _header(["sensors", name])]
         lines += _by_kind("sd", one.sd, arm, "its scatter from one measurement to the next")
         lines.append(_line(_pair("latency_ms", _digits(one.latency * MS, 3)), one.latency_words))
+        if one.latency_sd:
+            lines.append(_line(_pair("latency_sd_ms", _digits(one.latency_sd * MS)), "by its rows and steps"))
         if one.scale < 0.0:
             lines.append(_line(_pair("scale", -1.0), "it moves against the commands, as a distance may"))
         if one.bias:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -74,7 +74,8 @@ class ArmGuess:
 class SensorGuess:
     """A sensor: noise and biases by axis [m or rad], latency [s] and where it is from, scale, gate (0: none needed).
 
-    ``turns``: whether it measures angles within a turn. ``doubts``: what one latency does not say, in sentences.
+    ``latency_sd``: how far the latency of a row is from that [s]. ``turns``: whether it measures angles within a turn.
+    ``doubts``: what one latency does not say, in sentences.
     """
 
     sd: Mapping[str, float]
@@ -84,7 +85,8 @@ class SensorGuess:
     scale: float
     gate: float
     turns: bool
-    doubts: Sequence[str]
+    latency_sd: float = 0.0
+    doubts: Sequence[str] = ()
 
 
 class _Pair(NamedTuple):
@@ -190,8 +192,11 @@ def _sensor(
     turns = found.roles is not None and any(one.turns for one in found.roles.sensors if one.name == name)
     gates = [_gate(value) for value in found.run.sensors[name].values.values()]
     gate = min((one for one in gates if one), default=0.0)
-    doubts = [] if pair is None else list(pair.alignment.doubts(name, pair.other))
-    return SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns, doubts)
+    known = SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns)
+    if pair is None:
+        return known
+    beside = pair.alignment
+    return replace(known, latency_sd=beside.unsteadiness, doubts=list(beside.doubts(name, pair.other)))
 
 
 def _noise(found: Survey, name: str, axis: str, one: Following, beside: float) -> float:

@@ -88,6 +88,13 @@ class Alignment:
         """Half of the interval [s]."""
         return 0.5 * (self.latency_ci95[1] - self.latency_ci95[0])
 
+    @property
+    def unsteadiness(self) -> float:
+        """How far the latency of a row is from the one that is told, RMS [s]: its scatter, and its steps."""
+        parts = [step.after - self.latency for step in self.steps]
+        parts += [self.steps[0].before - self.latency] if self.steps else [0.0]
+        return math.hypot(self.latency_sd, math.sqrt(sum(one**2 for one in parts) / len(parts)))
+
     def doubts(self, name: str, other: str) -> Iterator[str]:
         """What one latency of this sensor does not say, beside that other one: steps, a drift, jitter, a scale."""
         rises = {step.after > step.before for step in self.steps}

@@ -141,8 +141,9 @@ def _arm_search(
     freedom: Freedom | None,
     near: ArmSearch | None,
 ) -> ArmSearch:
-    """The arm of an axis by the sensors whose latency is known, and what it leaves."""
+    """The arm of an axis by the sensors whose latency is known and steady, and what it leaves."""
     late = {one.sensor for one in free if one.fit == "latency"}
+    late |= {name for name, sensor in config.sensors.items() if sensor.latency_sd}
     names = [name for name in likelihood.sensors[axis] if name not in late] or list(likelihood.sensors[axis])
     sd = np.array([config.sensors[name].sd_of(axis) for name in names], dtype=np.float64)
     least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
