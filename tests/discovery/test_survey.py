@@ -748,6 +748,7 @@ def test_of_two_sources_of_desired_values_the_earlier_one_is_the_commands(tmp_pa
     found = survey(tmp_path / "log.csv")
     assert of_roles(found) == [[f"p_d[{n}].1" for n in range(3)], [f"state.p[{n}]" for n in range(3)]]
     assert {axis for _, axis in found.relations} == {"joint0", "joint1", "joint2"}
+    assert set(found.run.kinds.values()) == {"angle"}
 
 
 def test_torques_and_attitudes_that_move_alike_are_no_sensors(tmp_path: Path) -> None:
