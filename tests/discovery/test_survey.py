@@ -25,7 +25,7 @@ from pumafuse.discovery import names
 from pumafuse.discovery.contents import parts_of
 from pumafuse.discovery.drafts import drafts
 from pumafuse.discovery.guesses import guess
-from pumafuse.discovery.questions import questions
+from pumafuse.discovery.questions import decisions, questions
 from pumafuse.discovery.survey import Survey, survey
 from pumafuse.errors import RunError
 from refusals import one_line
@@ -754,6 +754,7 @@ def test_of_two_sources_of_desired_values_the_earlier_one_is_the_commands(tmp_pa
     found = survey(tmp_path / "log.csv")
     assert of_roles(found) == [[f"p_d[{n}].1" for n in range(3)], [f"state.p[{n}]" for n in range(3)]]
     assert {axis for _, axis in found.relations} == {"joint0", "joint1", "joint2"}
+    assert set(found.run.kinds.values()) == {"angle"}
 
 
 def test_torques_and_attitudes_that_move_alike_are_no_sensors(tmp_path: Path) -> None:
@@ -793,7 +794,7 @@ def test_doubts_are_said_with_their_numbers(tmp_path: Path) -> None:
     write(log / "encoder.csv", {"time_s": s + 1e6, "x_m": z[:, 0]})
     found = survey(log)
     said = "\n".join(asked(found))
-    assert "camera does not follow the commands on x (correlation" in said
+    assert "camera is not used on x: it does not follow the commands (correlation" in said
     assert "laser moves 1e+03 times as far as commanded on x: is its unit right?" in said
     assert (
         "encoder: its stamps (1000000.004 to 1000019.984 s) are not of the commands' time (0.000 to 19.980 s)" in said
@@ -876,3 +877,44 @@ def test_a_folder_with_many_topics_lists_what_it_does_not_use(tmp_path: Path) ->
     camera, goal = parts_of(tmp_path)
     assert dict(camera.left_out) == {"quality": "quality", "t_sent_s": "another clock"}
     assert dict(goal.left_out) == {"z_m": "always 0"}
+
+
+def test_an_axis_that_does_not_follow_is_left_out_and_the_others_are_fused(tmp_path: Path) -> None:
+    """Its commands, too: where nothing measures them no lag is known, and none is made up."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    own = np.random.default_rng(6).normal(size=len(s)).cumsum()
+    write(log / "goal.csv", {"t_s": t, "a_mm": 1e3 * u[:, 0], "b_mm": 1e3 * u[:, 1], "c_mm": 1e3 * u[:, 2]})
+    write(log / "encoder.csv", {"t_s": s, "a_mm": 1e3 * z[:, 0], "b_mm": own})
+    found = survey(log)
+    run, config = written(found, tmp_path / "out")
+    assert run.axes == ("a",) == tuple(config.arm.axes)
+    said = "\n".join(asked(found))
+    assert "encoder is not used on b: it does not follow the commands (correlation" in said
+    assert "goal is not used on b, c: nothing measures where these commands lead" in said
+
+
+@pytest.mark.parametrize(("gain", "expected"), [(2.002, True), (0.45, True), (1.0, False), (0.93, False)])
+def test_a_gain_that_is_not_about_1_is_a_question(gain: float, expected: bool, tmp_path: Path) -> None:
+    """Consistent as it may be: a gear, or a unit. What is decided says so, too."""
+    t, u, s, z = recorded()
+    write(tmp_path / "goal.csv", {"t_s": t, "turn_rad": u[:, 0]})
+    write(tmp_path / "encoder.csv", {"t_s": s, "turn_rad": gain * z[:, 0]})
+    found = survey(tmp_path)
+    assert (
+        any("times as far as commanded on turn: is that its gear, or a unit?" in one for one in asked(found))
+        is expected
+    )
+    checked = {what: sure for what, _, sure in decisions(found)}
+    assert [*checked] == ["clock", "units", "who is who", "encoder follows"]
+    assert [*checked.values()] == ["sure", "sure", "sure", "a question" if asked else "sure"]
+
+
+def test_where_nothing_follows_no_columns_are_exchanged(tmp_path: Path) -> None:
+    """One sensor that does something else: there is nothing that it could be exchanged with."""
+    t, u, s, _ = recorded()
+    write(tmp_path / "goal.csv", {"t_s": t, "x_mm": 1e3 * u[:, 0]})
+    write(tmp_path / "camera.csv", {"t_s": s, "x_mm": np.random.default_rng(3).normal(size=len(s))})
+    said = "\n".join(asked(survey(tmp_path)))
+    assert "camera does not follow the commands on x" in said and "exchanged" not in said

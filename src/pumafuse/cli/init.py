@@ -13,7 +13,7 @@ from rich.table import Table
 from ..discovery.contents import Part, Signal, rate_of
 from ..discovery.drafts import BASES, FILES, drafts
 from ..discovery.guesses import SensorGuess, guess
-from ..discovery.questions import questions
+from ..discovery.questions import decisions, questions
 from ..discovery.roles import Stream
 from ..discovery.survey import Survey, survey
 from ..errors import ConfigError, counted, printable
@@ -73,6 +73,7 @@ def _tables(found: Survey) -> Iterator[Table]:
         headings = ["what", "axis", "column", "unit", "range", "because"]
         yield table(headings, [[printable(cell, 200) for cell in row] for row in rows])
     yield _relations_table(found)
+    yield table(["decided", "", "how surely"], [[printable(cell, 200) for cell in row] for row in decisions(found)])
 
 
 def _part_row(part: Part) -> list[str]:

@@ -247,7 +247,8 @@ def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) ->
     for one in signals:
         lists.setdefault(leaf(one.column) if one.column.endswith("]") else "", []).append(one)
     for listed, four in lists.items():
-        size = np.linalg.norm([one.plain for one in four], axis=0)
+        with np.errstate(over="ignore"):
+            size = np.linalg.norm([one.plain for one in four], axis=0)
         if listed and len(four) == 4 and bool((np.abs(size[np.isfinite(size)] - 1.0) < _UNIT).all()):
             left_out |= {one.name: "of a quaternion" for one in four}
     return [one for one in signals if one.name not in left_out]

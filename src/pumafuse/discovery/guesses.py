@@ -16,11 +16,9 @@ from ..units import Kind
 from .contents import period_of
 from .following import Following, isolated
 from .sensors import REFERENCE, Alignment, aligned, noise
-from .survey import Survey
+from .survey import AHEAD, FOLLOWS, Survey
 
-_FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 _DELAY_SHARE = 0.6  # of the lag; the PUMA's is 0.6, a servo's on a bus rather 0.75
-_AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
 _UNKNOWN_LAG = 0.1  # s, where nothing follows
 _UNKNOWN_SD, _SMALLEST_SD = 1e-3, 1e-6  # m or rad
 _OUTLIERS, _FEWEST_OUTLIERS = 3e-3, 3  # share and number from which a narrow gate pays: one or two may be anything
@@ -106,7 +104,7 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     period = period_of(run.command)
     if math.isnan(period):
         raise RunError(f"{found.log}: fewer than two commands with stamps of their own")
-    relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= _FOLLOWS}
+    relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= FOLLOWS}
     first, latencies, pairs = _against_each_other(found.run, relations)
     leads = {
         axis: {name: relations[name, axis] for name in run.sensors if (name, axis) in relations} for axis in run.axes
@@ -142,7 +140,7 @@ def _against_each_other(
     later = {base: 0.0, **{name: pair.alignment.latency for name, pair in pairs.items()}}
     first = base if base == REFERENCE else min(later, key=later.__getitem__)
     ahead = float(np.median(lags[first]))
-    ahead = ahead if ahead < -_AHEAD else 0.0
+    ahead = ahead if ahead < -AHEAD else 0.0
     latencies = {name: ahead + max(late - later[first], 0.0) for name, late in later.items()}
     return first, latencies, pairs
 
@@ -179,7 +177,7 @@ def _sensor(
     noises = {} if pair is None else pair.alignment.sd
     relations = {axis: found.relations.get((name, axis)) for axis in found.run.sensors[name].values}
     known = {axis: one for axis, one in relations.items() if one is not None}
-    mirrored = [one.slope < 0.0 for one in known.values() if abs(one.correlation) >= _FOLLOWS]
+    mirrored = [one.slope < 0.0 for one in known.values() if abs(one.correlation) >= FOLLOWS]
     scale = -1.0 if sum(mirrored) > len(mirrored) / 2 else 1.0
     bias = {axis: size for axis, one in known.items() if (size := _bias(found, axis, one, scale, leads[axis]))}
     sd = dict.fromkeys(relations, _UNKNOWN_SD)

@@ -215,6 +215,7 @@ def axis_of(column: str, labels: list[str]) -> str:
         column: Its name, or a field path.
         labels: What the elements of lists are, where the log says so.
     """
+    column = re.sub(r"(?<=\])\.\d+$", "", column)  # a copy of a header
     label = None if unit_of(column) else re.search(r"\[([^\]]*)\]$", column)
     if label and label[1].isdigit():
         if (told := label_of(column, labels)) is not None:

@@ -1,47 +1,88 @@
-"""What the user has to decide, or should look into, about a log."""
+"""What was decided about a log, how surely, and what the user has to decide, in the order in which one checks it.
+
+Clock, units, who is who, what follows: each is nothing without the one before.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
+import numpy as np
+
 from ..errors import printable
 from ..units import MS
+from .following import LATEST
 from .guesses import SensorGuess
 from .roles import another_clock
-from .survey import Survey
+from .survey import AHEAD, FOLLOWS, Survey
 
-_FOLLOWS = 0.5  # correlation of changes
-_OTHER_UNIT = 3.0  # factor by which a sensor may move less or more than its command
+_SAME = 0.8  # correlation of changes from which one follows another for sure
+_OTHER_UNIT, _ABOUT_ONE = 3.0, 1.25  # factors by which a sensor may move less or more than its command
+_LONG = 0.5  # s, of a lag that hardly an arm has
+
+
+def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
+    """What was checked, what it is, and how surely that is known."""
+    if found.roles is not None:
+        roles = found.roles
+        streams = [roles.command, *roles.sensors, *([] if roles.reference is None else [roles.reference])]
+        clocks = {f"{one.part.clock.time.column or 'rows'}": one.part.clock.basis for one in streams if one.part.clock}
+        guessed = [column for column, basis in clocks.items() if basis.endswith(("interval", "default"))]
+        yield "clock", ", ".join(f"{column}: {basis}" for column, basis in clocks.items()), _sure(guessed)
+        signals = [some[0] for one in streams for some in one.axes.values()]
+        units = " and ".join(sorted({one.unit for one in signals}))
+        yield "units", units, _sure([one.column for one in signals if one.basis == "range"])
+        who = ", ".join(f"{one.name} is a sensor" for one in roles.sensors)
+        moved = [one.name for one in streams if "follow" in one.why]
+        yield "who is who", f"{roles.command.part.label} is commanded, {who}", _sure(moved, "by how they move")
+    for name in found.run.sensors:
+        mine = [one for (source, _), one in found.relations.items() if source == name]
+        if mine:
+            lag, gain = (float(np.median([getattr(one, key) for one in mine])) for key in ("lag", "slope"))
+            least = min(abs(one.correlation) for one in mine)
+            as_it_should = least >= _SAME and _is_one(gain) and -AHEAD < lag < _LONG
+            told = f"{lag * MS:.0f} ms late, gain {gain:.3g}, correlation {least:.3f}"
+            yield f"{name} follows", told, "sure" if as_it_should else "a question"
 
 
 def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str]:
-    """Sentences, the gravest first."""
+    """Sentences, in the order in which one checks."""
     run = found.run
-    lags: list[float] = []
+    yield from dict.fromkeys(part.clock.doubt for part in found.parts if part.clock and part.clock.doubt)
+    if found.interpolation:
+        yield (
+            "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"
+            " follows that path sooner than an arm can that holds each command (interpolation_ms in run.toml)"
+        )
+    follow = any(abs(one.correlation) >= _SAME for one in found.relations.values())
+    later = list[str]()
     for name, source in run.sensors.items():
         mine = {axis: found.relations[name, axis] for axis in source.values if (name, axis) in found.relations}
         if not mine:
             why = another_clock(source, run.command)
             yield f"{name}: {why or 'too few measurements, or no motion, while there are commands'}"
         for axis, one in mine.items():
-            if abs(one.correlation) < _FOLLOWS:
-                yield (
-                    f"{name} does not follow the commands on {axis} (correlation {one.correlation:+.2f}): are axes"
-                    " exchanged, or its clock another one?"
+            size = abs(one.slope)
+            if abs(one.correlation) < _SAME:
+                ask = (
+                    ": are axes exchanged, or its clock another one?" if follow else ", nor anything else its commands"
                 )
-            elif not 1.0 / _OTHER_UNIT < abs(one.slope) < _OTHER_UNIT:
-                yield f"{name} moves {abs(one.slope):.3g} times as far as commanded on {axis}: is its unit right?"
-            elif one.lag < 0.0:
+                how = "does not follow" if abs(one.correlation) < FOLLOWS else "hardly follows"
+                later.append(f"{name} {how} the commands on {axis} (correlation {one.correlation:+.2f}){ask}")
+                continue
+            if one.lag < 0.0:
                 yield f"{name} runs {-one.lag * MS:.0f} ms ahead of the commands on {axis}: is its clock another one?"
-            lags.append(one.lag)
+            elif one.lag > _LONG:
+                most = " or more" if one.lag >= LATEST else ""
+                late = f"{one.lag * MS:.0f} ms{most} late"
+                yield f"{name} is {late} on {axis}, as hardly an arm is: is its clock another one?"
+            if not _is_one(size):
+                unit = (
+                    "is its unit right" if not 1.0 / _OTHER_UNIT < size < _OTHER_UNIT else "is that its gear, or a unit"
+                )
+                later.append(f"{name} moves {size:.3g} times as far as commanded on {axis}: {unit}?")
     for one in sensors.values():
         yield from one.doubts
-    if found.interpolation:
-        yield (
-            "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"
-            " follows that path sooner than an arm can that holds each command (interpolation_ms in run.toml)"
-        )
-    yield from dict.fromkeys(part.clock.doubt for part in found.parts if part.clock and part.clock.doubt)
     if found.roles is not None:
         roles = found.roles
         streams = [roles.command, *roles.sensors, *([] if roles.reference is None else [roles.reference])]
@@ -49,8 +90,22 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
         units = sorted({signal.unit for one in guessed.values() for some in one.axes.values() for signal in some})
         if guessed:
             yield f"are the numbers of {', '.join(guessed)} in {' and '.join(units)}? No name says it (run.toml)"
-    if lags and run.reference is None:
+        for stream, why in roles.left_out:
+            if stream.name in {*run.sensors, roles.command.name} or "follow" in why:
+                yield f"{printable(stream.name)} is not used on {', '.join(stream.axes)}: {why}"
+    yield from later
+    if found.relations and run.reference is None:
         yield (
             "how old is a measurement when it is stamped? Commands and measurements tell only the sum of the arm's lag"
             " and that age (fusion.toml, latency_ms)"
         )
+
+
+def _is_one(gain: float) -> bool:
+    """Whether a gain is about 1, whatever its sign."""
+    return 1.0 / _ABOUT_ONE < abs(gain) < _ABOUT_ONE
+
+
+def _sure(doubtful: list[str], else_: str = "a guess") -> str:
+    """How surely something is known."""
+    return f"{else_}: {', '.join(map(printable, dict.fromkeys(doubtful)))}" if doubtful else "sure"

@@ -100,6 +100,22 @@ class Roles:
         reference = None if scored is None else scored.source.beside(command, scored.turns)
         return Run("log", command, sensors, reference, kinds=kinds)
 
+    def without(self, why_not: Mapping[tuple[str, str], str]) -> Roles:
+        """The roles without axes of sensors, by their names, and without axes that nothing measures then."""
+        left_out, sensors = [*self.left_out], list[Stream]()
+        for one in self.sensors:
+            bad = {axis: why_not[one.name, axis] for axis in one.axes if (one.name, axis) in why_not}
+            kept = {axis: signals for axis, signals in one.axes.items() if axis not in bad}
+            left_out += [(replace(one, axes={axis: one.axes[axis]}), why) for axis, why in bad.items()]
+            sensors += [replace(one, axes=kept)] if kept else []
+        measured = {
+            axis for one in (*sensors, *([] if self.reference is None else [self.reference])) for axis in one.axes
+        }
+        told = {axis: signals for axis, signals in self.command.axes.items() if axis in measured}
+        if unmeasured := {axis: signals for axis, signals in self.command.axes.items() if axis not in measured}:
+            left_out.append((replace(self.command, axes=unmeasured), "nothing measures where these commands lead"))
+        return replace(self, command=replace(self.command, axes=told), sensors=sensors, left_out=left_out)
+
 
 def roles_of(parts: Iterable[Part], log: str) -> Roles:
     """Who is who among the parts of a log.

@@ -17,10 +17,14 @@ from ..errors import RunError
 from ..logs.axes import in_axes
 from ..logs.clock import without_strays
 from ..logs.run import Run
+from ..units import MS
 from .contents import Part, parts_of, period_of, without_clock
 from .following import Following
 from .roles import Roles, relations, roles_of
+from .sensors import REFERENCE
 
+FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
+AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
 _SURELY = 0.9  # correlation of changes from which a lag is known well
 SOONER = 2e-3  # s: lags are known to 1 ms
 _STEPS, _FINEST = 10, 1e-3  # of an update period; s
@@ -74,12 +78,25 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     roles = roles_of(parts, str(log))
     if not roles.sensors:
         raise RunError(f"{log}: commands, but nothing that measures where they lead: {_reasons(roles, parts)}")
-    run = without_strays(roles.run)
-    found = Survey(log, run, relations(run), parts, roles)
+    related = relations(without_strays(roles.run))
+    follow = any(abs(one.correlation) >= _SURELY for one in related.values())
+    roles = roles.without({key: why for key, one in related.items() if follow and (why := _does_not_follow(one))})
+    kept = {(one.name, axis) for one in roles.sensors for axis in one.axes}
+    related = {key: one for key, one in related.items() if key in kept or key[0] == REFERENCE}
+    found = Survey(log, without_strays(roles.run), related, parts, roles)
     if step := interpolation(found):
         command = found.run.command.interpolated(step)
         found = replace(found, run=replace(found.run, command=command), interpolation=step)
     return found
+
+
+def _does_not_follow(one: Following) -> str:
+    """Why an axis of a sensor is left out where others follow; empty for one that follows."""
+    if abs(one.correlation) < FOLLOWS:
+        return f"it does not follow the commands (correlation {one.correlation:+.2f}): are columns exchanged?"
+    if one.lag < -AHEAD and abs(one.correlation) < _SURELY:
+        return f"it moves {-one.lag * MS:.0f} ms before its commands (correlation {one.correlation:+.2f})"
+    return ""
 
 
 def interpolation(found: Survey) -> float:
