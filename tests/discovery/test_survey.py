@@ -453,17 +453,37 @@ def test_joints_that_are_desired_are_commands(tmp_path: Path) -> None:
     assert {found.command.kind(axis) for axis in found.command.axes} == {"angle"}
 
 
-def test_a_clock_of_its_own_is_said(tmp_path: Path) -> None:
-    """Motion capture counts from its own start: whatever its file is called, that is why nothing follows."""
+@pytest.mark.parametrize("begins", [START, -7.3, 3 * 3600.0])
+def test_a_clock_of_its_own_is_shifted_and_said(begins: float, tmp_path: Path) -> None:
+    """Motion capture counts from its own start, or in another time zone: whatever its file is called, it is found."""
     t, u, s, z = recorded()
     log = tmp_path / "log"
     log.mkdir()
-    write(log / "commands.csv", {"time_s": t + START, "x_m": u[:, 0]})
-    write(log / "take1.csv", {"time_s": s, "x_m": z[:, 0]})
-    with pytest.raises(pf.PumafuseError, match=r"take1: its stamps \(0\.\d+ to .* are not of the commands' time"):
-        survey(log)
-    (log / "take1.csv").rename(log / "camera.csv")
-    assert any("camera: its stamps (0." in one for one in questions(survey(log)))
+    moving = slice(3, 1000)  # a capture that begins 60 ms later
+    write(log / "commands.csv", {"time_s": t + begins, **{f"{axis}_m": u[:, n] for n, axis in enumerate("xyz")}})
+    write(log / "take1.csv", {"time_s": s[moving], **{f"{axis}_m": z[moving, n] for n, axis in enumerate("xyz")}})
+    found = survey(log)
+    (asked,) = [one for one in questions(found) if "is the clock of take1" in one]
+    side = "behind" if begins > 0 else "ahead of"
+    assert f"{side} the commands'" in asked
+    run, _ = written(found, tmp_path / "out")
+    assert abs(run.sensors["take1"].stamp[0] / 1e9 - begins - 0.06) < 0.061
+    for axis in "xyz":
+        assert found.relations["take1", axis].lag == pytest.approx(LAG, abs=0.065)  # less what nobody can tell
+
+
+def test_a_clock_that_nothing_tells_from_the_lag_is_said_to_be_a_guess(tmp_path: Path) -> None:
+    """A sensor that is recorded for the middle of a run, 5.5 s ahead: its shift is found, its lag is called a guess."""
+    t, u, s, z = recorded(2000)
+    log = tmp_path / "log"
+    log.mkdir()
+    part = slice(300, 1500)
+    write(log / "commands.csv", {"time_s": t, **{f"{axis}_m": u[:, n] for n, axis in enumerate("xyz")}})
+    write(log / "camera.csv", {"time_s": s[part] + 5.5, **{f"{axis}_m": z[part, n] for n, axis in enumerate("xyz")}})
+    (asked,) = [one for one in questions(survey(log)) if "is the clock of camera" in one]
+    ahead = float(asked.partition("camera ")[2].split()[0])
+    assert ahead == pytest.approx(5.5, abs=0.02)  # a bin
+    assert "the lag is a guess" in asked
 
 
 def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:
@@ -709,9 +729,7 @@ def test_doubts_are_said_with_their_numbers(tmp_path: Path) -> None:
     said = "\n".join(questions(found))
     assert "camera does not follow the commands on x (correlation" in said
     assert "laser moves 1e+03 times as far as commanded on x: is its unit right?" in said
-    assert (
-        "encoder: its stamps (1000000.004 to 1000019.984 s) are not of the commands' time (0.000 to 19.980 s)" in said
-    )
+    assert "is the clock of encoder 1000000.004 s ahead of the commands'?" in said
     written(found, tmp_path / "out")
 
 

@@ -38,10 +38,10 @@ def questions(found: Survey) -> Iterator[str]:
             "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"
             " follows that path sooner than an arm can that holds each command (interpolation_ms in run.toml)"
         )
-    yield from dict.fromkeys(part.clock.doubt for part in found.parts if part.clock and part.clock.doubt)
     if found.roles is not None:
         roles = found.roles
         streams = [roles.command, *roles.sensors, *([] if roles.reference is None else [roles.reference])]
+        yield from dict.fromkeys(one.part.clock.doubt for one in streams if one.part.clock and one.part.clock.doubt)
         guessed = {printable(one.part.label): one for one in streams if one.guessed}
         units = sorted({signal.unit for one in guessed.values() for some in one.axes.values() for signal in some})
         if guessed:
