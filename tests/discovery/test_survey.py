@@ -807,3 +807,101 @@ def test_a_folder_with_many_topics_lists_what_it_does_not_use(tmp_path: Path) ->
     camera, goal = parts_of(tmp_path)
     assert dict(camera.left_out) == {"quality": "quality", "t_sent_s": "another clock"}
     assert dict(goal.left_out) == {"z_m": "always 0"}
+
+
+@pytest.mark.parametrize(
+    ("clocks", "column", "unit", "known"),
+    [
+        # a counter of ms, rows 1 ms apart: nothing but the motion says that they are no seconds
+        (lambda n: {"clock": 5_000_000 + n}, "clock", "ms", "motion"),
+        (lambda n: {"t": 812.5 + 1.25 * n}, "t", "ms", "motion"),
+        # whole seconds, beside a counter whose unit is told by them
+        (lambda n: {"stamp": 1_700_000_000 + n // 1000, "KRC": 40_000 + n}, "", "", ""),
+        (
+            lambda n: {"date": [f"2026-03-01 08:00:{k // 250:02d}" for k in n], "KRC": 77_000 + 4 * n},
+            "KRC",
+            "ms",
+            "another clock",
+        ),
+        (lambda n: {"stamp": 1_700_000_000 + n // 500, "ticks": 9 + 2000 * n}, "ticks", "us", "another clock"),
+        # the name says it
+        (lambda n: {"millis": 70 + 2 * n}, "millis", "ms", "name"),
+        (lambda n: {"usec": 2**32 - 1_000_000 + 2000 * n - 2**32 * (n >= 500)}, "usec", "us", "name"),
+        # days of Excel and of MATLAB
+        (lambda n: {"Time": 45_678.25 + n * 0.004 / 86400}, "Time", "days", "range"),
+        (lambda n: {"time": 739_000.5 + n * 0.008 / 86400}, "time", "days", "range"),
+    ],
+)
+def test_clocks_are_those_that_make_sense_of_the_table(
+    clocks: Callable[[Any], dict[str, Any]], column: str, unit: str, known: str, tmp_path: Path
+) -> None:
+    """Numbers of a clock by the motion beside them, by another clock, by their name, or by their date."""
+    n = np.arange(3000)
+    u = np.stack([np.sin(n / 230.0 + k) for k in range(2)])
+    z = np.roll(u, 40, axis=1)
+    columns = {"goal_x_m": u[0], "goal_y_m": u[1], "actual_x_m": z[0], "actual_y_m": z[1], "load": 100 + n % 7}
+    write(tmp_path / "log.csv", clocks(n) | columns)
+    (part,) = parts_of(tmp_path / "log.csv")
+    if not column:  # steps of 1 count rows
+        assert part.clock is None
+        return
+    assert part.clock is not None
+    assert (part.clock.time.column, part.clock.time.unit) == (column, unit)
+    assert part.clock.basis == f"{unit} by {known}"
+    assert bool(part.clock.doubt) == (known == "motion")
+    steps = np.diff(part.clock.stamp) / 1e6  # ms
+    assert steps.min() > 0.9
+    assert steps.max() < 9.0
+    assert {one.column for one in part.signals}.isdisjoint({"stamp", "KRC", "ticks"})
+
+
+def test_seconds_stay_seconds_where_the_motion_is_one_of_a_robot(tmp_path: Path) -> None:
+    """Rows 0.5 s apart with strokes of ten seconds."""
+    n = np.arange(400)
+    write(tmp_path / "log.csv", {"time": 0.5 * n, "goal_x_m": np.sin(n / 6.0), "actual_x_m": np.sin((n - 1) / 6.0)})
+    (part,) = parts_of(tmp_path / "log.csv")
+    assert part.clock is not None
+    assert part.clock.basis == "s by interval"
+
+
+def test_rows_in_packets_are_spread_by_what_counts_them(tmp_path: Path) -> None:
+    """A camera that sends 16 rows at a time follows as late as it would one by one; without a counter it is asked."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    n = np.arange(len(s))
+    sent = s[np.minimum(n // 16 * 16 + 15, len(s) - 1)] + 1e-5 * (n % 16)
+    axes = {f"{axis}_m": z[:, k] for k, axis in enumerate("xyz")}
+    write(log / "commands.csv", {"time_s": t, **{f"{axis}_m": u[:, k] for k, axis in enumerate("xyz")}})
+    write(log / "camera.csv", {"received_s": sent, "frame": 300 + n, **axes})
+    found = check_fuses(log, tmp_path / "out")
+    assert "counter" in drafts(found, tmp_path)["run.toml"]
+    write(log / "camera.csv", {"received_s": sent, **axes})
+    assert any("camera.csv: rows arrive" in one and "no column counts them" in one for one in questions(survey(log)))
+
+
+def test_stamps_that_were_counted_are_said(tmp_path: Path) -> None:
+    """Stamps that are frames over a rate, to the rounding of float32, but not such as were measured."""
+    t, u, z = recorded_at_once()
+    columns = {"step": np.arange(len(t)), "goal_x_m": u[:, 0], "actual_x_m": z[:, 0]}
+    log = tmp_path / "log.csv"
+    write(log, {"time": np.arange(len(t), dtype=np.float32) / np.float32(50.0), **columns})
+    assert any("exactly step / 50" in one for one in questions(survey(log)))
+    write(log, {"time": t + np.random.default_rng(1).normal(scale=1e-4, size=len(t)), **columns})
+    assert not any("exactly" in one for one in questions(survey(log)))
+
+
+def test_thrust_says_nothing_about_the_unit_of_positions(tmp_path: Path) -> None:
+    """Columns that follow nothing, however large, leave the unit alone, and axes of one source share it."""
+    t, u, z = recorded_at_once()
+    columns = {f"goal_{axis}": 30.0 * u[:, n] for n, axis in enumerate("xyz")}  # up to 18 and only 6
+    columns |= {f"actual_{axis}": 30.0 * z[:, n] for n, axis in enumerate("xyz")}
+    write(tmp_path / "log.csv", {"time": t, **columns, "propeller": 4e4 + 1e3 * np.sin(t)})
+    roles = survey(tmp_path / "log.csv").roles
+    assert roles is not None
+    assert {one.unit for some in roles.command.axes.values() for one in some} == {"mm"}
+    small = {name: 0.2 * value for name, value in columns.items()}
+    write(tmp_path / "log.csv", {"time": t, **small, "propeller": 4e4 + 1e3 * np.sin(t)})
+    roles = survey(tmp_path / "log.csv").roles
+    assert roles is not None
+    assert {one.unit for some in roles.command.axes.values() for one in some} == {"m"}
