@@ -12,7 +12,7 @@ from ..errors import counted
 _PERIODS = {2**32 * 1_000: "2^32 us", 2**32 * 1_000_000: "2^32 ms"}  # ns, after which counters of 32 bits begin anew
 _HOUR_NS = 3_600_000_000_000
 _CLOSE = 10  # usual intervals, within which a step is one of these: a dropout may hide some rows
-_FAR_NS = 60_000_000_000  # from all other stamps: a stamp of 0 that is as far is none
+_FAR_NS = 60_000_000_000  # from all other stamps: a stamp of 0 that is as far is none; rows so far apart tell no step
 _WAITS = 10.0  # times the usual interval, from which a row begins another packet
 _FEWEST, _MANY = 10, 0.005  # packets, and their share of the rows; fewer are pauses
 _AT_ONCE_NS = 300_000  # between rows of a packet: nothing that moves an arm is sampled at 3 kHz
@@ -27,15 +27,16 @@ def going_on(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
         label: The file and the column, for the sentences.
     """
     notes, zero = list[str](), stamp == 0
-    if zero.any() and (np.abs(stamp[~zero & (stamp != NO_STAMP)]) >= _FAR_NS).all() and not zero.all():
+    others = stamp[~zero & (stamp != NO_STAMP)]
+    if zero.any() and len(others) >= _FEWEST and np.abs(others).min() >= max(_FAR_NS, float(np.ptp(others))):
         notes.append(f"{label}: {counted(int(zero.sum()), 'stamp')} of 0, far from all others: taken as missing")
         stamp = np.where(zero, NO_STAMP, stamp)
     rows = np.flatnonzero(stamp != NO_STAMP)
-    known = stamp[rows]
-    steps = np.diff(known)
-    if not (steps > 0).any() or int(np.abs(steps).max()) < _HOUR_NS // 2:
+    steps = np.diff(stamp[rows])
+    close = _CLOSE * float(np.median(steps[steps > 0])) if (steps > 0).any() else math.inf
+    if close > _FAR_NS or int(np.abs(steps).max()) < _HOUR_NS // 2:
         return stamp, notes
-    close, back = _CLOSE * float(np.median(steps[steps > 0])), np.zeros(len(steps), dtype=np.int64)
+    back = np.zeros(len(steps), dtype=np.int64)
 
     def take(turns: TimeArray, period: int, words: str) -> None:
         back[:] += turns * period
@@ -47,7 +48,7 @@ def going_on(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
         if turns.any() and turns[np.flatnonzero(turns)[0]] < 0:  # what leaps ahead first is a pause
             take(turns, period, f"begins anew after {words}")
     hours = np.where((back == 0) & (np.abs(np.abs(steps) - _HOUR_NS) <= close), np.sign(steps), 0)
-    if np.count_nonzero(hours) == 1 and close < _HOUR_NS // 2:
+    if np.count_nonzero(hours) == 1:
         take(hours, _HOUR_NS, f"is set {'back' if hours.sum() < 0 else 'ahead'} by an hour, as for daylight saving")
     found = stamp.copy()
     found[rows[1:]] -= np.cumsum(back)
