@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import PumafuseError, RunError
+from pumafuse.logs import tables
 from pumafuse.logs.columns import Table
 from refusals import one_line
 
@@ -303,3 +304,16 @@ def test_decimal_seconds_are_exact(stamps: list[Any]) -> None:
     table = one_column(stamps, pa.decimal128(20, 9))
     assert table.stamps("t", unit="_s")[0].tolist() == [int(stamp * GIGA) for stamp in stamps]
     np.testing.assert_allclose(table.numbers("t", "_m")[0], [float(stamp) for stamp in stamps], rtol=1e-15)
+
+
+def test_thousands_with_commas(tmp_path: Path) -> None:
+    """Cells such as 1,000.123 are numbers where a point says what the comma is; 1,000 alone may be 1."""
+    file = tmp_path / "log.csv"
+    file.write_text('t_s,x_mm,y_mm\n0,"1,234.5","1,000"\n1,999.25,2\n2,"-12,345,678.125",3\n')
+    table = tables.read(file)
+    values, note = table.plain("x_mm")
+    assert values.tolist() == [1234.5, 999.25, -12345678.125]
+    assert note is None
+    values, note = table.plain("y_mm")
+    assert np.isnan(values[0])
+    assert note is not None

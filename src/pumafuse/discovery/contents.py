@@ -49,6 +49,7 @@ _DAYS = ((2e4, 8e4), (7e5, 8e5))  # since 1899 or, as MATLAB counts, since the y
 _FINEST_DAY = 2.5e-5  # days, 2 s: rows of a clock that counts seconds are never so near
 _EVEN = 0.1  # share by which most steps of a counter may differ from the usual one
 _LONGEST_WAIT = 3.0  # packets, that a row waits: of rows that come in bursts by themselves some wait longer
+_ROUNDED, _FLOAT32 = 1.5e-6, 1.2e-7  # s, of stamps in us; share, of stamps in float32
 _ALIKE_SPANS = 1.2  # factor between the spans that two clocks of a table tell
 _METRES = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "Point", "PointStamped", "Odometry", "TransformStamped")
 _RADIANS = ("JointState", "JointTrajectory", "JointTrajectoryControllerState")
@@ -381,7 +382,7 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
     for clock in filter(None, candidates()):
         source = Source(clock.stamp, {one.name: one.plain for one in signals}, table.path.name)
         if not signals or not (stands := standing_clock(source)):
-            return _spread(table, clock, counts), notes
+            return _numbered(table, _spread(table, clock, counts), counts), notes
         notes.append(f"{clock.time.column} is no clock: {stands}")
         coarse = coarse or float(np.ptp(clock.stamp[clock.stamp != NO_STAMP])) / 1e9
     return None, notes
@@ -398,6 +399,22 @@ def _spread(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
         if float(np.ptp(clock.stamp - even.stamp)) / 1e9 < _LONGEST_WAIT * every:
             return replace(even, notes=(*even.notes, f"{what}: stamped by {counter}, along the earliest arrivals"))
     return replace(clock, doubt=f"{what}, and no column counts them: when was each made?")
+
+
+def _numbered(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
+    """A clock with a question where its stamps are exactly what counts the rows over a rate: nobody measured them."""
+    for name in counts if not (clock.time.counter or clock.doubt) else ():
+        number, since = table.plain(name)[0], (clock.stamp - clock.stamp[0]) / 1e9
+        number -= number[0]
+        rate = float(number[-1] / since[-1]) if since[-1] > 0.0 and name not in clock.time.columns else 0.0
+        rounding = max(_ROUNDED, _FLOAT32 * float(np.abs(since).max(initial=0.0)))
+        if rate and _counts(table, name) == 1.0 and (np.abs(since - number / rate) <= rounding).all():
+            return replace(
+                clock,
+                doubt=f"did the loop run at {rate:.4g} Hz? The stamps of {table.path.name} are exactly {name} /"
+                f" {rate:.4g}: they were counted, not measured. If it ran slower, lags are as much longer",
+            )
+    return clock
 
 
 def _counts(table: Table, name: str) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 SMALL_SHIFT = 0.15  # s; a wrong delay, lag or latency may explain as much
 _FARTHEST, _SHARE = 30.0, 0.75  # shifts that are looked for: s, and share of the run
 _FINEST, _MOST = 0.01, 16_384  # s; bins of a run, and how many
+_MOST_FAR, _CLEARLY = 131_072, 0.9  # bins where clocks differ; correlation from which it is known by how much
 _MUCH_BETTER = math.log(4.0)  # another cause than the simplest must leave a quarter of the variance that this leaves
 _AS_GOOD = math.log(1.5)  # of such valleys the nearest counts: a motion may repeat itself
 _LEAST = 1e-6  # share of a variance that is left at least: bins are no finer
@@ -21,6 +22,9 @@ _ROUNDING = 1e-9  # share of a power below which a variance is the rounding of t
 _SPIKE, _MOST_SPIKES = 10.0, 0.25  # times the usual distance from the values around, and the most that are outliers
 _PIECES, _MOVING = 20, 4.0  # short pieces of a run, and how many of them must move
 _SLIGHT = 0.1  # share of the greatest motion below which commands tell nothing at a shift
+
+
+Rows: TypeAlias = tuple[TimeArray, FloatArray]  # stamps [ns] and values
 
 
 class Grid(NamedTuple):
@@ -41,6 +45,11 @@ class Grid(NamedTuple):
         """Bins from ``first`` to ``last`` [ns] as wide as the ``period`` [s] of the commands, or 10 ms."""
         span, step = (last - first) / 1e9, max(period, _FINEST)
         margin = math.ceil(min(_FARTHEST, _SHARE * span) / step)
+        return Grid.around(first, span, step, margin)
+
+    @staticmethod
+    def around(first: int, span: float, step: float, margin: int) -> Grid:
+        """Bins over ``span`` [s] from ``first`` [ns] on, with margins."""
         count = np.arange(-margin, math.ceil(span / step) + margin)
         return Grid(first + np.rint((count + 0.5) * (step * 1e9)).astype(np.int64), step, margin)
 
@@ -128,6 +137,37 @@ def matches(measured: Mapping[str, FloatArray], led: Mapping[str, FloatArray], g
         axis: _match(names[other], shift, measured[axis], commanded[other], fits[axis], other, at)
         for axis, (other, at) in place.items()
     }
+
+
+def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple[float, float]) -> float | None:
+    """How late a sensor is whose clock is another one [s]; None where it follows nothing, or about at once.
+
+    Both are laid side by side from their own beginnings on and shifted by up to half of the run, and to where their
+    clocks would be one; of shifts that are about as good the one counts that is nearest to none.
+
+    Args:
+        led: Stamps [ns], ascending, and commanded values, by axis, (n,).
+        measured: Likewise of the sensor, of the same axes, (m,).
+        near: From and to what lag [s] it would be on the commands' clock.
+    """
+    first, begin = (min(int(stamp[0]) for stamp, _ in one.values()) for one in (led, measured))
+    until, last = (max(int(stamp[-1]) for stamp, _ in one.values()) for one in (led, measured))
+    apart, span, overlap = (begin - first) / 1e9, (last - begin) / 1e9, last > first and begin < until
+    farthest = max(0.5 * span, abs(apart) + near[1] if overlap else 0.0)
+    period = max(float(np.median(np.diff(stamp))) for stamp, _ in led.values()) / 1e9
+    step = max(period, _FINEST, (span + 2.0 * farthest) / _MOST_FAR)
+    grid = Grid.around(begin, span, step, math.ceil(farthest / step))
+    lag = apart + step * np.arange(-grid.margin, grid.margin + 1)
+    left, correlation = np.zeros(len(lag)), np.zeros(len(lag))
+    for axis, (stamp, value) in measured.items():
+        fit = _fits(grid.mean(stamp, value), np.interp(grid.time - begin + first, *led[axis])[None], grid.margin)
+        left += fit.unexplained[0]
+        correlation = np.maximum(correlation, np.abs(fit.correlation[0]))
+    late, here = _nearest(left, np.arange(len(lag))), (near[0] <= lag) & (lag <= near[1])
+    at_once = left[here].min(initial=np.inf) <= left[late] + _MUCH_BETTER
+    if correlation[late] < _CLEARLY or (overlap and at_once):
+        return None
+    return float(lag[late]) + _between(np.exp(left[max(late - 1, 0) : late + 2])) * step
 
 
 def _match(name: str, shift: float, measured: FloatArray, led: FloatArray, fits: _Fits, axis: int, place: int) -> Match:

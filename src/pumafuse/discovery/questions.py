@@ -86,6 +86,7 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
     if found.roles is not None:
         roles = found.roles
         streams = [roles.command, *roles.sensors, *([] if roles.reference is None else [roles.reference])]
+        yield from dict.fromkeys(one.part.clock.doubt for one in streams if one.part.clock and one.part.clock.doubt)
         guessed = {printable(one.part.label): one for one in streams if one.guessed}
         units = sorted({signal.unit for one in guessed.values() for some in one.axes.values() for signal in some})
         if guessed:

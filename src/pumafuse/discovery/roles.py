@@ -5,28 +5,37 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 
-from ..arrays import NO_STAMP
+from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, printable
 from ..logs.run import Run, Source
-from ..units import AN, OF_KIND, TURN, Kind, kind_of
+from ..units import AN, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
 from .contents import Part, Signal, without_clock
 from .following import LATEST, Following, following
+from .matching import far_shift
 from .names import Role
 
 _SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
 _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
+_NEAR = -0.5, 1.5  # s, from and to which lag a sensor is on the commands' clock
+_MOST_LAG, _GUESSED_LAG = 0.5, 0.1  # s, that an arm is late where its clock is shifted
+_FEWEST = 20  # rows
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
 _MOST_APART = 40  # axes of a table that is taken apart by their names
 _MOST_LISTED = 8  # columns in an error
 _NUMBERED = re.compile(r"joint\d+|position")
+_RANGES: dict[Kind, tuple[str, str, float]] = {  # small and large unit, and beyond which number it is the large one
+    "length": ("m", "mm", 10.0),
+    "angle": ("rad", "deg", 2.0 * math.pi),
+}
 _AXIS_WORD = re.compile(r"[xyz]|\d+|")
 
 
@@ -145,6 +154,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         if stream.role == "command":
             left_out.append((stream, "other commands: a run has one source of them; exchange the two to use these"))
             continue
+        stream = _on_one_clock(command, stream)
         axes, why_not = _matched(command, stream)
         if axes and _copies(command, replace(stream, axes=axes)):
             left_out.append((stream, "the same numbers as the commands, at the same time"))
@@ -192,6 +202,55 @@ def another_clock(source: Source, command: Source) -> str:
             f" ({theirs.min():.3f} to {theirs.max():.3f} s): name a clock that both have (run.toml, time)"
         )
     return ""
+
+
+def _on_one_clock(command: Stream, stream: Stream) -> Stream:
+    """A stream on the commands' clock, where it has another one by which it follows nothing, with a question.
+
+    How late it follows is the difference of the clocks and the arm's lag together. Where both begin, or end, at once,
+    or differ by whole hours, that difference is known; else the lag is not.
+    """
+    told, source = command.source, stream.source
+    axes = [axis for axis in stream.axes if axis in command.axes and _same_kind(command, axis, stream, axis)]
+    one, other = command.part.clock, stream.part.clock
+    if not axes or one is None or other is None or (one.time == other.time and command.part.file == stream.part.file):
+        return stream
+    led, measured = ({axis: _rows(rows, axis) for axis in axes} for rows in (told, source))
+    if min(len(stamp) for stamp, _ in (*led.values(), *measured.values())) < _FEWEST:
+        return stream
+    if (late := far_shift(led, measured, _NEAR)) is None:
+        return stream
+    (begun, ended), (begins, ends) = (
+        (min(int(at[0]) for at, _ in rows.values()), max(int(at[-1]) for at, _ in rows.values()))
+        for rows in (led, measured)
+    )
+    hours = round(late / 3600.0) * 3600.0
+    known = {"both begin at once": (begins - begun) / 1e9, "both end at once": (ends - ended) / 1e9}
+    known |= {"time zones are hours apart": hours} if hours else {}
+    why, ahead = next(
+        ((words, by) for words, by in known.items() if 0.0 <= late - by < _MOST_LAG),
+        ("the lag is a guess: nothing tells what of it is the clock's", late - _GUESSED_LAG),
+    )
+    side = "ahead of" if ahead > 0.0 else "behind"
+    doubt = (
+        f"is the clock of {stream.name} {abs(ahead):.3f} s {side} the commands'? So shifted (shift_s in run.toml) it"
+        f" follows them {(late - ahead) * 1e3:.0f} ms late, as {why}; as stamped, {late:.3f} s"
+    )
+    shifted = replace(
+        other,
+        time=structs.replace(other.time, shift=-ahead),
+        basis=f"{other.basis}, shifted",
+        stamp=np.where(other.stamp == NO_STAMP, NO_STAMP, other.stamp - round(ahead * 1e9)),
+        doubt=doubt,
+    )
+    return replace(stream, part=replace(stream.part, clock=shifted))
+
+
+def _rows(source: Source, axis: str) -> tuple[TimeArray, FloatArray]:
+    """Stamps, ascending, and values of the rows that have both."""
+    there = np.isfinite(source.values[axis]) & (source.stamp != NO_STAMP)
+    order = np.argsort(source.stamp[there], kind="stable")
+    return source.stamp[there][order], source.values[axis][there][order]
 
 
 def _streams(part: Part) -> list[Stream]:
@@ -401,28 +460,51 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
 
 
 def _with_units(roles: Roles) -> Roles:
-    """Units that are guesses made to fit: the commands' to sensors whose units are known, then all others' to those."""
+    """Units that are guesses made to fit, one of a kind for each source, by the axes that somebody measures.
+
+    The commands' to sources whose units are known, else by their range; then all others' to those.
+    """
     command, reference = roles.command, roles.reference
-    sure = [one for one in (reference, *reversed(roles.sensors)) if one is not None and not one.guessed]
+    others = [one for one in (reference, *reversed(roles.sensors)) if one is not None]
+    sure = [one for one in others if not one.guessed]
     for one in sure:  # the first sensor has the last word
         command = _fitted(command, one)
+    if not sure:
+        command = _ranged(command, {axis for one in others for axis in one.axes})
     sensors = [_fitted(one, command) for one in roles.sensors]
     return replace(
         roles, command=command, sensors=sensors, reference=None if reference is None else _fitted(reference, command)
     )
 
 
+def _ranged(stream: Stream, measured: Set[str]) -> Stream:
+    """A stream whose guessed units are the likeliest for the range of those of its axes that are measured."""
+    found = dict(stream.axes)
+    for kind in KINDS:
+        small, large, most = _RANGES[kind]
+        mine = {axis: signals for axis, signals in stream.axes.items() if stream.kind(axis) == kind}
+        plain = [one.plain for axis in mine.keys() & measured for one in mine[axis] if one.basis == "range"]
+        unit = large if max((float(np.nanmax(np.abs(one))) for one in plain), default=0.0) > most else small
+        found |= {axis: _in(signals, unit) for axis, signals in mine.items()} if plain else {}
+    return replace(stream, axes=found)
+
+
 def _fitted(stream: Stream, anchor: Stream) -> Stream:
-    """A stream whose guessed units are those in which it moves as far as another."""
+    """A stream whose guessed units, one of each kind, are those in which it moves as far as another."""
     made = dict(stream.axes)
-    for axis in made.keys() & anchor.axes.keys() if stream.guessed else ():
-        wanted = _travel(anchor, axis)
+    shared = [axis for axis in anchor.axes if axis in made and any(one.basis == "range" for one in made[axis])]
+    for kind in KINDS:
+        mine = [axis for axis in shared if anchor.kind(axis) == kind]
+        if not mine:
+            continue
 
-        def misfit(unit: str, axis: str = axis, wanted: float = wanted) -> float:
-            found = _travel(replace(stream, axes={axis: _in(made[axis], unit)}), axis)
-            return abs(math.log(max(found, 1e-12) / max(wanted, 1e-12)))
+        def misfit(unit: str, mine: Sequence[str] = mine) -> float:
+            found = replace(stream, axes={axis: _in(stream.axes[axis], unit) for axis in mine})
+            ratios = [max(_travel(found, axis), 1e-12) / max(_travel(anchor, axis), 1e-12) for axis in mine]
+            return abs(float(np.median(np.log(ratios))))
 
-        made[axis] = _in(made[axis], min(OF_KIND[anchor.kind(axis)], key=misfit))
+        unit = min(OF_KIND[kind], key=misfit)
+        made |= {axis: _in(made[axis], unit) for axis in mine}
     return replace(stream, axes=made)
 
 

@@ -35,6 +35,7 @@ _NANOSECONDS = re.compile("nano|nsec", re.IGNORECASE)
 _GIGA = 10**9
 _WHOLE = r"^[+-]?\d{1,19}$"
 NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
+_GROUPED = r"^[+-]?\d{1,3}(,\d{3})+(\.\d*)?$"  # 1,000.123
 _DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([Zz]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
 _ZONE = r"\d([Zz]|[+-]\d\d(:?\d\d)?)$"  # behind a time
 # Other ways to write a time that cannot be read in two ways, and what stands for them here. With points the day comes
@@ -356,6 +357,9 @@ class Table:
             return column, None
         column = self._cast(name, column, pa.string())
         trimmed = pc.utf8_trim_whitespace(column)
+        grouped = pc.match_substring_regex(trimmed, _GROUPED)
+        if pc.any(pc.and_(grouped, pc.match_substring(trimmed, "."))).as_py():  # else the comma may be a decimal one
+            trimmed = pc.if_else(grouped, pc.replace_substring(trimmed, ",", ""), trimmed)
         numeric = pc.match_substring_regex(trimmed, NUMBER)
         note = self._words(name, column, numeric, "a number")
         return pc.if_else(numeric, trimmed, pa.scalar(None, pa.string())), note
