@@ -21,7 +21,7 @@ import pyarrow.parquet as papq
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, counted, printable
-from ..logs import recordings, tables
+from ..logs import formats, recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, without_sentinels
 from ..logs.messages import PATH, PATH_TIME
 from ..logs.run import Source, standing_clock
@@ -29,6 +29,13 @@ from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
 from . import names
 
 _TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
+_ACCEPTED = "accepted: CSV, JSON, Parquet, .xlsx, .mat, .npy, .npz, MCAP, bags of ROS, .ulg, .rrd"
+_CONVERTED = {
+    **dict.fromkeys((".xls", ".ods"), "save it as .xlsx, or as CSV"),
+    **dict.fromkeys((".pkl", ".pickle"), "in Python: pandas.read_pickle(FILE).to_parquet('log.parquet')"),
+    ".feather": "in Python: pandas.read_feather(FILE).to_parquet('log.parquet')",
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), "in Python: numpy.savez('log.npz', **{name: array of h5py.File(FILE)})"),
+}
 _TEXTS = (".txt", ".dat", ".lvm")  # tables, too; in a folder they may be anything
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
@@ -55,6 +62,7 @@ _VELOCITIES = names.words_in("Twist TwistStamped TwistWithCovariance TwistWithCo
 _SPEEDS = names.words_in("velocity velocities vel speed twist")  # why columns are no positions
 _ARE_VELOCITIES, _UNDECODED = "velocities, no positions", "its messages cannot be decoded"
 _OF_FRAME = ["header", "child_frame_id", "transform"]  # of a transform
+_PX4 = "PX4"  # whose numbers are in SI units
 _CHILD = "child_frame_id"
 _BASES = names.words_in("base world map odom root origin")  # words of frames that stand still
 _TOOLS = names.words_in("tool tcp ee eef effector flange hand gripper")
@@ -171,7 +179,7 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
         if path.suffix in _TEXTS and path != log:
             found += _perhaps(path, rate)
         else:
-            found += _recorded(path) if tables.is_recording(path) else _tabled(path, rate)
+            found += _recorded(path) if tables.is_recording(path) else _each_table(path, rate)
         if len(found) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
     return found
@@ -182,10 +190,8 @@ def _files(log: Path) -> list[Path]:
     if not os.path.exists(log):  # noqa: PTH110 - Path.exists raises on a name that is too long
         raise RunError(f"{log}: no such file or folder")
     if not log.is_dir():
-        if not (log.name.endswith(_TABLES + _TEXTS) or tables.is_recording(log)):
-            raise RunError(
-                f"{log}: no log that can be read; accepted: CSV, lines of JSON, Parquet, MCAP, bags of ROS, .rrd"
-            )
+        if not (log.name.endswith(_TABLES + _TEXTS + formats.ENDINGS) or tables.is_recording(log)):
+            raise RunError(f"{log}: no log that can be read; {_CONVERTED.get(log.suffix, _ACCEPTED)}")
         return [log]
     inside = sorted(path for path in log.rglob("*") if path.is_file())
     if (log / "metadata.yaml").is_file() or (inside and all(path.suffix in (".db3", ".mcap") for path in inside)):
@@ -193,10 +199,9 @@ def _files(log: Path) -> list[Path]:
     if (log / "meta" / "info.json").is_file():  # LeRobot: many files of many episodes
         inside = [path for path in inside if log / "data" in path.parents][:1]
     found = [path for path in inside if path.name.endswith(_TABLES + _TEXTS) or tables.is_recording(path)]
+    found = found or [path for path in inside if path.name.endswith(formats.ENDINGS)]
     if not found:
-        raise RunError(
-            f"{log}: no log in it that can be read; accepted: CSV, lines of JSON, Parquet, MCAP, bags of ROS, .rrd"
-        )
+        raise RunError(f"{log}: no log in it that can be read; {_ACCEPTED}")
     return found
 
 
@@ -288,7 +293,7 @@ def _signal(
         return f"always {known[0]:g}"
     kind = _RADIANS[0] if joint else type_.rpartition("/")[2]
     sliding = kind in _RADIANS and names.is_sliding(joint or path)
-    metres = kind in _METRES or sliding or _ECHOED.match(path)
+    metres = kind in _METRES or sliding or _ECHOED.match(path) or (kind == _PX4 and not names.is_turning(path))
     of_type = "m" if metres else "rad" if kind in _RADIANS or path.startswith(f"{PATH}.") else ""
     unit = names.unit_of(path)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
@@ -467,10 +472,16 @@ def _time_unit(values: FloatArray) -> tuple[str, str]:
 # Tables.
 
 
-def _tabled(path: Path, rate: float) -> Iterator[Part]:
+def _each_table(path: Path, rate: float) -> Iterator[Part]:
+    """A table; of a file with several each of them."""
+    for name in formats.names(path) if path.name.endswith(formats.ENDINGS) else ("",):
+        yield from _tabled(path, rate, name)
+
+
+def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
     """A table; of several runs in it the first, of a sensor's rows those that it calls valid; of tf each frame."""
     fields = _fields(path) if path.suffix == ".parquet" else None
-    read = partial(tables.read, path, growing=True)
+    read = partial(tables.read, path, growing=True, topic=topic)
     if fields is None:
         table = read()
         where = _first_run(table)
@@ -484,7 +495,8 @@ def _tabled(path: Path, rate: float) -> Iterator[Part]:
         where, rows = {**where, **valid}, table.rows
         table = read(fields=fields, where=where)
         notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
-    for place, rows in _by_frame(table, Part(path, where=where, notes=tuple(notes))):
+    type_ = _PX4 if path.suffix == ".ulg" else ""
+    for place, rows in _by_frame(table, Part(path, topic, where=where, type=type_, notes=tuple(notes))):
         yield _part(rows, place, _labels(path), rate)
 
 
@@ -513,7 +525,8 @@ def _by_frame(table: Table, place: Part) -> Iterator[tuple[Part, Table]]:
         where = {**place.where, child: name, **({parent: one} if sum(name == each for _, each in rows) > 1 else {})}
         if not others and len(chosen) == 1:
             where = place.where
-        mine = tables.read(place.file, topic=place.topic, fields=None if place.type == "" else _OF_FRAME, where=where)
+        fields = _OF_FRAME if place.type.endswith("/TFMessage") else None
+        mine = tables.read(place.file, topic=place.topic, fields=fields, where=where)
         yield replace(place, where=where, notes=(*place.notes, *notes)), mine
 
 

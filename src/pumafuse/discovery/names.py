@@ -48,7 +48,7 @@ _NO_POSITIONS = words_in(
     " efforts torque torques tau force forces momentum current currents voltage power pressure mode scaling bits"
     " temperature temperatures temp quality confidence covariance orientation rotation quaternion twist index id seq"
     " sequence count status valid std sd sigma latency duration error header stamp nanosec layout frame done reward"
-    " task episode tick time timestamp"
+    " task episode tick time timestamp lat lon latitude longitude"
 )
 # Words that are something else only without a number: ax1 is an axis.
 _WHOLE = {**dict.fromkeys(words_in("vx vy vz ax ay az"), "a rate"), **dict.fromkeys(words_in("qx qy qz qw"), "turning")}

@@ -25,6 +25,7 @@ import pyarrow.parquet as papq
 
 from ..arrays import BoolArray
 from ..errors import RunError, UnknownNameError, counted, shortened
+from . import formats
 from .columns import BLANK, NUMBER, Table, find, longest, prefixes
 
 Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
@@ -64,7 +65,7 @@ def read(
     topic: str = "",
     entity: str = "",
 ) -> Table:
-    """Read a table (CSV, lines of JSON, gzip allowed for both, or Parquet), or a part of a recording.
+    """Read a table (CSV, lines of JSON, gzip allowed for both, Parquet, :mod:`.formats`), or a part of a recording.
 
     Args:
         path: The file, or the folder of a bag.
@@ -72,7 +73,7 @@ def read(
             line break may then be torn within a number: it is left out, and noted.
         fields: Columns and field paths that will be asked for; only of CSV others are read, too. All for None.
         where: Which rows to read; of Parquet, parts of the file that can have none are skipped.
-        topic: Which part of a recording is the table.
+        topic: Which part of a recording is the table; which of several tables in a file.
         entity: The same in a Rerun recording.
 
     Raises:
@@ -81,7 +82,8 @@ def read(
     where = where or {}
     if is_recording(path):
         return _recording(path, topic, entity, fields, where)
-    if topic or entity:
+    of_several = path.name.endswith(formats.ENDINGS)
+    if (topic and not of_several) or entity:
         key = "topic" if topic else "entity"
         raise RunError(
             f"{path}: a table has no {key}; leave the key out: 'topic' is for MCAP and bags (.mcap, .bag, .db3 or"
@@ -91,7 +93,7 @@ def read(
         if path.suffix == ".parquet":
             (table, names), notes = _parquet(path, fields, where), list[str]()
         else:
-            whole, notes = _of_text(path, growing)
+            whole, notes = _of_several(path, topic) if of_several else _of_text(path, growing)
             table, names = _only(path, whole, where), whole.column_names
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
@@ -216,6 +218,12 @@ def _text(path: Path) -> bytes:
     return content
 
 
+def _of_several(path: Path, name: str) -> tuple[pa.Table, list[str]]:
+    """A table of a file that may have several."""
+    found = formats.table(path, name)
+    return _of_csv(path, found) if isinstance(found, bytes) else (found, [])
+
+
 def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
     """The table in a text; lines with the wrong number of cells, and a torn last line, are left out and noted."""
     text, notes = _text(path), list[str]()
@@ -225,6 +233,12 @@ def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
         notes = [f"{path.name}: {torn}"]
     if path.name.endswith(JSON_LINES):
         return pajson.read_json(pa.BufferReader(text), pajson.ReadOptions(use_threads=False)), notes
+    table, more = _of_csv(path, text)
+    return table, [*more, *notes]
+
+
+def _of_csv(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
+    """The table in a CSV text; lines with the wrong number of cells are left out and noted."""
     try:
         table, more = _parsed(path, text)
         _ = table.column_names  # only now it is seen whether they are UTF-8
@@ -234,7 +248,7 @@ def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
         table, more = _parsed(path, text.decode("cp1252").encode())
         more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
     names = [name or _column(n) for n, name in enumerate(table.column_names)]
-    return pa.table([_listed(one) for one in table.columns], names), [*more, *notes]
+    return pa.table([_listed(one) for one in table.columns], names), more
 
 
 def _listed(column: pa.ChunkedArray) -> pa.ChunkedArray:
