@@ -74,7 +74,7 @@ bench: .venv-bench/.ready
 # Universal: one lock for every platform and Python. No index address goes into it.
 LOCK := uv pip compile --universal --generate-hashes --no-emit-index-url --no-header --quiet
 lock:
-	$(LOCK) pyproject.toml --extra bags --group dev --output-file requirements.lock
+	$(LOCK) pyproject.toml --extra bags --extra formats --group dev --output-file requirements.lock
 	echo ziglang | $(LOCK) - --output-file core/zig.lock
 
 clean:

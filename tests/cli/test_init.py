@@ -233,9 +233,10 @@ def test_a_table_without_stamps_is_read_at_a_rate(tmp_path: Path) -> None:
 
 def test_what_is_no_log_is_one_line(tmp_path: Path) -> None:
     """Nothing is written."""
-    (tmp_path / "a.xlsx").write_text("no log")
+    for name in ("a.docx", "a.xlsx"):
+        (tmp_path / name).write_text("no log")
     assert "no such file or folder" in refused("init", tmp_path / "none")
-    assert "accepted: CSV, lines of JSON, Parquet, MCAP" in refused(
-        "init", tmp_path / "a.xlsx", "-o", tmp_path / "made"
-    )
-    assert names(tmp_path) == {"a.xlsx"}
+    made = "-o", tmp_path / "made"
+    assert "accepted: CSV, lines of JSON, Parquet, MCAP" in refused("init", tmp_path / "a.docx", *made)
+    assert "a.xlsx: cannot be read" in refused("init", tmp_path / "a.xlsx", *made)
+    assert names(tmp_path) == {"a.docx", "a.xlsx"}

@@ -553,3 +553,22 @@ def test_a_growing_file_read_at_any_moment(tmp_path_factory: pytest.TempPathFact
     assert table.stamps("t_ns")[0].tolist() == [stamp for stamp, _ in rows[:whole]]
     np.testing.assert_array_equal(table.numbers("x_mm")[0], [x / 1e3 for _, x in rows[:whole]])
     assert there.endswith("\n") != any("may be torn" in note for note in table.notes)
+
+
+def test_a_header_that_lacks_one_name_names_the_columns_that_it_can(tmp_path: Path) -> None:
+    """The last has none; of R's row names, in quotes, the first; where rows are counted it may be either: refused."""
+    rows = [f"{0.1 * n:.1f};{n * n}.5;7" for n in range(20)]
+    found = csv(tmp_path, "\n".join(["t_s;x_mm", *rows, ""]))
+    assert list(found.columns) == ["t_s", "x_mm", "column 3"]
+    assert found.rows == 20
+    assert found.numbers("x_mm")[0][3] == 9.5e-3
+    assert found.notes == ("log.csv: the header has 2 names, each of 20 rows 3 cells: the last has no name",)
+    of_r = "\n".join(['"t_s","x_mm"', *(f'"{n + 1}",{0.1 * n:.1f},{n * n}.5' for n in range(20)), ""])
+    found = csv(tmp_path, of_r)
+    assert list(found.columns) == ["column 1", "t_s", "x_mm"]
+    assert found.numbers("x_mm")[0][3] == 9.5e-3
+    assert "the first has no name" in found.notes[0]
+    assert "first or of the last column" in refusal(lambda: csv(tmp_path, of_r.replace('"', "")))
+    assert "the table has no rows" in refusal(
+        lambda: csv(tmp_path, "a,b\n" + "".join(f"{n},1,2,3\n" for n in range(9)))
+    )

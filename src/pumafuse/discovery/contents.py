@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,16 +21,24 @@ import pyarrow.parquet as papq
 from msgspec import structs
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
-from ..errors import RunError, printable
-from ..logs import recordings, tables
-from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes, without_sentinels
+from ..errors import RunError, counted, printable
+from ..logs import formats, recordings, tables
+from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, without_sentinels
 from ..logs.manifest import Time
+from ..logs.messages import PATH, PATH_TIME
 from ..logs.run import Source, standing_clock
 from ..logs.stamps import packets
 from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
 from . import names
 
 _TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
+_ACCEPTED = "accepted: CSV, JSON, Parquet, .xlsx, .mat, .npy, .npz, MCAP, bags of ROS, .ulg, .rrd"
+_CONVERTED = {
+    **dict.fromkeys((".xls", ".ods"), "save it as .xlsx, or as CSV"),
+    **dict.fromkeys((".pkl", ".pickle"), "in Python: pandas.read_pickle(FILE).to_parquet('log.parquet')"),
+    ".feather": "in Python: pandas.read_feather(FILE).to_parquet('log.parquet')",
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), "in Python: numpy.savez('log.npz', **{name: array of h5py.File(FILE)})"),
+}
 _TEXTS = (".txt", ".dat", ".lvm")  # tables, too; in a folder they may be anything
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
@@ -51,12 +59,25 @@ _EVEN = 0.1  # share by which most steps of a counter may differ from the usual 
 _LONGEST_WAIT = 3.0  # packets, that a row waits: of rows that come in bursts by themselves some wait longer
 _ROUNDED, _FLOAT32 = 1.5e-6, 1.2e-7  # s, of stamps in us; share, of stamps in float32
 _ALIKE_SPANS = 1.2  # factor between the spans that two clocks of a table tell
-_METRES = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "Point", "PointStamped", "Odometry", "TransformStamped")
+_METRES = names.words_in(
+    "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage"
+)
+_ECHO = re.compile(r"^field\.(transforms0\.)?")
+_ECHOED = re.compile(r"field\..*(position|translation|point)\.[xyz]$")  # of a message by `rostopic echo -p`: in m, too
 _RADIANS = ("JointState", "JointTrajectory", "JointTrajectoryControllerState")
 _OTHER_TYPES = names.words_in(
-    "Image CompressedImage CameraInfo PointCloud2 LaserScan Imu TFMessage Log DiagnosticArray Clock Twist TwistStamped"
-    " Wrench WrenchStamped ParameterEvent Joy OccupancyGrid MarkerArray"
+    "Image CompressedImage CameraInfo PointCloud2 LaserScan Imu Log DiagnosticArray Clock Wrench WrenchStamped"
+    " ParameterEvent Joy OccupancyGrid MarkerArray"
 )
+_VELOCITIES = names.words_in("Twist TwistStamped TwistWithCovariance TwistWithCovarianceStamped")
+_SPEEDS = names.words_in("velocity velocities vel speed twist")  # why columns are no positions
+_ARE_VELOCITIES, _UNDECODED = "velocities, no positions", "its messages cannot be decoded"
+_OF_FRAME = ["header", "child_frame_id", "transform"]  # of a transform
+_PX4 = "PX4"  # whose numbers are in SI units
+_CHILD = "child_frame_id"
+_BASES = names.words_in("base world map odom root origin")  # words of frames that stand still
+_TOOLS = names.words_in("tool tcp ee eef effector flange hand gripper")
+_STREAM_NS = 250_000_000  # between trajectories of one point, up to which they are commands that are sent as they act
 
 
 @dataclass(frozen=True)
@@ -158,7 +179,8 @@ class Part:
     @property
     def stem(self) -> str:
         """Its name without the endings of files."""
-        return self.topic or self.entity or self.file.name.split(".")[0]
+        frame = [str(value) for column, value in self.where.items() if column.endswith(_CHILD)]
+        return "_".join([self.topic or self.entity or self.file.name.split(".")[0], *frame])
 
 
 def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
@@ -176,7 +198,7 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
         if path.suffix in _TEXTS and path != log:
             found += _perhaps(path, rate)
         else:
-            found += _recorded(path) if tables.is_recording(path) else [_tabled(path, rate)]
+            found += _recorded(path) if tables.is_recording(path) else _each_table(path, rate)
         if len(found) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
     return found
@@ -187,10 +209,8 @@ def _files(log: Path) -> list[Path]:
     if not os.path.exists(log):  # noqa: PTH110 - Path.exists raises on a name that is too long
         raise RunError(f"{log}: no such file or folder")
     if not log.is_dir():
-        if not (log.name.endswith(_TABLES + _TEXTS) or tables.is_recording(log)):
-            raise RunError(
-                f"{log}: no log that can be read; accepted: CSV, lines of JSON, Parquet, MCAP, bags of ROS, .rrd"
-            )
+        if not (log.name.endswith(_TABLES + _TEXTS + formats.ENDINGS) or tables.is_recording(log)):
+            raise RunError(f"{log}: no log that can be read; {_CONVERTED.get(log.suffix, _ACCEPTED)}")
         return [log]
     inside = sorted(path for path in log.rglob("*") if path.is_file())
     if (log / "metadata.yaml").is_file() or (inside and all(path.suffix in (".db3", ".mcap") for path in inside)):
@@ -198,10 +218,9 @@ def _files(log: Path) -> list[Path]:
     if (log / "meta" / "info.json").is_file():  # LeRobot: many files of many episodes
         inside = [path for path in inside if log / "data" in path.parents][:1]
     found = [path for path in inside if path.name.endswith(_TABLES + _TEXTS) or tables.is_recording(path)]
+    found = found or [path for path in inside if path.name.endswith(formats.ENDINGS)]
     if not found:
-        raise RunError(
-            f"{log}: no log in it that can be read; accepted: CSV, lines of JSON, Parquet, MCAP, bags of ROS, .rrd"
-        )
+        raise RunError(f"{log}: no log in it that can be read; {_ACCEPTED}")
     return found
 
 
@@ -312,10 +331,11 @@ def _signal(
         return f"always {known[0]:g}"
     kind = _RADIANS[0] if joint else place.type.rpartition("/")[2]
     sliding = kind in _RADIANS and names.is_sliding(joint or path)
-    of_type = "m" if kind in _METRES or sliding else "rad" if kind in _RADIANS else ""
+    metres = kind in _METRES or sliding or _ECHOED.match(path) or (kind == _PX4 and not names.is_turning(path))
+    of_type = "m" if metres else "rad" if kind in _RADIANS or path.startswith(f"{PATH}.") else ""
     unit = names.unit_of(path) or names.unit_of(place.topic or place.entity)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
-    axis = joint or names.axis_of(_called(path, where), labels)
+    axis = joint or names.axis_of(_called(_ECHO.sub("", path), where), labels)
     return Signal(path, axis, unit or of_type, basis, values, where=where)
 
 
@@ -567,12 +587,12 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
             return unit, "range", ""
     if interval < _FINEST_DAY and any(low <= middle <= high for low, high in _DAYS):
         return "days", "range", ""
-    for unit, longest in _INTERVALS.items():
-        second = longest / _INTERVALS["s"]
+    for unit, most in _INTERVALS.items():
+        second = most / _INTERVALS["s"]
         if span and 1.0 / _ALIKE_SPANS < float(np.ptp(known)) / second / span < _ALIKE_SPANS:
             return unit, "another clock", ""
-        if not span and interval <= longest:
-            if interval <= _SLOW * longest or stroke * interval <= _LONGEST_STROKE * second:
+        if not span and interval <= most:
+            if interval <= _SLOW * most or stroke * interval <= _LONGEST_STROKE * second:
                 return unit, "interval", ""
             slow = f"{float(np.ptp(known)) / second:.4g} s, and a stroke takes {stroke * interval / second:.3g} s"
             finer = {"s": "ms", "ms": "us", "us": "ns"}[unit]
@@ -583,10 +603,16 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
 # Tables.
 
 
-def _tabled(path: Path, rate: float) -> Part:
-    """A table; of several runs in it the first, of a sensor's rows those that it calls valid."""
+def _each_table(path: Path, rate: float) -> Iterator[Part]:
+    """A table; of a file with several each of them."""
+    for name in formats.names(path) if path.name.endswith(formats.ENDINGS) else ("",):
+        yield from _tabled(path, rate, name)
+
+
+def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
+    """A table; of several runs in it the first, of a sensor's rows those that it calls valid; of tf each frame."""
     fields = _fields(path) if path.suffix == ".parquet" else None
-    read = partial(tables.read, path, growing=True)
+    read = partial(tables.read, path, growing=True, topic=topic)
     if fields is None:
         table = read()
         where = _first_run(table)
@@ -600,15 +626,52 @@ def _tabled(path: Path, rate: float) -> Part:
         where, rows = {**where, **valid}, table.rows
         table = read(fields=fields, where=where)
         notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
-    return _part(table, Part(path, where=where, notes=tuple(notes)), _labels(path), rate)
+    type_ = _PX4 if path.suffix == ".ulg" else ""
+    for place, rows in _by_frame(table, Part(path, topic, where=where, type=type_, notes=tuple(notes))):
+        yield _part(rows, place, _labels(path), rate)
+
+
+def _by_frame(table: Table, place: Part) -> Iterator[tuple[Part, Table]]:
+    """Of transforms of many frames those that move as seen from a base, of tools where there are any, each as a part.
+
+    Joints turn links: these keep their place in the frame of the link before. Any other table as it is.
+    """
+    child = next((name for name in table.columns if name.endswith(_CHILD)), "")
+    parent, translation = child.replace(_CHILD, "header.frame_id"), child.replace(_CHILD, "transform.translation.")
+    if not child or longest(table.columns, translation + "x") is None:
+        yield place, table
+        return
+    frames = list(zip(table.texts(parent), table.texts(child), strict=True))
+    at = np.stack([table.plain(translation + axis)[0] for axis in "xyz"])
+    rows = {pair: np.array([one == pair for one in frames]) for pair in dict.fromkeys(frames)}
+    links = {name for _, name in rows}
+    moving = [pair for pair, mine in rows.items() if np.ptp(at[:, mine], axis=1).max() > 0.0]
+    chosen = [pair for pair in moving if pair[0] not in links or _called_as(pair[0], _BASES)]
+    chosen = [pair for pair in chosen if _called_as(pair[1], _TOOLS)] or chosen
+    if not chosen:
+        yield replace(place, notes=(*place.notes, "no frame in it moves as seen from a base: links only turn")), table
+    others = [f"{one} → {name}" for one, name in rows if (one, name) not in chosen]
+    notes = [f"transforms of {counted(len(others), 'other frame')} left out: {', '.join(others[:3])}"] if others else []
+    for one, name in chosen:
+        where = {**place.where, child: name, **({parent: one} if sum(name == each for _, each in rows) > 1 else {})}
+        if not others and len(chosen) == 1:
+            where = place.where
+        fields = _OF_FRAME if place.type.endswith("/TFMessage") else None
+        mine = tables.read(place.file, topic=place.topic, fields=fields, where=where)
+        yield replace(place, where=where, notes=(*place.notes, *notes)), mine
+
+
+def _called_as(frame: str, known: frozenset[str]) -> bool:
+    """Whether a frame has one of these words in its name: ``tool0_controller``."""
+    return any(word.rstrip("0123456789") in known for word in names.words(frame))
 
 
 def _perhaps(path: Path, rate: float) -> Iterator[Part]:
     """A text in a folder, which may be anything, if it is a table of positions with a clock of its own."""
     with suppress(RunError):
-        part = _tabled(path, rate)
-        if part.clock and not part.clock.time.rate and part.signals:
-            yield part
+        for part in _tabled(path, rate):
+            if part.clock and not part.clock.time.rate and part.signals:
+                yield part
 
 
 def _validity(table: Table) -> dict[str, Any]:
@@ -682,22 +745,53 @@ def _recorded(path: Path) -> Iterator[Part]:
         )
     for topic in topics:
         place = Part(path, "", topic.name) if path.suffix == ".rrd" else Part(path, topic.name)
-        yield _of_topic(replace(place, type=topic.type, rows=topic.count), topic)
+        place = replace(place, type=topic.type, rows=topic.count)
+        if why := _unread(topic):
+            yield replace(place, notes=(why,))
+            continue
+        try:
+            for part, table in _by_frame(recordings.read(path, topic.name, _wanted(topic)), place):
+                yield _part(table, part, {})
+        except RunError as error:
+            yield replace(place, notes=(str(error).removeprefix(f"{path}: "),))
 
 
-def _of_topic(place: Part, topic: Topic) -> Part:
-    """A topic or entity; one that has no positions is not read."""
+def _unread(topic: Topic) -> str:
+    """Why a topic or entity is not read; empty of one that may have positions."""
+    kind = topic.type.rpartition("/")[2]
+    if kind in _VELOCITIES:
+        return _ARE_VELOCITIES
+    if kind in _OTHER_TYPES or not (topic.fault or any(not names.no_position(name) for name in topic.fields)):
+        return "no positions in messages of this type"
+    return topic.fault and f"{_UNDECODED} ({topic.fault})"
+
+
+def _wanted(topic: Topic) -> list[str]:
+    """The fields of a topic that may be positions or their stamps."""
+    if topic.type.endswith("/TFMessage"):
+        return _OF_FRAME
+    several, times = any("points[1]" in name for name in topic.fields), (topic.first or 0, topic.last or 0)
+    streamed = not several and times[1] - times[0] < _STREAM_NS * (topic.count - 1)
+    if PATH_TIME in topic.fields and not streamed:
+        return [PATH]
     wanted = [name for name in topic.fields if not names.no_position(name)]
-    if topic.type.rpartition("/")[2] in _OTHER_TYPES or not wanted:
-        return replace(place, notes=("no positions in messages of this type",))
-    if any(name.startswith("points[1]") for name in wanted):
-        return replace(place, notes=("its trajectories have several points: a plan, not commands that are sent",))
-    fields = prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
-    try:
-        table = recordings.read(place.file, topic.name, fields)
-    except RunError as error:
-        return replace(place, notes=(str(error).removeprefix(f"{place.file}: "),))
-    return _part(table, place, {})
+    return prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
+
+
+def no_commands(parts: Iterable[Part]) -> str:
+    """What may be the commands and is no positions, and what to do, in words; empty without any."""
+    found = list[str]()
+    for part in parts:
+        speeds = [name for name, why in part.left_out.items() if why in _SPEEDS]
+        speeds = [name for name in speeds if names.column_role(name) == "command"]
+        if _ARE_VELOCITIES in part.notes or speeds:
+            what = f"{part.label} are" if not speeds else f"{', '.join(speeds[:3])} of {part.label} are"
+            found.append(
+                f"{what} velocities, and commands must be positions: integrate them along the measured heading, as"
+                " docs/own-log.md does under 'Commands that are velocities'"
+            )
+        found += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
+    return "; ".join(printable(one, 300) for one in found)
 
 
 def _joint_names(table: Table) -> list[str]:

@@ -50,7 +50,8 @@ _NO_POSITIONS = words_in(
     " thrust thrusts momentum current currents curr amp amps amperes voltage volt volts power pwm duty load pressure"
     " mode scaling bits temperature temperatures temp quality confidence covariance orientation rotation quaternion"
     " quat twist index id seq sequence count status valid std sd sigma latency duration error header stamp nanosec"
-    " layout frame done reward task episode tick time timestamp reset"
+    " layout frame done reward task episode tick time timestamp reset lat lon latitude"
+    " longitude"
 )
 _SPREADS = words_in("std sd sigma error covariance")  # in the unit of a position, and none
 _CHANGES = words_in("delta relative rel incremental increment diff")

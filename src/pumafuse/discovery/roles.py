@@ -13,10 +13,11 @@ from msgspec import structs
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, printable
+from ..logs.messages import PATH_TIME
 from ..logs.run import Run, Source
 from ..units import AN, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
-from .contents import Part, Signal, without_clock
+from .contents import Part, Signal, no_commands, without_clock
 from .following import LATEST, Following, following
 from .matching import far_shift
 from .names import Role
@@ -142,10 +143,10 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         raise RunError(
             f"{log}: no columns of positions with a clock beside them"
             + (f", but {there}" if there else "")
-            + f";{at_a_rate} say in run.toml where they are"
+            + f";{at_a_rate} {_and_then(no_commands(parts))}say in run.toml where they are"
         )
     streams = _uniquely_named(_apart(streams[0]) if len(streams) == 1 else streams)
-    command, why = _command(streams, log)
+    command, why = _command(streams, log, _and_then(no_commands(parts)))
     left_out: list[tuple[Stream, str]] = []
     kept: list[Stream] = []
     for stream in streams:
@@ -275,7 +276,8 @@ def _streams(part: Part) -> list[Stream]:
             names.column_role(part.clock.time.column),
             f"its clock is called '{printable(part.clock.time.column)}'",
         )
-        by_type = ("command" if part.type.endswith("JointTrajectory") else None, f"its messages are {part.type}")
+        tells = part.type.endswith("JointTrajectory") or part.clock.time.column == PATH_TIME
+        by_type = ("command" if tells else None, f"its messages are {part.type}")
         by_state = ("sensor" if part.type.endswith("JointState") else None, f"its messages are {part.type}")
         order = (own, file, clock) if len(groups) > 1 else (file, own, clock)
         role, why = next((one for one in (wanted, *order, by_type, by_state) if one[0]), (None, ""))
@@ -349,7 +351,11 @@ def _uniquely_named(streams: Iterable[Stream]) -> list[Stream]:
     return list(found.values())
 
 
-def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
+def _and_then(advice: str) -> str:
+    return f"{advice}; or " if advice else ""
+
+
+def _command(streams: Sequence[Stream], log: str, advice: str) -> tuple[Stream, str]:
     """The commands, and how they are known: by name, and of several by what follows them; without names by that."""
     called = [one for one in streams if one.role == "command"]
     if len(called) == 1:
@@ -362,7 +368,7 @@ def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
         what = ", ".join(printable(one.part.label) for one in streams)
         raise RunError(
             f"{log}: which numbers are the commands? None is called command, goal, target, desired, setpoint or action,"
-            f" and none runs ahead of others ({what}); say it in run.toml"
+            f" and none runs ahead of others ({what}); {advice}say it in run.toml"
         )
     return best, best.why or "others follow it"
 

@@ -57,7 +57,7 @@ class Survey:
         """The log's name without the endings of files."""
         log = self.log.resolve()
         log = log.parent if log.name == "run.toml" else log
-        return re.sub(r"(\.(csv|parquet|mcap|bag|db3|rrd))?(\.gz)?$", "", log.name) or "log"
+        return re.sub(r"(\.(csv|parquet|mcap|bag|db3|rrd|mat|np[yz]|json|xlsx|ulg))?(\.gz)?$", "", log.name) or "log"
 
 
 def survey(log: Path, rate: float = 0.0) -> Survey:

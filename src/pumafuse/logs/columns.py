@@ -30,7 +30,7 @@ _EXCEL_1970, _MATLAB_1970, _BETWEEN = 25_569.0, 719_529.0, 3e5  # 1970-01-01; da
 LOG_TIME = "log_time"  # when a row was recorded
 NAMES = "name"  # the list beside another one that says what its elements are
 # Seconds and nanoseconds in a struct: ROS 2, ROS 1, Foxglove's JSON schemas, google.protobuf.Timestamp.
-_SPLIT_STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos"))
+SPLIT_STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos"))
 _NANOSECONDS = re.compile("nano|nsec", re.IGNORECASE)
 _GIGA = 10**9
 _WHOLE = r"^[+-]?\d{1,19}$"
@@ -150,7 +150,7 @@ class Table:
         column = self.column(name)
         if pa.types.is_struct(column.type):
             fields = {field.name for field in column.type}
-            split = next((pair for pair in _SPLIT_STAMPS if fields.issuperset(pair)), None)
+            split = next((pair for pair in SPLIT_STAMPS if fields.issuperset(pair)), None)
             if split is not None and not nanoseconds:
                 return self.stamps(f"{name}.{split[0]}", f"{name}.{split[1]}")
         if nanoseconds:
@@ -389,6 +389,7 @@ class Topic:
         first: When the first was recorded, int ns; None: not known.
         last: When the last was.
         fields: Field paths of the numbers in its first message; of an entity, also its timelines.
+        fault: Why its messages cannot be decoded; empty if they can.
     """
 
     name: str
@@ -397,6 +398,7 @@ class Topic:
     first: int | None
     last: int | None
     fields: tuple[str, ...]
+    fault: str = ""
 
 
 def leaf(path: str) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from ..errors import one_line, reason, unknown_part
-from . import bags, entities
+from . import bags, entities, messages
 from .bags import Channel, Faults, Message, Record
 from .columns import LOG_TIME, Table, Topic, joined, numeric_paths, wanted
 
@@ -56,7 +57,8 @@ def topics(path: Path) -> tuple[Topic, ...]:
 
 def _read_topic(path: Path, topic: str, fields: Sequence[str] | None) -> Table:
     faults, seen, names = Faults(), set[Channel](), dict[str, None]()
-    table = joined(_batches(_messages(path, topic, faults, seen), fields, names), f"topic '{topic}'")
+    rows = _rows(_messages(path, topic, faults, seen), fields, faults)
+    table = joined(_batches(rows, fields, names), f"topic '{topic}'")
     notes = faults.notes(path.name)
     if table is None:
         raise unknown_part(path, "topic", topic, {one.topic: one.type for one in sorted(seen)}, notes)
@@ -82,6 +84,21 @@ def _messages(path: Path, topic: str, faults: Faults, seen: set[Channel]) -> Ite
             faults.leave_out("message", error)
         else:
             yield record, message
+
+
+def _rows(
+    found: Iterator[tuple[Record, Message]], fields: Sequence[str] | None, faults: Faults
+) -> Iterable[tuple[Record, Message]]:
+    """Messages as rows: each as one, or, where fields of rows in them are asked for, these; see :mod:`.messages`."""
+    first = next(found, None)
+    if first is None:
+        return []
+    found = chain([first], found)
+    if fields is not None and list(first[1]) == [messages.TRANSFORMS] and not wanted(messages.TRANSFORMS, fields):
+        return messages.each_transform(found)
+    if fields is not None and messages.PATH not in first[1] and wanted(messages.PATH, fields):
+        return messages.each_place(found, faults)
+    return found
 
 
 def _batches(
@@ -128,16 +145,18 @@ def _topics(path: Path) -> tuple[Topic, ...]:
     if not seen:
         raise unknown_part(path, "topic", "", {}, faults.notes(path.name))
     return tuple(
-        Topic(one.topic, one.type, found[one], *ends.get(one, (None, None)), _numbers_in(first.get(one)))
+        Topic(one.topic, one.type, found[one], *ends.get(one, (None, None)), *_fields_in(first.get(one)))
         for one in sorted(seen)
     )
 
 
-def _numbers_in(record: Record | None) -> tuple[str, ...]:
-    """The field paths of the numbers in a message; none if it cannot be decoded."""
+def _fields_in(record: Record | None) -> tuple[tuple[str, ...], str]:
+    """The field paths of the numbers in a message, also of those of its rows; or why it cannot be decoded."""
     if record is None:
-        return ()
+        return (), ""
     try:
-        return tuple(numeric_paths(bags.plain(bags.decoder_of(record.channel)(record.payload))))
-    except bags.DAMAGE:
-        return ()
+        message = bags.plain(bags.decoder_of(record.channel)(record.payload))
+    except bags.DAMAGE as error:
+        return (), reason(error)
+    path = [messages.PATH_TIME] if messages.trajectory_in(message) else []
+    return (*numeric_paths(message), *path), ""

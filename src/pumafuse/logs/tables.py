@@ -25,6 +25,7 @@ import pyarrow.parquet as papq
 
 from ..arrays import BoolArray
 from ..errors import RunError, UnknownNameError, counted, shortened
+from . import formats
 from .columns import BLANK, NUMBER, Table, find, longest, prefixes
 
 Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
@@ -40,6 +41,8 @@ _BESIDE = 3  # rows of numbers that make the line above them a header
 _COMMENT = re.compile(r"\s*(#|%|//)\s*")
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
 _UNIT = re.compile(r"[\[(]?(|-|[µunm]?s|[µum]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(mm|m|deg|rad|°)/s²?)[\])]?")
+_ECHO = "%time,"  # begins the header that `rostopic echo -p` writes
+_TRANSFORMS = b"%time,field.transforms0."  # of /tf: a line has all transforms of a message, as many as it likes
 FIRST = "column 1"  # what the first column is called, if it has no name
 JSON_LINES = (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz")
 _DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\r\n]|$)"  # between separators
@@ -62,7 +65,7 @@ def read(
     topic: str = "",
     entity: str = "",
 ) -> Table:
-    """Read a table (CSV, lines of JSON, gzip allowed for both, or Parquet), or a part of a recording.
+    """Read a table (CSV, lines of JSON, gzip allowed for both, Parquet, :mod:`.formats`), or a part of a recording.
 
     Args:
         path: The file, or the folder of a bag.
@@ -70,7 +73,7 @@ def read(
             line break may then be torn within a number: it is left out, and noted.
         fields: Columns and field paths that will be asked for; only of CSV others are read, too. All for None.
         where: Which rows to read; of Parquet, parts of the file that can have none are skipped.
-        topic: Which part of a recording is the table.
+        topic: Which part of a recording is the table; which of several tables in a file.
         entity: The same in a Rerun recording.
 
     Raises:
@@ -79,7 +82,8 @@ def read(
     where = where or {}
     if is_recording(path):
         return _recording(path, topic, entity, fields, where)
-    if topic or entity:
+    of_several = path.name.endswith(formats.ENDINGS)
+    if (topic and not of_several) or entity:
         key = "topic" if topic else "entity"
         raise RunError(
             f"{path}: a table has no {key}; leave the key out: 'topic' is for MCAP and bags (.mcap, .bag, .db3 or"
@@ -89,7 +93,7 @@ def read(
         if path.suffix == ".parquet":
             (table, names), notes = _parquet(path, fields, where), list[str]()
         else:
-            whole, notes = _of_text(path, growing)
+            whole, notes = _of_several(path, topic) if of_several else _of_text(path, growing)
             table, names = _only(path, whole, where), whole.column_names
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
@@ -214,6 +218,12 @@ def _text(path: Path) -> bytes:
     return content
 
 
+def _of_several(path: Path, name: str) -> tuple[pa.Table, list[str]]:
+    """A table of a file that may have several."""
+    found = formats.table(path, name)
+    return _of_csv(path, found) if isinstance(found, bytes) else (found, [])
+
+
 def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
     """The table in a text; lines with the wrong number of cells, and a torn last line, are left out and noted."""
     text, notes = _text(path), list[str]()
@@ -223,6 +233,12 @@ def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
         notes = [f"{path.name}: {torn}"]
     if path.name.endswith(JSON_LINES):
         return pajson.read_json(pa.BufferReader(text), pajson.ReadOptions(use_threads=False)), notes
+    table, more = _of_csv(path, text)
+    return table, [*more, *notes]
+
+
+def _of_csv(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
+    """The table in a CSV text; lines with the wrong number of cells are left out and noted."""
     try:
         table, more = _parsed(path, text)
         _ = table.column_names  # only now it is seen whether they are UTF-8
@@ -239,7 +255,7 @@ def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
         for place, name in enumerate(names):
             names[place] = f"{name}.{count[name]}" if count[name] else name  # as pandas calls them
             count[name] += 1
-    return pa.table([_listed(one) for one in table.columns], names), [*more, *notes]
+    return pa.table([_listed(one) for one in table.columns], names), more
 
 
 def _listed(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -265,6 +281,7 @@ def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
     """The table in a CSV text, and what was left out of it."""
     if (match := _BARE_LIST.search(text, 0, _HEAD)) and b'"' not in text[: match.start()]:
         text = _BARE_LIST.sub(rb'"\1"', text)
+    text = _transforms_apart(text) if text.startswith(_TRANSFORMS) else text
     layout = _layout(text)
     if layout.separator == " ":
         text = re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)|(?<=[ \t])[ \t]+", b"", text)
@@ -275,7 +292,7 @@ def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
         wrong.append(row)
         return "skip"
 
-    def parsed(**options: Any) -> pa.Table:
+    def parsed(layout: _Layout, **options: Any) -> pa.Table:
         return pacsv.read_csv(
             pa.BufferReader(text),
             read_options=pacsv.ReadOptions(
@@ -291,12 +308,15 @@ def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
         )
 
     try:
-        return parsed(), notes
+        return parsed(layout), notes
     except pa.ArrowInvalid as error:
         if " columns, got " not in str(error):
             raise
     text.decode("utf-8")  # pyarrow cannot hand over a wrong line that is not UTF-8
-    table = parsed(invalid_row_handler=leave_out)
+    table = parsed(layout, invalid_row_handler=leave_out)
+    if not table.num_rows and (short := _short_header(path, table.column_names, layout, wrong)):
+        layout, note = short
+        return parsed(layout), [note, *notes]
     note = (
         f"{path.name}: {counted(len(wrong), 'line')} left out: {wrong[0].actual_columns} cells where the header has"
         f" {wrong[0].expected_columns}, first in line {wrong[0].number}"
@@ -304,6 +324,39 @@ def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
     if table.num_rows == 0:  # not the kind of table that it should be
         raise RunError(f"{path}: the table has no rows; {note}")
     return table, [note, *notes]
+
+
+def _transforms_apart(text: bytes) -> bytes:
+    """The text of ``rostopic echo -p /tf`` with a line for each transform."""
+    header, *lines = text.splitlines()
+    width = header.count(_TRANSFORMS.removeprefix(b"%time"))
+    apart = [b",".join(header.split(b",")[: 1 + width])]
+    for time, *cells in (line.split(b",") for line in lines):
+        apart += [b",".join([time, *cells[place : place + width]]) for place in range(0, len(cells), width)]
+    return b"\n".join([*apart, b""])
+
+
+def _short_header(
+    path: Path, names: list[str], layout: _Layout, rows: Sequence[pacsv.InvalidRow]
+) -> tuple[_Layout, str] | None:
+    """The layout of a text whose header lacks one name, and a note; None of any other.
+
+    R leaves out that of its row names, in quotes in front. Rows that count without quotes may be either.
+
+    Raises:
+        RunError: It cannot be told which name is missing.
+    """
+    if {one.actual_columns for one in rows} != {len(names) + 1}:
+        return None
+    what = f"{path.name}: the header has {counted(len(names), 'name')}, each of {len(rows)} rows {len(names) + 1} cells"
+    first = [_split(one.text, layout.separator)[0].strip() for one in rows[:_BESIDE]]
+    in_front = all(one.startswith('"') for one in first)
+    if not in_front and first in ([str(begin + n) for n in range(len(first))] for begin in (0, 1)):
+        raise RunError(f"{what}: is the name of the first or of the last column missing? Add it to the header")
+    place = 0 if in_front else len(names)
+    whole = [*names[:place], _column(place), *names[place:]]
+    skipped = layout.skipped + (layout.names is None)
+    return layout._replace(names=whole, skipped=skipped), f"{what}: the {'first' if in_front else 'last'} has no name"
 
 
 class _Layout(NamedTuple):
@@ -339,7 +392,8 @@ def _layout(text: bytes) -> _Layout:
     comment = _COMMENT.sub("", lines[first - 1], 1) if first > 0 else ""
     separator = _separator(comment)
     names = _cells(comment, separator)
-    if len(names) == len(_cells(lines[first], separator)) and _begins(lines, first, separator):
+    rows_below = lines[first - 1].startswith(_ECHO) or _begins(lines, first, separator)
+    if first > 0 and len(names) == len(_cells(lines[first], separator)) and rows_below:
         return _Layout(separator, _point(text, separator), first, names, units=False, above=0, broken=broken)
     separator = _separator(lines[first])
     header = -1 if _is_headless(lines, first, separator) else _header(lines, full)

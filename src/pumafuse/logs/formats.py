@@ -1,0 +1,205 @@
+"""Files of other programs with one table or several: MATLAB's, NumPy's, Excel's, PX4's, and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, BinaryIO, TypeAlias, cast
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from ..errors import RunError, one_line, unknown_part
+
+Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
+
+SHEETS = ".xlsx"
+ENDINGS = (".mat", ".npy", ".npz", ".json", ".ulg", SHEETS)
+_FEWEST = 2  # rows: one number is a setting
+
+
+def names(path: Path) -> list[str]:
+    """What the tables of a file are called: the only one is called nothing.
+
+    Raises:
+        RunError: It cannot be read, or has no table.
+    """
+    return list(_tables(path, path.stat().st_mtime_ns if path.is_file() else 0))
+
+
+def table(path: Path, name: str) -> pa.Table | bytes:
+    """A table of a file; of a sheet its cells as CSV.
+
+    Raises:
+        RunError: It cannot be read, or has no such table.
+    """
+    found = _tables(path, path.stat().st_mtime_ns if path.is_file() else 0)
+    if name not in found:
+        raise unknown_part(path, "topic", name, dict.fromkeys(found, "a table"), ())
+    return found[name]
+
+
+@lru_cache(maxsize=1)
+def _tables(path: Path, _written: int) -> dict[str, pa.Table | bytes]:
+    """The tables of a file by name; a file is read once for all of them."""
+    with one_line(path, "'pumafuse[formats]'"), path.open("rb") as file:
+        found = {SHEETS: _sheets, ".ulg": _topics}.get(path.suffix, _arrays)(path, file)
+    if not found:
+        raise RunError(f"{path}: no table in it: nothing has rows of numbers")
+    return {"": next(iter(found.values()))} if len(found) == 1 else found
+
+
+def _sheets(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
+    """The sheets of a workbook that have cells, as CSV."""
+    from openpyxl import load_workbook
+
+    book: Any = load_workbook(file, read_only=True, data_only=True)
+    found = dict[str, pa.Table | bytes]()
+    for sheet in book.worksheets:
+        text = io.StringIO()
+        rows = (row for row in sheet.iter_rows(values_only=True) if any(cell is not None for cell in row))
+        csv.writer(text).writerows([c.isoformat() if isinstance(c, datetime) else c for c in row] for row in rows)
+        if text.tell():
+            found[sheet.title] = text.getvalue().encode()
+    return found
+
+
+def _topics(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
+    """The topics of a log of PX4, whose stamps are in us."""
+    from pyulog import ULog  # pyright: ignore[reportMissingTypeStubs]
+
+    found = dict[str, pa.Table | bytes]()
+    for topic in cast(Any, ULog)(file).data_list:
+        data: Mapping[str, npt.NDArray[Any]] = topic.data
+        columns = {f"{name}_us" if name.startswith("timestamp") else name: column for name, column in data.items()}
+        found[f"{topic.name}_{topic.multi_id}" if topic.multi_id else topic.name] = pa.table(columns)
+    return found
+
+
+def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
+    """The tables that arrays, structs and records of a file make."""
+    if path.suffix == ".json":
+        value = _json(file.read())
+    elif path.suffix == ".mat":
+        value = _matlab(path, file)
+    else:
+        loaded: Any = np.load(file, allow_pickle=False)
+        value = dict(loaded) if path.suffix == ".npz" else loaded
+    found = dict[str, pa.Table | bytes]()
+    for name, one in _apart(value, ""):
+        found.update(_by_length(one, name))
+    return found
+
+
+def _json(text: bytes) -> Any:
+    """What a JSON file holds; a list of what its lines do, if each of them is JSON."""
+    try:
+        return msgspec.json.decode(text)
+    except msgspec.DecodeError:
+        return cast(Any, msgspec.json.Decoder()).decode_lines(text)
+
+
+def _matlab(path: Path, file: BinaryIO) -> Any:
+    from scipy.io import loadmat  # pyright: ignore
+
+    try:
+        return cast(Any, loadmat)(file, simplify_cells=True)
+    except NotImplementedError:
+        raise RunError(
+            f"{path}: MATLAB's format 7.3, which is HDF5; in MATLAB: clear; load('{path.name}');"
+            f" save('{path.stem}_v7.mat', '-v7')"
+        ) from None
+
+
+def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Values that are tables of their own: those of a struct that has no arrays beside them."""
+    struct = cast(Mapping[str, Any], value) if isinstance(value, Mapping) else dict[str, Any]()
+    inside = {key: one for key, one in struct.items() if not key.startswith("__") and _is_some(one)}
+    if inside and all(isinstance(one, Mapping) and not _is_column(one) for one in inside.values()):
+        for key, one in inside.items():
+            yield from _apart(one, f"{name}.{key}" if name else key)
+    elif len(inside) == 1 and not isinstance(only := next(iter(inside.values())), np.ndarray):
+        yield from _apart(only, name)
+    else:
+        yield name, value
+
+
+def _is_some(value: Any) -> bool:
+    return isinstance(value, Mapping | list) or (isinstance(value, np.ndarray) and value.size > 1)
+
+
+def _is_column(value: Any) -> bool:
+    """Whether a table is a column by its rows, as pandas writes it: {"0": 0.5, "1": 0.6}."""
+    keys = cast(Mapping[str, Any], value)
+    return len(keys) > 0 and all(key.isdigit() for key in keys)
+
+
+def _by_length(value: Any, name: str) -> dict[str, pa.Table]:
+    """Tables of arrays that are equally long, called after their first array where there are several."""
+    columns = dict(_columns(value, ""))
+    lengths = {len(one) for one in columns.values() if one.ndim == 1}
+    groups = dict[int, Arrays]()
+    for key, one in columns.items():
+        along = one.shape[0] in lengths or (not lengths and one.shape[0] >= one.shape[-1])
+        one = one if one.ndim == 1 or along else one.T
+        groups.setdefault(len(one), {})[key] = one
+    groups = {rows: group for rows, group in groups.items() if rows >= _FEWEST}
+    titles = (
+        [name] if len(groups) == 1 else [".".join(filter(None, (name, next(iter(one))))) for one in groups.values()]
+    )
+    return {title: _table(group) for title, group in zip(titles, groups.values(), strict=True)}
+
+
+def _table(arrays: Arrays) -> pa.Table:
+    """A table of arrays (rows,) or (rows, n); of one array without a name its n columns."""
+    if list(arrays) == [""]:
+        whole = arrays[""].reshape(len(arrays[""]), -1)
+        arrays = {f"column {place + 1}": column for place, column in enumerate(whole.T)}
+    columns = {name: pa.array(np.ascontiguousarray(one).ravel()) for name, one in arrays.items()}
+    wide = {name: one.shape[1] for name, one in arrays.items() if one.ndim == 2}
+    lists = {name: pa.FixedSizeListArray.from_arrays(columns[name], width) for name, width in wide.items()}
+    return pa.table({**columns, **lists})
+
+
+def _columns(value: Any, name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """All arrays within a value, by their paths: numbers, text and times of one or two dimensions."""
+    if isinstance(value, Mapping):
+        struct = cast(Mapping[str, Any], value)
+        if {"columns", "data"} <= struct.keys():  # as pandas splits a table
+            struct = dict(zip(struct["columns"], zip(*struct["data"], strict=True), strict=True))
+        if _is_column(struct):
+            struct, value = {}, list(struct.values())
+        for key, one in struct.items():
+            if not key.startswith("__"):
+                yield from _columns(one, f"{name}.{key}" if name else str(key))
+    if isinstance(value, list | tuple):
+        rows = cast(Sequence[Any], value)
+        if rows and all(isinstance(row, Mapping) for row in rows):
+            records = cast(Sequence[Mapping[str, Any]], rows)
+            value = {key: [row.get(key) for row in records] for row in records[:1] for key in row}
+            yield from _columns(value, name)
+            return
+        value = _as_array(rows)
+    if isinstance(value, np.ndarray):
+        array = cast(npt.NDArray[Any], value).squeeze()
+        for field in array.dtype.names or ():
+            yield from _columns(array[field], f"{name}.{field}" if name else field)
+        if array.dtype.kind in "biufUMm" and array.ndim in (1, 2) and array.size:
+            yield name, array.astype(array.dtype.newbyteorder("="))
+
+
+def _as_array(rows: Sequence[Any]) -> npt.NDArray[Any]:
+    """A list as an array: of numbers with NaN for none, or of text; empty of anything else."""
+    try:
+        if any(isinstance(one, str) for one in rows):
+            return np.array(["" if one is None else str(one) for one in rows])
+        whole = np.array(rows) if all(type(one) is int for one in rows) else np.array(rows, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        return np.empty(0)
+    return whole

@@ -1,0 +1,207 @@
+"""Files of other programs: the same numbers as in CSV, and one line for what cannot be read."""
+
+from __future__ import annotations
+
+import csv
+import json
+import struct
+import sys
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from openpyxl import Workbook
+from scipy.io import savemat
+
+import pumafuse as pf
+from pumafuse.arrays import FloatArray
+from pumafuse.discovery.drafts import drafts
+from pumafuse.discovery.guesses import guess
+from pumafuse.discovery.survey import survey
+from pumafuse.errors import PumafuseError, RunError
+from pumafuse.logs import formats, tables
+from refusals import one_line
+
+LAG = 0.09  # s
+TIME = 0.02 * np.arange(600)
+LATER = 0.01 * np.arange(1100) + 0.003
+
+
+def path(t: FloatArray) -> FloatArray:
+    """A smooth motion of two axes from rest [rad], (n, 2)."""
+    t = np.maximum(t, 0.0)
+    return np.stack([0.4 * (1.0 - np.cos(0.9 * t)), 0.3 * (1.0 - np.cos(1.7 * t))], axis=1)
+
+
+TOLD, SEEN = path(TIME), path(LATER - LAG)
+
+
+def npz(folder: Path) -> Path:
+    """Flat arrays of two lengths."""
+    arrays = {"command_t": TIME, "command_rad": TOLD, "encoder_t": LATER, "encoder_rad": SEEN}
+    np.savez(folder / "log.npz", **arrays)
+    return folder / "log.npz"
+
+
+def mat(folder: Path) -> Path:
+    """Structs, as Simulink saves them: rows and columns of numbers, and a setting."""
+    said = {"time": TIME[:, None], "position_rad": TOLD}
+    seen = {"time": LATER[None, :], "position_rad": SEEN.T}
+    savemat(folder / "log.mat", {"command": said, "encoder": seen, "settings": {"gain": 3.0}})
+    return folder / "log.mat"
+
+
+def records(folder: Path) -> Path:
+    """Records of JSON by source."""
+    whole = {
+        name: [{"t": t, "joint": {"a_rad": a, "b_rad": b}} for t, (a, b) in zip(time, values.tolist(), strict=True)]
+        for name, time, values in (("command", TIME, TOLD), ("encoder", LATER, SEEN))
+    }
+    (folder / "log.json").write_text(json.dumps(whole))
+    return folder / "log.json"
+
+
+def columns(folder: Path) -> Path:
+    """Columns of JSON, as pandas writes them, by their rows."""
+
+    def of(values: FloatArray) -> dict[str, float]:
+        return {str(n): float(value) for n, value in enumerate(values)}
+
+    said = {"t": of(TIME), "a_rad": of(TOLD[:, 0]), "b_rad": of(TOLD[:, 1])}
+    seen = {"t": of(LATER), "a_rad": of(SEEN[:, 0]), "b_rad": of(SEEN[:, 1])}
+    (folder / "log.json").write_text(json.dumps({"command": said, "encoder": seen}))
+    return folder / "log.json"
+
+
+def xlsx(folder: Path) -> Path:
+    """Sheets with a title above the header, and dates."""
+    book = Workbook()
+    book.remove(book.active)
+    begin = datetime(2026, 3, 4, 12)
+    for name, time, values in (("command", TIME, TOLD), ("encoder", LATER, SEEN)):
+        sheet = book.create_sheet(name)
+        sheet.append(["recorded in cell 4"])
+        sheet.append(["time", "a_rad", "b_rad"])
+        for t, (a, b) in zip(time, values.tolist(), strict=True):
+            sheet.append([begin + timedelta(seconds=float(t)), a, b])
+    book.save(folder / "log.xlsx")
+    return folder / "log.xlsx"
+
+
+def ulg(folder: Path) -> Path:
+    """A log of PX4, by its format: a message of definitions for each topic, then rows."""
+    fields = "uint64_t timestamp;float[2] joint"
+
+    def message(kind: str, body: bytes) -> bytes:
+        return struct.pack("<HB", len(body), ord(kind)) + body
+
+    said, seen = "position_setpoint", "position_measured"
+    parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message("B", bytes(40))]
+    parts += [message("F", f"{name}:{fields};".encode()) for name in (said, seen)]
+    parts += [message("A", struct.pack("<BH", 0, n) + name.encode()) for n, name in enumerate((said, seen))]
+    for n, time, values in ((0, TIME, TOLD), (1, LATER, SEEN)):
+        rows = zip(time, values.tolist(), strict=True)
+        parts += [message("D", struct.pack("<HQff", n, 5_000_000 + round(t * 1e6), *at)) for t, at in rows]
+    (folder / "log.ulg").write_bytes(b"".join(parts))
+    return folder / "log.ulg"
+
+
+@pytest.mark.parametrize("write", [npz, mat, records, columns, xlsx, ulg])
+def test_a_log_of_several_tables_is_found_and_read_again(write: Callable[[Path], Path], tmp_path: Path) -> None:
+    """Commands and a sensor of another rate in one file: who is who, the unit, the lag; run.toml reads the same."""
+    found = survey(write(tmp_path))
+    assert len(found.run.axes) == 2
+    assert len(found.run.sensors) == 1
+    assert set(found.run.kinds.values()) == {"angle"}
+    for one in found.relations.values():
+        assert one.lag == pytest.approx(LAG, abs=0.003)
+        assert one.slope == pytest.approx(1.0, abs=0.02)
+    (said,), (seen,) = {len(found.run.command.stamp)}, {len(one.stamp) for one in found.run.sensors.values()}
+    assert (said, seen) == (len(TIME), len(LATER))
+    for name, text in drafts(found, *guess(found), tmp_path).items():
+        (tmp_path / name).write_text(text)
+    read = pf.Run.read(tmp_path)
+    for axis, told in zip(found.run.axes, TOLD.T, strict=True):
+        assert np.array_equal(read.command.values[axis], found.run.command.values[axis])
+        assert np.allclose(read.command.values[axis], told, atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz", "mat", "json", "lines", "split", "xlsx"])
+def test_a_single_table_needs_no_name(ending: str, tmp_path: Path) -> None:
+    """A structured array, arrays, a struct, records, lines of them, pandas' split, a sheet: a run in one table."""
+    names = ["time_s", "command.z_mm", "laser.z_mm"]
+    rows = np.round(np.stack([TIME, 1e3 * TOLD[:, 0], 1e3 * path(TIME - LAG)[:, 0]], axis=1), 6)
+    whole: dict[str, Any] = dict(zip(names, rows.T, strict=True))
+    file = tmp_path / f"log.{ending}"
+    match ending:
+        case "npy":
+            np.save(file, np.array(list(map(tuple, rows)), dtype=[(name, ">f8") for name in names]))
+        case "npz":
+            np.savez(file, **whole)
+        case "mat":
+            split = {"command": {"z_mm": rows[:, 1]}, "laser": {"z_mm": rows[:, 2]}}
+            savemat(file, {"run": {"time_s": rows[:, 0], **split, "note": "a cell"}})
+        case "xlsx":
+            book = Workbook()
+            for row in [names, *rows.tolist()]:
+                book.active.append(row)
+            book.save(file)
+        case "split":
+            file = tmp_path / "log.json"
+            file.write_text(json.dumps({"columns": names, "index": list(range(len(rows))), "data": rows.tolist()}))
+        case _:
+            file = tmp_path / "log.json"
+            listed = [dict(zip(names, row, strict=True)) for row in rows.tolist()]
+            file.write_text("\n".join(map(json.dumps, listed)) if ending == "lines" else json.dumps({"rows": listed}))
+    with (tmp_path / "plain.csv").open("w", newline="") as text:
+        csv.writer(text).writerows([names, *rows.tolist()])
+    found, plain = pf.Run.read(file), pf.Run.read(tmp_path / "plain.csv")
+    assert np.array_equal(found.command.stamp, plain.command.stamp)
+    assert np.array_equal(found.command.values["z"], plain.command.values["z"])
+    assert np.array_equal(found.sensors["laser"].values["z"], plain.sensors["laser"].values["z"])
+
+
+def test_an_array_without_names_is_a_table_without_a_header(tmp_path: Path) -> None:
+    """Its columns are numbered, whichever way it lies."""
+    np.save(tmp_path / "a.npy", np.column_stack([TIME, TOLD]))
+    np.save(tmp_path / "b.npy", np.column_stack([TIME, TOLD]).T)
+    for name in ("a.npy", "b.npy"):
+        found = tables.read(tmp_path / name)
+        assert list(found.columns) == ["column 1", "column 2", "column 3"]
+        assert np.array_equal(found.plain("column 3")[0], TOLD[:, 1])
+
+
+def test_what_cannot_be_read_says_how_to_convert_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pickled objects are never loaded; HDF5, torn and empty files, other formats, and a missing library."""
+
+    def refusal(name: str) -> str:
+        return one_line(PumafuseError, lambda: survey(tmp_path / name))
+
+    np.save(tmp_path / "objects.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    assert "allow_pickle" in refusal("objects.npy")
+    (tmp_path / "new.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(124, b" ") + b"\x00\x02IM" + bytes(400))
+    assert "clear; load('new.mat'); save('new_v7.mat', '-v7')" in refusal("new.mat")
+    (tmp_path / "torn.npz").write_bytes(npz(tmp_path).read_bytes()[:900])
+    (tmp_path / "torn.json").write_text('{"t": [1, 2')
+    (tmp_path / "torn.xlsx").write_bytes(b"PK\x03\x04 no book")
+    (tmp_path / "torn.ulg").write_bytes(b"no log of PX4")
+    for name in ("torn.npz", "torn.json", "torn.xlsx", "torn.ulg"):
+        assert f"{name}: cannot be read" in refusal(name)
+    (tmp_path / "empty.json").write_text('{"version": 3, "name": "cell"}')
+    assert "no table in it" in refusal("empty.json")
+    (tmp_path / "old.xls").write_bytes(b"")
+    assert "save it as .xlsx" in refusal("old.xls")
+    assert "has: command_t" in one_line(RunError, lambda: tables.read(tmp_path / "log.npz"))
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    (tmp_path / "later.xlsx").write_bytes(b"PK")
+    assert "pip install 'pumafuse[formats]'" in refusal("later.xlsx")
+
+
+def test_a_file_is_read_again_when_it_was_written_again(tmp_path: Path) -> None:
+    """What was read last is kept, but not beyond a change of the file."""
+    assert len(formats.names(npz(tmp_path))) == 2
+    np.savez(tmp_path / "log.npz", time_s=TIME)
+    assert formats.names(tmp_path / "log.npz") == [""]
