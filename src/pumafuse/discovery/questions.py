@@ -25,7 +25,7 @@ def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
     """What was checked, what it is, and how surely that is known."""
     if found.roles is not None:
         roles = found.roles
-        streams = [roles.command, *roles.sensors, *([] if roles.reference is None else [roles.reference])]
+        streams = [roles.command, *roles.sensors, *filter(None, [roles.reference])]
         clocks = {f"{one.part.clock.time.column or 'rows'}": one.part.clock.basis for one in streams if one.part.clock}
         guessed = [column for column, basis in clocks.items() if basis.endswith(("interval", "default"))]
         yield "clock", ", ".join(f"{column}: {basis}" for column, basis in clocks.items()), _sure(guessed)
@@ -48,7 +48,9 @@ def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
 def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str]:
     """Sentences, in the order in which one checks."""
     run = found.run
-    yield from dict.fromkeys(part.clock.doubt for part in found.parts if part.clock and part.clock.doubt)
+    roles = found.roles
+    streams = [] if roles is None else [roles.command, *roles.sensors, *filter(None, [roles.reference])]
+    yield from dict.fromkeys(one.part.clock.doubt for one in streams if one.part.clock and one.part.clock.doubt)
     if found.interpolation:
         yield (
             "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"
@@ -83,10 +85,7 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
                 later.append(f"{name} moves {size:.3g} times as far as commanded on {axis}: {unit}?")
     for one in sensors.values():
         yield from one.doubts
-    if found.roles is not None:
-        roles = found.roles
-        streams = [roles.command, *roles.sensors, *([] if roles.reference is None else [roles.reference])]
-        yield from dict.fromkeys(one.part.clock.doubt for one in streams if one.part.clock and one.part.clock.doubt)
+    if roles is not None:
         guessed = {printable(one.part.label): one for one in streams if one.guessed}
         units = sorted({signal.unit for one in guessed.values() for some in one.axes.values() for signal in some})
         if guessed:
