@@ -1032,3 +1032,31 @@ def test_thrust_says_nothing_about_the_unit_of_positions(tmp_path: Path) -> None
     roles = survey(tmp_path / "log.csv").roles
     assert roles is not None
     assert {one.unit for some in roles.command.axes.values() for one in some} == {"m"}
+
+
+@pytest.mark.parametrize("stem", ["flight", "reference_log"])
+def test_a_reference_beside_one_other_is_a_set_point(stem: str, tmp_path: Path) -> None:
+    """Where what is measured leads it, as of an arm that looks ahead, the log is refused: the two are not exchanged."""
+    t, u, z = recorded_at_once()
+    tables = {"t_s": t, "ref_x_m": z[:, 0], "pos_x_m": u[:, 0]}
+    write(tmp_path / f"{stem}.csv", tables)
+    with pytest.raises(RunError, match="it does not follow the commands"):
+        survey(tmp_path / f"{stem}.csv")
+    write(tmp_path / f"{stem}.csv", tables | {"ref_x_m": u[:, 0], "pos_x_m": z[:, 0]})
+    found = survey(tmp_path / f"{stem}.csv")
+    assert found.roles is not None
+    assert "set point" in found.roles.command.why
+    assert found.relations[found.roles.sensors[0].name, "x"].lag == pytest.approx(LAG, abs=0.01)
+
+
+def test_a_reference_that_runs_ahead_of_the_commands_is_no_truth(tmp_path: Path) -> None:
+    """Steps that a controller shapes into commands: left out and named; nothing is scored against them."""
+    t, u, _ = recorded_at_once()
+    steps = np.sign(u[:, 0] - 0.3) * 0.3
+    ahead = np.roll(steps, -25)
+    shaped = np.convolve(np.pad(ahead, (50, 0), mode="edge"), np.full(51, 1.0 / 51.0), mode="valid")
+    measured = np.interp(t - LAG, t, shaped) + np.random.default_rng(5).normal(0.0, 1e-4, len(t))
+    write(tmp_path / "log.csv", {"t_s": t, "reference_x_m": ahead, "command_x_m": shaped, "actual_x_m": measured})
+    found = survey(tmp_path / "log.csv")
+    assert found.run.reference is None
+    assert any(one.startswith("reference is not used on x: it does not follow the commands") for one in asked(found))

@@ -111,20 +111,22 @@ class Roles:
         return Run("log", command, sensors, reference, kinds=kinds)
 
     def without(self, why_not: Mapping[tuple[str, str], str]) -> Roles:
-        """The roles without axes of sensors, by their names, and without axes that nothing measures then."""
-        left_out, sensors = [*self.left_out], list[Stream]()
-        for one in self.sensors:
-            bad = {axis: why_not[one.name, axis] for axis in one.axes if (one.name, axis) in why_not}
+        """The roles without axes of sensors or ``reference``, and without axes that nothing measures then."""
+        left_out, found = [*self.left_out], list[Stream]()
+        for one in (*self.sensors, *filter(None, [self.reference])):
+            name = "reference" if one is self.reference else one.name
+            bad = {axis: why_not[name, axis] for axis in one.axes if (name, axis) in why_not}
             kept = {axis: signals for axis, signals in one.axes.items() if axis not in bad}
             left_out += [(replace(one, axes={axis: one.axes[axis]}), why) for axis, why in bad.items()]
-            sensors += [replace(one, axes=kept)] if kept else []
-        measured = {
-            axis for one in (*sensors, *([] if self.reference is None else [self.reference])) for axis in one.axes
-        }
+            found += [replace(one, axes=kept)] if kept else []
+        sensors = [one for one in found if one.role == "sensor"]
+        reference = next((one for one in found if one.role == "reference"), None)
+        measured = {axis for one in found for axis in one.axes}
         told = {axis: signals for axis, signals in self.command.axes.items() if axis in measured}
         if unmeasured := {axis: signals for axis, signals in self.command.axes.items() if axis not in measured}:
             left_out.append((replace(self.command, axes=unmeasured), "nothing measures where these commands lead"))
-        return replace(self, command=replace(self.command, axes=told), sensors=sensors, left_out=left_out)
+        command = replace(self.command, axes=told)
+        return replace(self, command=command, sensors=sensors, reference=reference, left_out=left_out)
 
 
 def roles_of(parts: Iterable[Part], log: str) -> Roles:
@@ -267,11 +269,13 @@ def _streams(part: Part) -> list[Stream]:
             signal = replace(signal, axis=names.axis_of(measured or signal.column.removesuffix(copy), []))
         groups.setdefault((called, listed, copy, bool(measured)), []).append(signal)
     roles = Counter(key for key, *_ in groups)
+    of_file, of_columns = names.role_of(part.stem), {names.column_role(one[0].name) for one in groups.values()}
+    of_file = None if len(groups) > 1 and of_file in of_columns else of_file  # then it is what these columns are
     found = list[Stream]()
     for (key, listed, copy, desired), signals in groups.items():
         wanted = ("command" if desired else None, f"'{signals[0].column}' is of desired values, by its name")
         own = (names.column_role(signals[0].name), f"its columns are called '{key.replace('_', ' ')}'")
-        file = (names.role_of(part.stem), f"it is called '{printable(part.stem)}'")
+        file = (of_file, f"it is called '{printable(part.stem)}'")
         clock = (
             names.column_role(part.clock.time.column),
             f"its clock is called '{printable(part.clock.time.column)}'",
@@ -360,7 +364,11 @@ def _command(streams: Sequence[Stream], log: str, advice: str) -> tuple[Stream, 
     called = [one for one in streams if one.role == "command"]
     if len(called) == 1:
         return called[0], called[0].why
-    # A reference that runs ahead is a set point, as control engineers call it.
+    # A reference that runs ahead, or that stands beside one other alone, is a set point, as control engineers call it.
+    beside = [one for one in streams if one.role != "reference"]
+    if not called and len(streams) == 2 and len(beside) == 1:
+        (set_point,) = (one for one in streams if one.role == "reference")
+        return set_point, f"{set_point.why}, and one other alone is beside them: a set point"
     candidates = (called or [one for one in streams if one.role != "sensor"])[:_MOST_CANDIDATES]
     followers = {one.name: _followers(one, streams) for one in candidates}
     best = max(candidates, key=lambda one: followers[one.name], default=None)
@@ -520,5 +528,6 @@ def _in(signals: Sequence[Signal], unit: str) -> list[Signal]:
 
 def _travel(stream: Stream, axis: str) -> float:
     """How far an axis moves, outliers apart [m or rad]."""
-    low, high = np.nanquantile(stream.source.values[axis], [0.02, 0.98])
-    return float(high - low)
+    value = stream.source.values[axis]
+    low, high = np.nanquantile(value, [0.02, 0.98])
+    return float(high - low) or float(np.nanmax(value) - np.nanmin(value))

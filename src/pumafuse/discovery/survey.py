@@ -82,7 +82,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     follow = any(abs(one.correlation) >= _SURELY for one in related.values())
     roles = roles.without({key: why for key, one in related.items() if follow and (why := _does_not_follow(one))})
     kept = {(one.name, axis) for one in roles.sensors for axis in one.axes}
-    related = {key: one for key, one in related.items() if key in kept or key[0] == REFERENCE}
+    kept |= {(REFERENCE, axis) for axis in roles.reference.axes} if roles.reference else set()
+    related = {key: one for key, one in related.items() if key in kept}
     found = Survey(log, without_strays(roles.run), related, parts, roles)
     if step := interpolation(found):
         command = found.run.command.interpolated(step)
