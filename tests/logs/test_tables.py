@@ -194,6 +194,10 @@ LAYOUTS: dict[str, tuple[str, str]] = {
         "Robot,UR5\nt_s;x_mm\n" + "".join(f"{t};{x}\n".replace(".", ",") for t, x in ROWS),
         "1 line above the header left out",
     ),
+    "a message below the header": (
+        "t_s,x_mm\nINFO  [node-3] recording started\n" + "".join(f"{t},{x}\n" for t, x in ROWS),
+        "1 line left out: 1 cells where the header has 2, first in line 2",
+    ),
     "settings and units": (
         "Trajectories\n100\nt_s,x_mm\n[s],[mm]\n" + "".join(f"{t},{x}\n" for t, x in ROWS),
         "2 lines above the header left out",

@@ -427,17 +427,25 @@ def _whole_lines(lines: Sequence[str]) -> tuple[list[str], bool]:
 def _header(lines: Sequence[str], full: Sequence[int]) -> int:
     """Where the header is: the first full line, if rows of as many cells, as most lines have, begin below it.
 
-    Else it is what stands right above rows of numbers: recorders write their settings on top (``Format Version,1.23``).
+    Else it is what stands right above rows of numbers: recorders write their settings on top (``Format Version,1.23``);
+    but for what a program has written in between (``INFO started``).
     """
     header, separator = full[0], _separator(lines[full[0]])
     if '"' in lines[header]:  # a name may go on in the next line
         return header
     first, *below = (_cells(lines[n], separator) for n in full[: 1 + _BESIDE])
-    begin = next((n for n in full[1:] if _begins(lines, n, _separator(lines[n - 1]))), header + 1)
+    begin = next(
+        (n for n in full[1:] if any(_begins(lines, n, one) for one in {separator, _separator(lines[n - 1])})),
+        header + 1,
+    )
     between = [_cells(lines[n], separator) for n in full[1:] if n < begin]
     most = Counter(len(_split(lines[n], separator)) for n in full).most_common(1)[0][0]
     even = all(len(row) == len(first) == most > 1 for row in below)
-    return begin - 1 if not even or (between and all(map(_is_text, between))) else header
+    if even and not (between and all(map(_is_text, between))):
+        return header
+    count = len(_cells(lines[begin], separator)) if begin < len(lines) else 0
+    right_above = _cells(lines[begin - 1], separator)
+    return header if len(right_above) != count == len(first) > 1 and _is_text(first) else begin - 1
 
 
 def _told_apart(lines: Sequence[str], header: int, separator: str) -> tuple[int, list[str] | None]:
