@@ -19,9 +19,8 @@ from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, lon
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
 from .posterior import GAINS, SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
 
-# Recovery in s. A gain beyond these is a wrong unit; one that recovers is a small error of what is far from that.
-BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.3, 3.0)}
-RECOVERING_GAIN = (0.7, 1.3)
+BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.3, 3.0)}  # recovery [s]
+_USUAL_GAIN, _BEYOND = (0.7, 1.3), 1.25  # where it may be; where least squares find another, so many times that
 # A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
 # 95 % of what is believed of a recovery lies within its bounds.
 PRIORS = {
@@ -98,6 +97,7 @@ class ArmSearch:
     Attributes:
         sensors: By which it is known.
         plain: The arm of least squares; None where nothing moves.
+        limits: Where its numbers may lie.
         rest: What the best arm leaves.
         rests: Likewise, without a disturbance, with a smooth one and with a rough one.
         posterior: All models that count, along their dead times.
@@ -125,7 +125,13 @@ class ArmSearch:
         self._measured, self._freedom, self.sensors = measured, freedom, measured.sensors
         self._longest = longest_delay(measured.period)
         self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
+        self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
         self._fits = self._by_least_squares() if near is None else near._fits
+        still = {model: fit for model, fit in self._fits.items() if model.gain == "static"}
+        gain = self._best(still).arm.gain if still else 1.0
+        low, high = _USUAL_GAIN
+        gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
+        self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
         peaks, branches = self._peaks(noise, least, prior), list[Branch]()
         for evidence, model, peak in peaks:
             walked = (one for one in branches if one.model == model)
@@ -148,25 +154,20 @@ class ArmSearch:
             return max(entries, key=lambda one: one.log_density).arm
         near = min(entries, key=lambda one: abs(one.delay - delay)).arm._replace(delay=delay)
         names = [name for name in self._freedom.names(model) if name != "delay"]
-        return self._measured.fitted(near, names, self.rest, self._limits(names)).arm
+        return self._measured.fitted(near, names, self.rest, self.limits).arm
 
     def lag_scatter(self, model: Model, arm: Arm) -> float:
         """How much more the lag scatters over pieces of the runs than the information says, 1 or more (White, 1982)."""
         names = self._freedom.names(model)
-        free = [name for name, one in zip(names, self._limits(names).inside(arm, names), strict=True) if one]
+        free = [name for name, one in zip(names, self.limits.inside(arm, names), strict=True) if one]
         slope = np.array(
             [(arm.moved([name], [arm.coordinate(name) + _SLOPE]).total - arm.total) / _SLOPE for name in free]
         )
         if not slope.any():
             return 1.0
-        information, scatter = self._measured.scattered(arm, free, self.rest, self._limits(names), _PIECES)
+        information, scatter = self._measured.scattered(arm, free, self.rest, self.limits, _PIECES)
         cov = covariance(information)
         return max(1.0, math.sqrt(float(slope @ cov @ scatter @ cov @ slope) / float(slope @ cov @ slope)))
-
-    def _limits(self, names: Coordinates) -> Limits:
-        """Where these coordinates may lie."""
-        gain = {"gain": RECOVERING_GAIN} if "recovery" in names else {}
-        return Limits({"delay": (0.0, self._longest), **BOUNDS, **gain}, PRIORS)
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
@@ -214,7 +215,7 @@ class ArmSearch:
         varied = "gain" in free.free
         if varied:
             arms = [free.shaped(arm, "static") for arm in arms]
-        log, gain = self._measured.weighed(arms, self.rest, self._limits(()) if varied else None)
+        log, gain = self._measured.weighed(arms, self.rest, self.limits if varied else None)
         table = log.reshape(len(late), len(lags))
         around = np.pad(table, 1, constant_values=-np.inf)
         highest = np.max([np.roll(around, shift, (0, 1)) for shift in product((-1, 0, 1), repeat=2)], axis=0)[
@@ -253,7 +254,7 @@ class ArmSearch:
         if len(tried) <= count:
             return tried
         varied = "gain" in self._freedom.names(model)
-        log, gain = self._measured.weighed(tried, self.rest, self._limits(()) if varied else None)
+        log, gain = self._measured.weighed(tried, self.rest, self.limits if varied else None)
         return [tried[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:count].tolist()]
 
     def _shapes(self, model: Model, arm: Arm) -> Iterator[Arm]:
@@ -293,7 +294,7 @@ class ArmSearch:
 
     def _fit(self, model: Model, start: Arm) -> Fit:
         names = self._freedom.names(model)
-        return self._measured.fitted(start, names, self.rest, self._limits(names))
+        return self._measured.fitted(start, names, self.rest, self.limits)
 
     def _best(self, found: Mapping[Model, Fit]) -> Fit:
         return max(found.values(), key=lambda one: one.log_posterior)
@@ -301,7 +302,7 @@ class ArmSearch:
     def _evidence(self, model: Model, fit: Fit) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly."""
         names = self._freedom.names(model)
-        inside = self._limits(names).inside(fit.arm, names)
+        inside = self.limits.inside(fit.arm, names)
         doubt = _DOUBT if "recovery" in names and not inside[names.index("recovery")] else 0.0
         return self._laplace(fit, names, inside) - doubt
 
@@ -342,7 +343,7 @@ class ArmSearch:
         return Branch(model, [*reversed(sides[0]), middle, *sides[1]])
 
     def _side(self, peak: Fit, names: Coordinates, step: float, slope: FloatArray, least: float) -> Iterator[Entry]:
-        low, high = self._limits(names).range(names)
+        low, high = self.limits.range(names)
         before, move, height = peak.arm, step * slope, -np.inf
         for _ in range(_MOST):
             delay = before.delay + step
@@ -364,10 +365,10 @@ class ArmSearch:
 
     def _at(self, arm: Arm, names: Coordinates) -> Entry:
         """The entry of the best arm with the same dead time."""
-        return self._entry(self._measured.fitted(arm, names, self.rest, self._limits(names)), names)
+        return self._entry(self._measured.fitted(arm, names, self.rest, self.limits), names)
 
     def _entry(self, fit: Fit, names: Coordinates) -> Entry:
-        inside = self._limits(names).inside(fit.arm, names)
+        inside = self.limits.inside(fit.arm, names)
         free = [name for name, one in zip(names, inside, strict=True) if one]
         cov = covariance(fit.information[np.ix_(inside, inside)])
         means = _quantities(fit.arm)

@@ -27,7 +27,7 @@ from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..toml import Interval
 from ..units import MS
-from .arm_search import BOUNDS, RECOVERING_GAIN, ArmSearch, Freedom
+from .arm_search import ArmSearch, Freedom
 from .arms import Arm, Rest
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
@@ -406,8 +406,8 @@ def _arm(config: FusionConfig, found: Mapping[str, ArmSearch], trusted: str) -> 
     return with_shared_delay(config, shares, rounded(delay)) if delay is not None else config, lags
 
 
-def _notes(one: AxisLag) -> list[str]:
-    """What the motion was too poor for, and what to record instead."""
+def _notes(one: AxisLag, gains: tuple[float, float]) -> list[str]:
+    """What the motion was too poor for, and what to record instead; beside the least and the largest gain."""
     found: list[str] = []
     width = one.lag_ci95[1] - one.lag_ci95[0]
     if width > max(_WIDE * abs(one.lag), _WIDE_LAG):
@@ -422,7 +422,7 @@ def _notes(one: AxisLag) -> list[str]:
         )
     if one.gain_ci95 is not None and one.gain_ci95[1] - one.gain_ci95[0] > _WIDE_GAIN:
         found.append("the motion is too poor for the gain; record motion over more of the range")
-    if one.gain in (*BOUNDS["gain"], *RECOVERING_GAIN):
+    if one.gain in gains:
         found.append(
             f"the gain lies at the end of what is believed, {one.gain:g}: the axis moves otherwise than these models"
             " do, and its lag and gain mean little"
@@ -471,7 +471,7 @@ def _axis_lag(search: ArmSearch, arm: Arm, mixture: Mixture, model: Model, trust
     if arm.recovery:
         values |= {"gain_recovery": arm.recovery, "gain_recovery_ci95": interval("gain_recovery", arm.recovery)}
     found = msgspec.structs.replace(found, **values)
-    return msgspec.structs.replace(found, notes=_notes(found))
+    return msgspec.structs.replace(found, notes=_notes(found, search.limits.bounds["gain"]))
 
 
 def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
