@@ -116,3 +116,16 @@ def test_a_camera_whose_latency_steps_tells_nothing_of_the_arms_lag(tmp_path: Pa
     assert sensors["camera"].latency_sd == pytest.approx(0.035, abs=0.002)  # RMS of 0 and 50 ms
     pumafuse("fuse", folder, "-o", tmp_path / "out")
     assert pf.ArmModel.load(tmp_path / "out" / "arm.toml").lag_of("z") == pytest.approx(LATE, abs=2e-3)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_chance_makes_no_sensor_the_earliest(seed: int, tmp_path: Path) -> None:
+    """A camera of a sixth of the rows and ten times the noise: the time of all is the encoder's, not the camera's."""
+    rng, folder = np.random.default_rng(seed), tmp_path / "mount"
+    folder.mkdir()
+    t, u, z = swings(1800)
+    for name, value, every, sd in (("command", u, 1, 0.0), ("encoder", z, 1, 0.05), ("camera", z, 6, 0.5)):
+        table = np.column_stack((t, value + rng.normal(0.0, sd, len(t))))[::every]
+        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="time_s,z_mm", comments="", fmt="%.6f")
+    _, sensors = guess(survey(folder))
+    assert sensors["encoder"].latency == 0.0

@@ -28,6 +28,7 @@ _FAR = 0.05  # of what a sensor saw: what leaves its neighbours farther is no je
 _AWAY = 10.0  # times what the delayed command leaves, from which an arm starts elsewhere than at its first command
 _SOON = 0.5  # of the lag, within which a first measurement tells the start
 _DIFFERENT = 5.0  # sds
+_SURELY = 2.0  # half intervals, from which a sensor is earlier than the densest one
 
 
 @dataclass(frozen=True)
@@ -137,12 +138,17 @@ def _against_each_other(
     base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
     every = {name: aligned([run], base, name) for name in lags if name != base}
     pairs = {name: _Pair(base, one) for name, one in every.items() if one is not None}
-    later = {base: 0.0, **{name: pair.alignment.latency for name, pair in pairs.items()}}
+    later = {base: 0.0, **{name: one.alignment.latency for name, one in pairs.items() if not _hardly_earlier(one)}}
     first = base if base == REFERENCE else min(later, key=later.__getitem__)
     ahead = float(np.median(lags[first]))
     ahead = ahead if ahead < -AHEAD else 0.0
-    latencies = {name: ahead + max(late - later[first], 0.0) for name, late in later.items()}
+    latencies = {name: ahead + max(later.get(name, 0.0) - later[first], 0.0) for name in (base, *pairs)}
     return first, latencies, pairs
+
+
+def _hardly_earlier(pair: _Pair) -> bool:
+    """Whether a sensor seems earlier than the densest one, but not surely: the time of all would be wrong by that."""
+    return -_SURELY * pair.alignment.half < pair.alignment.latency < 0.0
 
 
 def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
