@@ -13,18 +13,23 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import msgspec
+import numpy as np
 
 from .. import toml
 from ..errors import ConfigError, UnknownNameError, shortened, suggestion
-from ..logs.frames import Frame
+from ..logs.frames import CARTESIAN, Frame
 from ..model.arm import ArmModel, arm_of
 from ..model.presets import PRESETS
+from ..space import rotations
+from ..space.rotations import TURNING
 from ..toml import NotNegative, Positive, Time
 from ..units import AN, KINDS, Kind, of_kind, refuse_name
 
 PerAxis = (
     NotNegative | Annotated[dict[str, NotNegative], msgspec.Meta(min_length=1)]
 )  # one number, or one for each axis
+
+Vector = tuple[float, float, float]
 
 SD_BOUNDS = (1e-7, 1.0)  # m or rad; of a sensor's noise that is fitted
 _LONGEST_LATENCY = 3600.0  # s
@@ -88,6 +93,28 @@ PROCESS: dict[Kind, Process] = {  # what is not configured
 }
 
 
+class Placement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A place and an orientation in another frame.
+
+    Attributes:
+        at: Where it is [m].
+        rotation: Its orientation as a rotation vector [rad].
+    """
+
+    at: Vector = msgspec.field(name="at_mm", default=(0.0, 0.0, 0.0))
+    rotation: Vector = msgspec.field(name="rotation_vector_deg", default=(0.0, 0.0, 0.0))
+
+
+class Tool(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A tool that turns.
+
+    Attributes:
+        reference: The orientation R₀ at which the axes rx, ry, rz are 0, as a rotation vector [rad].
+    """
+
+    reference: Vector = msgspec.field(name="reference_rotation_vector_deg")
+
+
 class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """z = scale · p(stamp − latency) + bias + noise.
 
@@ -104,6 +131,9 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         gate: A measurement beyond this many standard deviations is rejected; 0: never.
         gate_rows: Whether one rejected axis rejects the whole row; None: unless all its axes are angles, as of an
             encoder each.
+        frame: Where it stands, base_from_sensor; None: it measures along the base's axes. The noise of each axis is
+            then along the sensor's axes.
+        marker: What it sees, on the tool, tool_from_marker; None: the tool point.
     """
 
     sd: Positive | Annotated[dict[str, Positive], msgspec.Meta(min_length=1)] = msgspec.field(name="sd_mm")
@@ -116,10 +146,23 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     turn: NotNegative = msgspec.field(name="turn_deg", default=0.0)
     gate: NotNegative = 50.0
     gate_rows: bool | None = None
+    frame: Placement | None = None
+    marker: Placement | None = None
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether it stands, or sees the tool, elsewhere than the robot says."""
+        return self.frame is not None or self.marker is not None
 
     def sd_of(self, axis: str) -> float | None:
-        """The noise on one axis [m or rad]; None where the sensor has none and so is not used."""
-        return self.sd.get(axis) if isinstance(self.sd, dict) else self.sd
+        """The noise on one axis of the arm [m or rad]; None where the sensor has none and so is not used."""
+        if not isinstance(self.sd, dict):
+            return self.sd
+        mine = next((axes for axes in (CARTESIAN, TURNING) if axis in axes), None)
+        if self.frame is None or mine is None or not self.sd.keys() >= set(mine):
+            return self.sd.get(axis)
+        along = rotations.matrix(np.array(self.frame.rotation))[mine.index(axis)]
+        return float(np.hypot.reduce(along * [self.sd[one] for one in mine]))
 
     def bias_sd_of(self, axis: str) -> float:
         """The uncertainty of its constant bias on one axis [m or rad]; 0 where none is estimated."""
@@ -153,6 +196,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         start: Prior uncertainty at the start.
         process: Process noise by axis; every axis of the arm is there.
         frame: For streams and runs in x, y, z that have no frame of their own.
+        tool: The reference orientation of a tool that turns; None: a run's mean.
         sensors: By name, in the order of processing of measurements valid at the same instant.
     """
 
@@ -160,6 +204,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     start: Start = Start()
     process: dict[str, Process] = {}
     frame: Frame | None = None
+    tool: Tool | None = None
     sensors: dict[str, Sensor] = {}
 
     def __post_init__(self) -> None:
@@ -397,6 +442,10 @@ def of_all_axes(
             if name not in found:
                 continue
             value = found.pop(name)
+            if isinstance(value, list):  # along three axes of a sensor
+                three = cast(list[Any], value)
+                axes = CARTESIAN if of == "length" else TURNING
+                value = dict(zip(axes, three, strict=True)) if len(three) == 3 and set(axes) <= set(arm.axes) else value
             if of not in arm.kinds:
                 right = of_kind(key, arm.kinds[0])
                 raise ConfigError(f"{where}: {path}.{name}: no axis of the arm is {AN[of]}; give {right}")

@@ -14,7 +14,6 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import PumafuseWarning
 from ..filter.events import COMMAND
 from ..filter.outcome import ABSENT, Outcome
-from ..logs.axes import in_axes
 from ..logs.clock import clock_faults, segments
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
@@ -25,6 +24,7 @@ from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .faults import latency_questions, sensor_faults, starts_in_motion
+from .placing import in_base
 from .score import ReferenceTrack, late_rows, reference_track
 from .segments import NO_STAMP_WORD, Segment, added, best_of, build, counted, on_any_axis, output_times
 
@@ -82,7 +82,7 @@ def fuse(
     if engine == "filterpy" and mode != "filtered":
         raise ValueError(f"the filterpy engine gives filtered estimates only; mode '{mode}' needs the compiled one")
     chosen = None if sensors is None else config.sensor_names(sensors)
-    in_place, placed = in_axes(run, config.frame)
+    in_place, placed, config = in_base(run, config)
     logged, jumps = segments(in_place)
     parts, faults, moving = list[Part](), list[str](), list[str]()
 

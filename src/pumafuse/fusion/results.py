@@ -19,7 +19,6 @@ from ..errors import RunError
 from ..filter.outcome import Outcome
 from ..folders import FolderError
 from ..logs import manifest, tables
-from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run
@@ -28,6 +27,7 @@ from ..model.arm import ArmModel
 from ..units import AN, KINDS, SCREEN, SI, Kind, Screen, kind_of, of_kind, seconds
 from .config import FusionConfig
 from .estimates import AxisEstimate, Estimates, Mode
+from .placing import in_base
 from .score import ReferenceTrack, reference_track
 from .summary import ScoreSummary, Summary, decode, encode, score_axis, summarise
 
@@ -253,7 +253,7 @@ def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTr
         PumafuseError: It is none of these.
     """
     if path.is_dir() or path.suffix == ".toml":
-        run, _ = in_axes(Run.read(path), config.frame)
+        run = in_base(Run.read(path), config)[0]
         parts = [part.reference for part in segments(run)[0] if part.reference is not None]
         if not parts:
             raise RunError(f"{path}: the run has no reference")

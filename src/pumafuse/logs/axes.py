@@ -1,20 +1,28 @@
-"""Conversion of runs logged in x, y, z into runs in the arm's axes."""
+"""Conversion of runs logged in x, y, z, and with orientations, into runs in the arm's axes."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray
 from ..errors import RunError
+from ..space import rotations
+from ..space.rotations import TURNING
 from .clock import segments, without_strays
 from .frames import CARTESIAN, Frame, Placed, Rotated
 from .run import Run, Source
 
+FARTHEST_TURN = math.radians(170.0)  # at 180° a rotation vector changes its sign
+FAR_TURN = math.radians(120.0)  # from where on the axes of a rotation vector are far from linear
 
-def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
+
+def in_axes(run: Run, frame: Frame | None, tool: tuple[float, float, float] | None = None) -> tuple[Run, Placed | None]:
     """The run with every source in x, y, z converted into axes; sources that name axes stay as they are.
+
+    Orientations become axes rx, ry, rz where the commands have one, too.
 
     Stray stamps are removed first (:func:`pumafuse.logs.clock.without_strays`): the start level and the whole turns,
     which x and y leave open, must not come from them.
@@ -22,14 +30,16 @@ def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
     Args:
         run: The run as logged.
         frame: The frame to use where the run itself has none.
+        tool: The reference orientation as a rotation vector [rad]; None: the mean of the commanded ones.
 
     Returns:
         The run in axes and the placed frame; without a frame the run as it is and None.
 
     Raises:
-        RunError: A source gives x without y, or names an axis both ways; or the start is not known in x and y.
+        RunError: A source gives x without y, or names an axis both ways; or the start is not known in x and y; or the
+            tool turns too far.
     """
-    run = without_strays(run)
+    run = _turning(without_strays(run), tool)
     frame = frame if run.frame is None else run.frame
     named = {name for source in (run.command, *run.sensors.values()) for name in source.values}
     if frame is None or named.isdisjoint(CARTESIAN):
@@ -40,6 +50,50 @@ def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
     start = {axis: float(level[0]) for axis, level in _converted(rest, placed, None).values.items()}
     converted = run.each(lambda _, source: command if source is run.command else _converted(source, placed, command))
     return replace(converted, start=start, frame=None), placed
+
+
+def reference_orientation(run: Run) -> tuple[float, float, float] | None:
+    """The mean of the commanded orientations as a rotation vector [rad]; None where none is commanded."""
+    commanded = run.command.orientation
+    if commanded is None or np.isnan(commanded).all():
+        return None
+    x, y, z = rotations.mean(commanded).tolist()
+    return x, y, z
+
+
+def _turning(run: Run, tool: tuple[float, float, float] | None) -> Run:
+    """The run with axes rx, ry, rz instead of orientations, if the commands have one; else without these.
+
+    Raises:
+        RunError: The tool is told to turn farther from its reference orientation than 170°.
+    """
+    tool = tool or reference_orientation(run)
+    if tool is None or run.command.orientation is None:
+        return run.each(lambda _, source: replace(source, orientation=None)) if run.has_orientation else run
+    reference, notes = np.array(tool), list(run.notes)
+
+    def turning(_: str, source: Source) -> Source:
+        if source.orientation is None:
+            return source
+        vector = rotations.vectors(source.orientation, reference)
+        values = dict(source.values) | dict(zip(TURNING, vector.T.copy(), strict=True))
+        spread = dict(source.spread)
+        if source is not run.command:
+            spread |= dict(zip(TURNING, rotations.spread(vector).T.copy(), strict=True))
+        return replace(source, values=values, spread=spread, orientation=None)
+
+    found = run.each(turning)
+    told = np.stack([found.command.values[axis] for axis in TURNING])
+    farthest = float(np.sqrt(np.nanmax(np.sum(told**2, axis=0))))
+    far = (
+        f"{run.command.label}: the tool is told to turn by {math.degrees(farthest):.0f}° from its reference orientation"
+    )
+    if farthest > FARTHEST_TURN:
+        raise RunError(f"{far}; up to 170° can be followed: cut the log, or give another [tool] in fusion.toml")
+    if farthest > FAR_TURN:
+        notes.append(f"{far}: beyond 120° error bars of its orientation are too small")
+    kinds = dict(run.kinds) | dict.fromkeys(TURNING, "angle")
+    return replace(found, tool=tool, kinds=kinds, notes=tuple(notes))
 
 
 def _placed(run: Run, frame: Frame) -> Placed:

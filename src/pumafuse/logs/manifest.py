@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -10,16 +11,21 @@ import msgspec
 import numpy as np
 
 from .. import toml
-from ..arrays import NO_STAMP, TimeArray
+from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import ConfigError, PumafuseError, UnknownNameError
+from ..space import rotations
+from ..space.rotations import CONVENTIONS, TURNING
 from ..toml import NotNegative
 from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
 from .columns import DAYS, Table, leaf
-from .frames import Frame
+from .frames import CARTESIAN, Frame
 from .stamps import going_on, spread
 
 _OF_TIME = {"unit", "nanoseconds", "counter", "shift_s"}  # keys beside a column of stamps
 _MOST = 2**63  # more than a whole number of a column can be
+_LETTERS = {"".join(letters) for letters in product("xyz", repeat=3) if letters[0] != letters[1] != letters[2]}
+_IN_POSE = "position", "orientation"  # what a Pose has, and a Transform:
+_IN_TRANSFORM = "translation", "rotation"
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -100,6 +106,47 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return table.stamps(self.column, self.nanoseconds, self.ending)
 
 
+class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Columns of an orientation in one of three forms, see :mod:`pumafuse.space.rotations`.
+
+    Attributes:
+        quaternion: Four columns.
+        order: Where w is among them.
+        rotation_vector: Three columns of angles along the base's axes.
+        euler: Three columns of angles, in the order of the convention's letters.
+        convention: ``kuka``, ``fanuc``, ``rpy`` or letters as scipy has them; ``abb`` for a quaternion w, x, y, z.
+        unit: Of the angles, without the bar, where their names do not end in it.
+    """
+
+    quaternion: tuple[str, str, str, str] | None = None
+    order: rotations.Order = "xyzw"
+    rotation_vector: tuple[str, str, str] | None = None
+    euler: tuple[str, str, str] | None = None
+    convention: str = ""
+    unit: str = ""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """All its columns."""
+        return self.quaternion or self.rotation_vector or self.euler or ()
+
+    @property
+    def letters(self) -> str:
+        """The axes that Euler angles turn about, in their order."""
+        return CONVENTIONS.get(self.convention, self.convention)
+
+    def read(self, table: Table) -> tuple[FloatArray, list[str]]:
+        """Quaternions x, y, z, w of the rows of a table, (rows, 4), and notes; NaN in rows that have none."""
+        unit = "" if self.quaternion else f"_{self.unit}" if self.unit else None
+        parts = [table.plain(one) if unit == "" else table.numbers(one, unit or "") for one in self.columns]
+        value, notes = np.column_stack([part for part, _ in parts]), [note for _, note in parts if note]
+        if self.quaternion:
+            return rotations.of_quaternions(value, "wxyz" if self.convention == "abb" else self.order), notes
+        if self.rotation_vector:
+            return rotations.of_vectors(value), notes
+        return rotations.of_angles(value, self.letters), notes
+
+
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     """A source of a run: where its rows are, and its columns.
 
@@ -110,6 +157,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
         where: Which of the rows: those in which each of these columns has this value.
         time: Their stamps.
         axes: For each axis its columns, which are added up.
+        orientation: The columns of its orientation.
     """
 
     file: str
@@ -118,6 +166,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     where: dict[str, bool | int | float | str] = {}
     time: Time
     axes: dict[str, list[Column]]
+    orientation: Orientation | None = None
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -128,7 +177,9 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     def fields(self) -> list[str]:
         """All its columns and field paths."""
         axes = [column for columns in self.axes.values() for column in columns]
-        return [*self.time.columns, *(column.column for column in axes), *(name for one in axes for name in one.where)]
+        turning = () if self.orientation is None else self.orientation.columns
+        names = [*self.time.columns, *(column.column for column in axes), *turning]
+        return [*names, *(name for one in axes for name in one.where)]
 
     @property
     def has_own_rows(self) -> bool:
@@ -252,9 +303,13 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         given = {key: axis_of(key, where, f"{path}.start") for key in keys["start"]}
         keys["start"] = {axis: keys["start"][key] for key, axis in given.items()}
         kinds = {axis: kind_of(key) for key, axis in given.items()}
+    if "pose" in keys:
+        keys = _with_pose(keys, where, path)
     own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes", "kinds"}
     axes = {axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in list(keys) if axis not in own}
-    if not axes:
+    if "orientation" in keys:
+        _check_orientation(keys["orientation"], axes, where, f"{path}.orientation")
+    if not axes and "orientation" not in keys:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in x = 'x_mm'")
     if "time" in keys:
         keys["time"] = _time(keys["time"], where, f"{path}.time")
@@ -262,6 +317,47 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         keys["where"] = _where(keys["where"], where, f"{path}.where")
     more = {"kinds": kinds} if kinds else {}
     return toml.struct({**keys, **more, "axes": axes}, kind, where, path)
+
+
+def _with_pose(keys: dict[str, Any], where: str, path: str) -> dict[str, Any]:
+    """The keys of a source with what its ``pose`` stands for: x, y and z in m, and an orientation."""
+    pose = keys["pose"]
+    if not isinstance(pose, str) or not pose:
+        raise ConfigError(f"{where}: {path}.pose: expected the path of a pose in a message, as in 'pose.pose', or '.'")
+    if twice := next((key for key in (*CARTESIAN, "orientation") if key in keys), None):
+        raise ConfigError(f"{where}: {path}: gives {twice} and a pose, which has it; give one")
+    position, orientation = _IN_TRANSFORM if leaf(pose) == "transform" else _IN_POSE
+    inside = "" if pose == "." else f"{pose}."
+    found = {key: value for key, value in keys.items() if key != "pose"}
+    found |= {axis: {"column": f"{inside}{position}.{axis}", "unit": "m"} for axis in CARTESIAN}
+    return found | {"orientation": {"quaternion": [f"{inside}{orientation}.{one}" for one in "xyzw"]}}
+
+
+def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path: str) -> None:
+    """Refuse columns of an orientation that say too much or too little."""
+    one = toml.struct(given, Orientation, where, path)
+    forms = [one.quaternion, one.rotation_vector, one.euler]
+    if sum(form is not None for form in forms) != 1:
+        raise ConfigError(
+            f"{where}: {path}: expected one of quaternion = ['qx', 'qy', 'qz', 'qw'], rotation_vector = ['rx', 'ry',"
+            " 'rz'] and euler = ['A', 'B', 'C']"
+        )
+    if one.euler and not (one.letters in _LETTERS or one.letters.swapcase() in _LETTERS):
+        accepted = ", ".join(CONVENTIONS)
+        raise ConfigError(
+            f"{where}: {path}.convention: expected {accepted}, or letters as in 'ZYX' (about axes that turn along) or"
+            f" 'xyz' (about axes that stay), not '{one.convention}'"
+        )
+    if one.convention and not one.euler and not (one.quaternion and one.convention == "abb"):
+        raise ConfigError(f"{where}: {path}.convention: only Euler angles have one, and a quaternion of ABB's")
+    for column in () if one.quaternion else one.columns:
+        _check_unit({"unit": one.unit} if one.unit else {}, ANGLES, where, path)
+        if kind_of(f"_{one.unit}" if one.unit else leaf(column)) != "angle":
+            raise ConfigError(f"{where}: {path}: '{column}' ends in no unit of an angle; give unit = 'deg' or 'rad'")
+    if twice := next((axis for axis in TURNING if axis in axes), None):
+        raise ConfigError(f"{where}: {path}: the orientation has {twice}, which is an axis of its own, too; give one")
+    if any(column.get("where") for columns in axes.values() for column in columns):
+        raise ConfigError(f"{where}: {path}: axes with rows of their own have no orientation")
 
 
 def _columns(given: Any, where: str, path: str) -> list[Any]:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError, counted
 from ..model.arm import CANONICAL_AXES
+from ..space import rotations
 from ..units import AN, Kind, ending, nanoseconds, unwrapped
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
@@ -50,6 +51,8 @@ class Source:
         spread: For an axis computed by a frame, the factor on the noise of each row, (rows,).
         sd: Standard deviation of the noise of a reference [m or rad], for all axes or for each.
         apart: Whether axes may have rows of their own: NaN is then not invalid, but another axis's row.
+        orientation: That of each row as logged, a quaternion x, y, z, w, NaN where it has none, (rows, 4); None where
+            the source tells none. :func:`pumafuse.logs.axes.in_axes` makes axes of it.
         stray: Rows of commands of which a value is left out, as nobody sent it, (rows,); (0,) where none is.
     """
 
@@ -59,6 +62,7 @@ class Source:
     spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
     sd: float | Mapping[str, float] = 0.0
     apart: bool = False
+    orientation: FloatArray | None = None
     stray: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     def sd_of(self, axis: str) -> float:
@@ -76,14 +80,18 @@ class Source:
         """Rows whose stamp and values are all those of an earlier row, (rows,)."""
         if (np.diff(self.stamp) > 0).all():
             return np.zeros(len(self.stamp), dtype=bool)
-        columns = [self.stamp, *(np.ascontiguousarray(value).view(np.int64) for value in self.values.values())]
+        numbers = [*self.values.values(), *(() if self.orientation is None else self.orientation.T)]
+        columns = [self.stamp, *(np.ascontiguousarray(value).view(np.int64) for value in numbers)]
         _, first = np.unique(np.stack(columns, axis=1), axis=0, return_index=True)
         return ~np.isin(np.arange(len(self.stamp)), first)
 
     @property
     def has_value(self) -> BoolArray:
         """Rows that have a value for any axis, (rows,)."""
-        return np.any(~np.isnan(list(self.values.values())), axis=0)
+        known = [~np.isnan(value) for value in self.values.values()]
+        if self.orientation is not None:
+            known.append(~np.isnan(self.orientation[:, 0]))
+        return np.any(known, axis=0)
 
     def beside(self, command: Source, turns: Mapping[str, float]) -> Source:
         """The source with angles that go on moved by whole turns to where they are commanded.
@@ -161,7 +169,9 @@ class Source:
             return value[row] + np.where(share > 0.0, share * change, 0.0)
 
         stamp = self.stamp[row] + np.rint(share * np.append(gap, 0.0)[row]).astype(np.int64)
-        return replace(self, stamp=stamp, values={axis: between(value) for axis, value in self.values.items()})
+        values = {axis: between(value) for axis, value in self.values.items()}
+        turned = None if self.orientation is None else rotations.between(self.orientation, row, share)
+        return replace(self, stamp=stamp, values=values, orientation=turned)
 
     def on_timeline(self) -> tuple[Source, str | None]:
         """The source as Rerun shows it, where its clock steps back: by stamps, the first of each; and a note.
@@ -185,7 +195,9 @@ class Source:
         values = {axis: value[chosen] for axis, value in self.values.items()}
         spread = {axis: value[chosen] for axis, value in self.spread.items()}
         stray = self.stray[chosen] if len(self.stray) else self.stray
-        return replace(self, stamp=self.stamp[chosen], values=values, spread=spread, stray=stray)
+        turned = None if self.orientation is None else self.orientation[chosen]
+        stamp = self.stamp[chosen]
+        return replace(self, stamp=stamp, values=values, spread=spread, stray=stray, orientation=turned)
 
 
 @dataclass(frozen=True, repr=False)
@@ -199,6 +211,7 @@ class Run:
         reference: Positions to score against, where there are any; no filter uses them.
         start: The start level u₀ [m] of axes that rest elsewhere than at their first command.
         clock: Whether the commands' stamps are used as they are (``stamps``) or replaced by a grid of T (``regular``).
+        tool: The reference orientation R₀ of the axes rx, ry, rz as a rotation vector [rad], once there are such axes.
         frame: The arm's axes in the log's x, y, z, for sources that give these.
         kinds: Of what kind the axes are, where the units of a log say so.
         notes: What was wrong with the files, a sentence each.
@@ -219,6 +232,7 @@ class Run:
     notes: tuple[str, ...] = ()
     recording: Recording | None = None
     without_strays: bool = False
+    tool: tuple[float, float, float] | None = None
     since: float | None = None
     until: float | None = None
 
@@ -257,6 +271,12 @@ class Run:
     def axes(self) -> tuple[str, ...]:
         """The commanded axes, in the order of the log."""
         return tuple(self.command.values)
+
+    @property
+    def has_orientation(self) -> bool:
+        """Whether one of its sources tells an orientation that is not yet made axes of."""
+        sources = [self.command, *self.sensors.values(), *([] if self.reference is None else [self.reference])]
+        return any(source.orientation is not None for source in sources)
 
     def between(self, since: float | None = None, until: float | None = None) -> Run:
         """A part of the run, for example one that begins in mid-motion.
@@ -334,7 +354,8 @@ class Run:
 
         Args:
             time: Stamps of the commands, float seconds or int64 ns, (n,).
-            command: u [m or rad] for each axis, (n,).
+            command: u [m or rad] for each axis, (n,). Of a tool that turns also its ``orientation``, quaternions x, y,
+                z, w, (n, 4), here and in what follows.
             sensors: For each sensor its stamps (m,) and its values for each axis, (m,).
             reference: Stamps (k,) and reference positions for each axis, (k,).
             reference_sd: Standard deviation of the reference's own noise, for all axes or for each.
@@ -423,7 +444,7 @@ def _note_standing_clock(notes: list[str], source: Source, advice: str) -> None:
 
 def _most_changes(source: Source) -> tuple[str, BoolArray]:
     """The axis with the most rows that have the stamp of the row before and another value, and these rows, (rows,)."""
-    if not (np.diff(source.stamp) == 0).any():
+    if not source.values or not (np.diff(source.stamp) == 0).any():
         return "", np.zeros(len(source.stamp), dtype=np.bool_)
     changes = {axis: _changes(source, axis) for axis in source.values}
     axis = max(changes, key=lambda axis: changes[axis].sum())
@@ -463,6 +484,7 @@ def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.Array
     try:
         stamp = _stamps(np.array(time))
         columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
+        turned = columns.pop("orientation", None)
     except (ValueError, TypeError, OverflowError) as error:
         raise RunError(
             f"{label}: stamps are int ns, float seconds or datetime64, values are numbers: {error}"
@@ -472,9 +494,12 @@ def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.Array
             raise RunError(
                 f"{label}: {axis} has shape {column.shape}, its stamps {stamp.shape}; one value a stamp is needed"
             )
-    if not columns or not len(stamp):
+    if turned is not None and turned.shape != (*stamp.shape, 4):
+        raise RunError(f"{label}: orientation has shape {turned.shape}; a quaternion x, y, z, w a stamp is needed")
+    if (not columns and turned is None) or not len(stamp):
         raise RunError(f"{label}: no values")
-    source = Source(stamp, columns, label)
+    oriented = None if turned is None else rotations.of_quaternions(turned)
+    source = Source(stamp, columns, label, orientation=oriented)
     _note_standing_clock(notes, source, "give stamps as fine as the rows")
     return source
 
@@ -544,7 +569,7 @@ def of_tables(
         known = None if entry.time.rate else read[entry.rows].zoned(entry.time.column)
         if known is not None:
             (zoned if known else naive).append(name)
-        found = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
+        found = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units, entry.orientation)
         if entry.entity:
             found, note = found.on_timeline()
             notes.extend([] if note is None else [note])
@@ -633,6 +658,7 @@ def _source(
     label: str,
     notes: list[str],
     units: dict[str, Kind],
+    orientation: manifest.Orientation | None = None,
 ) -> Source:
     """A source from its columns, those of an axis added up; new notes and new kinds of axes are put in."""
     stamp, of_time = time.stamps(table)
@@ -647,8 +673,14 @@ def _source(
                 )
         values[axis] = np.sum([_own(table, one, numbers) for one, (numbers, _) in zip(columns, parts, strict=True)], 0)
         found.extend(note for _, note in parts)
+    turned = None
+    if orientation is not None:
+        turned, more = orientation.read(table)
+        found += more
+        if np.isnan(turned).all():
+            raise RunError(f"{table.path}: no row of {', '.join(orientation.columns)} is an orientation")
     notes.extend(note for note in found if note is not None and note not in notes)
-    source = Source(stamp, values, label)
+    source = Source(stamp, values, label, orientation=turned)
     beside = None if time.nanoseconds else table.nanoseconds_beside(time.column)
     advice = f"write time = ['{time.column}', '{beside}']" if beside else "name a finer column of time"
     _note_standing_clock(notes, source, advice)

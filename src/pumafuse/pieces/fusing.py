@@ -27,11 +27,11 @@ from ..fusion.engine import filter_piece
 from ..fusion.estimates import Estimates
 from ..fusion.faults import latency_questions, sensor_faults, starts_in_motion
 from ..fusion.offline import Part, estimates_of, found_by
+from ..fusion.placing import in_base
 from ..fusion.segments import Segment, build, no_estimates, output_times
 from ..fusion.setup import filter_model
 from ..fusion.summary import Summary, encode
 from ..logs import tables
-from ..logs.axes import in_axes
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, clock_faults
 from ..logs.run import Run
 from .merging import Digest, digest, merged
@@ -140,7 +140,7 @@ def _margins(config: FusionConfig) -> tuple[int, int]:
 
 def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> _Begun:
     """The filter at rest before the first command, by the first rows of a run."""
-    run = in_axes(run.between(), config.frame)[0]
+    run = in_base(run.between(), config)[0]
     segment = build(run, config, chosen)
     biases = [
         [
@@ -163,7 +163,7 @@ def _piece(
     own: tuple[int, int],
 ) -> Estimates:
     """The estimates of the rows after and until the instants ``own`` [int ns], with notes."""
-    in_place, placed = in_axes(run, config.frame)
+    in_place, placed, config = in_base(run, config)
     lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
         raise RunError(

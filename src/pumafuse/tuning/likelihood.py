@@ -29,8 +29,8 @@ from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations, linearised
 from ..fusion.faults import Fault, not_following, starts_in_motion, within_a_turn
+from ..fusion.placing import in_base
 from ..fusion.segments import Segment, added, build
-from ..logs.axes import in_axes
 from ..logs.clock import clock_faults, segments
 from ..logs.run import Run
 from .arms import Measured, Recording
@@ -228,7 +228,7 @@ class Likelihood:
             PumafuseError: A run and the configuration do not fit together.
         """
         chosen = config.sensor_names(sensors)
-        named = [(run.name, part) for run in runs for part in segments(in_axes(run, config.frame)[0])[0]]
+        named = [(run.name, part) for run in runs for part in segments(in_base(run, config)[0])[0]]
         built = list[Segment]()
         self.notes, counted = list[str](), dict[str, list[Segment]]()
         for name, part in named:

@@ -25,7 +25,7 @@ from .. import folders
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
 from ..fusion.estimates import Estimates
-from ..logs.axes import in_axes
+from ..fusion.placing import in_base
 from ..logs.entities import Recording
 from ..logs.frames import CARTESIAN, in_space
 from ..logs.run import Run
@@ -133,7 +133,7 @@ def _layer(est: Estimates, run: Run, under: Recording) -> bytes:
 
 def _send(est: Estimates, run: Run, sink: _Sink) -> None:
     by_sensor = colours.sensor_colours(est.measurements.sensors)
-    command = in_axes(run, est.config.frame)[0].command
+    command = in_base(run, est.config)[0].command
     time = seconds(command.stamp, est.origin)
     for name, axis in est.axes.items():
         screen = est.config.arm.screen_of(name)

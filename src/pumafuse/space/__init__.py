@@ -1,0 +1,1 @@
+"""Space: rotations and their conventions, kinematics."""

@@ -1,0 +1,144 @@
+"""Orientations: the conventions of logs, and the axes ``rx``, ``ry``, ``rz``.
+
+A quaternion has the order x, y, z, w and takes a vector of the tool to the base. The axes of an orientation R are those
+of the rotation vector θ = Log(R R₀ᵀ) [rad] along the base's axes, relative to a reference orientation R₀.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from ..arrays import FloatArray, IntArray
+
+TURNING = ("rx", "ry", "rz")
+Order = Literal["xyzw", "wxyz"]
+# Letters of scipy: capital ones turn about the axes that turned before, small ones about axes that stay.
+# A, B, C of KUKA are about Z, Y, X in this order; W, P, R of FANUC and roll, pitch, yaw about x, y, z that stay.
+CONVENTIONS = {"kuka": "ZYX", "fanuc": "xyz", "rpy": "xyz"}
+_NORM = 0.05  # by which a quaternion's norm is off 1 that was rounded; what is farther off is none
+_SMALL = 1e-4  # rad, below which series replace quotients: their next terms are below 1e-10
+
+
+def of_quaternions(value: FloatArray, order: Order = "xyzw") -> FloatArray:
+    """Unit quaternions x, y, z, w of logged ones, (n, 4); NaN in rows that have none, as of a sensor that is lost.
+
+    Args:
+        value: As logged, (n, 4).
+        order: Where w is.
+    """
+    value = value[:, [1, 2, 3, 0]] if order == "wxyz" else value
+    with np.errstate(invalid="ignore", over="ignore"):
+        norm = np.sqrt(np.sum(value**2, axis=1))
+        known = np.abs(norm - 1.0) < _NORM
+    return np.where(known[:, None], value / np.where(known, norm, 1.0)[:, None], np.nan)
+
+
+def of_vectors(vector: FloatArray) -> FloatArray:
+    """Quaternions of rotation vectors [rad], (n, 3) → (n, 4)."""
+    half = 0.5 * np.sqrt(np.sum(vector**2, axis=1, keepdims=True))
+    return np.column_stack([0.5 * np.sinc(half / np.pi) * vector, np.cos(half)])
+
+
+def of_angles(angle: FloatArray, letters: str) -> FloatArray:
+    """Quaternions of Euler angles [rad] about the axes that ``letters`` name, (n, 3) → (n, 4).
+
+    Capital letters, as in ``ZYX``, turn about axes that turn along, small ones about axes that stay, as in scipy.
+    """
+    found = np.tile([0.0, 0.0, 0.0, 1.0], (len(angle), 1))
+    for letter, about in zip(letters, angle.T, strict=True):
+        turn = np.zeros((len(angle), 3))
+        turn[:, "xyz".index(letter.lower())] = about
+        step = of_vectors(turn)
+        found = product(found, step) if letters.isupper() else product(step, found)
+    return found
+
+
+def mean(quaternion: FloatArray) -> FloatArray:
+    """The mean of orientations as a rotation vector [rad], (n, 4) → (3,); those that are NaN do not count.
+
+    The quaternion nearest to all, whatever their signs (Markley et al. 2007).
+    """
+    known = quaternion[np.isfinite(quaternion).all(axis=1)]
+    nearest = np.linalg.eigh(known.T @ known)[1][:, -1]
+    return vectors(nearest[None], np.zeros(3))[0]
+
+
+def vectors(quaternion: FloatArray, reference: FloatArray) -> FloatArray:
+    """θ = Log(R R₀ᵀ) of quaternions of R, at most π long [rad], (n, 4) → (n, 3); R₀ is a rotation vector [rad]."""
+    relative = product(quaternion, of_vectors(-reference[None]))
+    relative = relative * np.where(relative[:, 3:] < 0.0, -1.0, 1.0)  # q and -q are one orientation
+    sine = np.sqrt(np.sum(relative[:, :3] ** 2, axis=1, keepdims=True))
+    angle = 2.0 * np.arctan2(sine, relative[:, 3:])
+    return relative[:, :3] * np.where(sine < _SMALL, 2.0 + angle**2 / 12.0, angle / np.where(sine < _SMALL, 1.0, sine))
+
+
+def quaternions(vector: FloatArray, reference: FloatArray) -> FloatArray:
+    """The inverse of :func:`vectors`: quaternions of Exp(θ) R₀, (n, 3) → (n, 4)."""
+    return product(of_vectors(vector), of_vectors(reference[None]))
+
+
+def product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Quaternions of R_left R_right, row by row, (n, 4); either may be one row for all."""
+    (a, w), (b, v) = ((one[:, :3], one[:, 3:]) for one in (left, right))
+    return np.column_stack([w * b + v * a + np.cross(a, b), w * v - np.sum(a * b, axis=1, keepdims=True)])
+
+
+def inverse(quaternion: FloatArray) -> FloatArray:
+    """Quaternions of Rᵀ, (n, 4)."""
+    return quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def turned(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
+    """R v, row by row, (n, 4) and (n, 3) → (n, 3); either may be one row for all."""
+    across = 2.0 * np.cross(quaternion[:, :3], vector)
+    return vector + quaternion[:, 3:] * across + np.cross(quaternion[:, :3], across)
+
+
+def between(quaternion: FloatArray, row: IntArray, share: FloatArray) -> FloatArray:
+    """Orientations on the shortest turn from some rows to the ones after them, (m, 4).
+
+    Args:
+        quaternion: The orientations, (n, 4).
+        row: From which of them, (m,).
+        share: How far, 0 to 1, (m,); from the last row on there is no turn.
+    """
+    step = vectors(product(inverse(quaternion[:-1]), quaternion[1:]), np.zeros(3))
+    step = np.vstack([step, np.zeros(3)])[row]
+    part = np.where(share[:, None] > 0.0, share[:, None] * step, 0.0)
+    return product(quaternion[row], of_vectors(part))
+
+
+def matrix(vector: FloatArray) -> FloatArray:
+    """The rotation matrix of a rotation vector [rad], (3,) → (3, 3)."""
+    return turned(of_vectors(vector[None]), np.eye(3)).T
+
+
+def left_jacobian(vector: FloatArray) -> FloatArray:
+    """J of Exp(θ + δ) ≈ Exp(J δ) Exp(θ), (n, 3) → (n, 3, 3): how small changes of θ turn the tool.
+
+    Across θ it is sin(θ/2)/(θ/2) long, along θ 1 (Solà, Deray and Atchuthan 2018, eq. 145).
+    """
+    angle = np.sqrt(np.sum(vector**2, axis=1))
+    small = angle < _SMALL
+    safe = np.where(small, 1.0, angle)
+    one = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)[:, None, None]
+    two = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)[:, None, None]
+    cross = np.zeros((len(vector), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = vector
+    cross[:, [1, 2, 0], [2, 0, 1]] = -vector
+    return np.eye(3) + one * cross + two * (cross @ cross)
+
+
+def spread(vector: FloatArray) -> FloatArray:
+    """How much larger the noise of θ is along each axis than that of the orientation, (n, 3): 1 near R₀."""
+    known = np.isfinite(vector).all(axis=1)
+    inverted = np.linalg.inv(left_jacobian(np.where(known[:, None], vector, 0.0)))
+    return np.sqrt(np.sum(inverted**2, axis=2))
+
+
+def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The angle between orientations, row by row [rad], (n,)."""
+    between = product(first, inverse(second))
+    return 2.0 * np.arctan2(np.sqrt(np.sum(between[:, :3] ** 2, axis=1)), np.abs(between[:, 3]))
