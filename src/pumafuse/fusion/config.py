@@ -441,11 +441,7 @@ def of_all_axes(
             name = of_kind(key, of)
             if name not in found:
                 continue
-            value = found.pop(name)
-            if isinstance(value, list):  # along three axes of a sensor
-                three = cast(list[Any], value)
-                axes = CARTESIAN if of == "length" else TURNING
-                value = dict(zip(axes, three, strict=True)) if len(three) == 3 and set(axes) <= set(arm.axes) else value
+            value = _by_axis_of_sensor(found.pop(name), of, arm)
             if of not in arm.kinds:
                 right = of_kind(key, arm.kinds[0])
                 raise ConfigError(f"{where}: {path}.{name}: no axis of the arm is {AN[of]}; give {right}")
@@ -461,6 +457,14 @@ def of_all_axes(
     for key in found.keys() - types.keys():
         raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, _accepted(kind, arm, per_axis))}")
     return found
+
+
+def _by_axis_of_sensor(value: Any, kind: Kind, arm: ArmModel) -> Any:
+    """Three numbers, as of a sensor that sees depth less well, by the axes of its frame; anything else as it is."""
+    axes = CARTESIAN if kind == "length" else TURNING
+    if not isinstance(value, list) or len(cast(list[Any], value)) != len(axes) or not set(axes) <= set(arm.axes):
+        return cast(Any, value)
+    return dict(zip(axes, cast(list[Any], value), strict=True))
 
 
 def _accepted(kind: type[msgspec.Struct], arm: ArmModel, per_axis: Sequence[str]) -> list[str]:

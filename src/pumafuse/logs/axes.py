@@ -79,7 +79,7 @@ def _turning(run: Run, tool: tuple[float, float, float] | None) -> Run:
         values = dict(source.values) | dict(zip(TURNING, vector.T.copy(), strict=True))
         spread = dict(source.spread)
         if source is not run.command:
-            spread |= dict(zip(TURNING, rotations.spread(vector).T.copy(), strict=True))
+            spread |= dict.fromkeys(TURNING, rotations.spread(vector))
         return replace(source, values=values, spread=spread, orientation=None)
 
     found = run.each(turning)

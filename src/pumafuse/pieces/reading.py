@@ -134,6 +134,12 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
         return "rate_hz"
     if listed is not None and any(entry.time.counter or entry.time.shift for entry in listed.entries.values()):
         return "a counter or shift_s"
+    if listed is not None and (oriented := [entry for entry in listed.entries.values() if entry.orientation]):
+        if config.tool is None:
+            return "an orientation, and no [tool] in fusion.toml,"
+        known = [name for name, entry in listed.sensors.items() if entry in oriented]
+        if any(one.marker is not None and name not in known for name, one in config.sensors.items()):
+            return "a marker of a sensor that tells no orientation"
     frame = config.frame if listed is None or listed.frame is None else listed.frame
     named = {axis for entry in listed.entries.values() for axis in entry.axes} if listed else set(CARTESIAN)
     return "a cylindrical [frame]" if isinstance(frame, Cylindrical) and not named.isdisjoint(CARTESIAN) else None

@@ -132,10 +132,12 @@ def left_jacobian(vector: FloatArray) -> FloatArray:
 
 
 def spread(vector: FloatArray) -> FloatArray:
-    """How much larger the noise of θ is along each axis than that of the orientation, (n, 3): 1 near R₀."""
-    known = np.isfinite(vector).all(axis=1)
-    inverted = np.linalg.inv(left_jacobian(np.where(known[:, None], vector, 0.0)))
-    return np.sqrt(np.sum(inverted**2, axis=2))
+    """How much larger the noise of θ is than that of the orientation, (n,): 1 near R₀.
+
+    The same along all axes: a third of the trace of J⁻¹ J⁻ᵀ.
+    """
+    inverted = np.linalg.inv(left_jacobian(np.where(np.isfinite(vector), vector, 0.0)))
+    return np.sqrt(np.sum(inverted**2, axis=(1, 2)) / 3.0)
 
 
 def angle_between(first: FloatArray, second: FloatArray) -> FloatArray:
