@@ -1,0 +1,1 @@
+"""The tool in space: where the joints of a robot hold it."""
