@@ -16,6 +16,7 @@ SOURCE = Path(pf.__file__).parent
 # each imports itself and those before it
 ROOMS = [
     "model",
+    "space",
     "logs",
     "discovery",
     "filter",

@@ -1,1 +1,1 @@
-"""Space: rotations and their conventions, kinematics."""
+"""The tool in space: rotations and their conventions, and where the joints of a robot hold it."""

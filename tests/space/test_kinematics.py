@@ -1,0 +1,387 @@
+"""Forward kinematics of a URDF's chain, against Denavit-Hartenberg, products of 4x4 matrices, and recorded commands."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pumafuse.errors import ConfigError, UnknownNameError
+from pumafuse.space.kinematics import Chain
+from refusals import one_line
+
+PUMA = Path(str(files("pumafuse") / "data" / "pose-virtual" / "puma560.urdf"))
+COMMANDS = Path(__file__).with_name("commands.csv")
+# d [m], a [m], alpha [rad] of each link: what the controller of the recorded PUMA 560 computes with
+DENAVIT_HARTENBERG = [
+    (0.0, 0.0, math.pi / 2),
+    (0.0, 0.4318, 0.0),
+    (0.15005, 0.0203, -math.pi / 2),
+    (0.4318, 0.0, math.pi / 2),
+    (0.0, 0.0, -math.pi / 2),
+    (0.0, 0.0, 0.0),
+]
+TOOL = 0.05625  # m along the last z
+EXACT = 1e-12  # m, rad: some roundings of numbers of some metres
+
+ONE = '<robot name="r"><link name="l0"/><link name="l1"/><link name="l2"/>{}</robot>'
+ENDS = '<parent link="l0"/><child link="l1"/>'
+BOMB = '<?xml version="1.0"?><!DOCTYPE robot [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]>' + ONE.format("&b;")
+
+numbers = st.floats(-2.0, 2.0)
+vectors = st.tuples(numbers, numbers, numbers)
+
+
+@dataclass(frozen=True)
+class Given:
+    """A joint of a random chain."""
+
+    type: str
+    xyz: tuple[float, ...]
+    rpy: tuple[float, ...]
+    axis: tuple[float, ...]
+    mimic: tuple[int, float, float] | None = None  # the joint's number, multiplier, offset
+
+
+joints = st.builds(
+    Given,
+    st.sampled_from(["revolute", "continuous", "prismatic", "fixed"]),
+    vectors,
+    vectors,
+    vectors.filter(lambda axis: math.hypot(*axis) > 0.1),
+    st.none() | st.tuples(st.integers(0, 6), numbers, numbers),
+)
+
+
+def moving(chain: list[Given]) -> list[int]:
+    """Joints that are driven by themselves: a mimic counts only of one that is."""
+    return [number for number, joint in enumerate(chain) if joint.type != "fixed" and follows(chain, joint) is None]
+
+
+def follows(chain: list[Given], joint: Given) -> tuple[int, float, float] | None:
+    """What a joint mimics, if that is a joint that moves by itself."""
+    if joint.mimic is None or joint.mimic[0] >= len(chain):
+        return None
+    target = chain[joint.mimic[0]]
+    return joint.mimic if target.type != "fixed" and target.mimic is None else None
+
+
+def words(values: tuple[float, ...]) -> str:
+    return " ".join(map(repr, values))
+
+
+def written(chain: list[Given]) -> str:
+    """The URDF of a chain l0, l1, ... of joints j0, j1, ..., beside which another branch hangs."""
+    lines = ['<robot name="random">', '<link name="l0"/>']
+    for number, joint in enumerate(chain):
+        mimic = follows(chain, joint)
+        lines += [
+            f'<joint name="j{number}" type="{joint.type}"><parent link="l{number}"/><child link="l{number + 1}"/>',
+            f'<origin xyz="{words(joint.xyz)}" rpy="{words(joint.rpy)}"/><axis xyz="{words(joint.axis)}"/>',
+            f'<mimic joint="j{mimic[0]}" multiplier="{mimic[1]!r}" offset="{mimic[2]!r}"/>' if mimic else "",
+            f'</joint><link name="l{number + 1}"/>',
+        ]
+    lines += ['<joint name="aside" type="floating"><parent link="l0"/><child link="hand"/></joint>']
+    return "\n".join([*lines, '<link name="hand"/></robot>'])
+
+
+def transform(rotation: Rotation, position: tuple[float, ...] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation.as_matrix(), position
+    return matrix
+
+
+def by_matrices(chain: list[Given], q: dict[int, float]) -> list[np.ndarray]:
+    """The links' poses, one configuration at a time: the URDF's definition, written with scipy's rotations."""
+    poses = [np.eye(4)]
+    for number, joint in enumerate(chain):
+        mimic = follows(chain, joint)
+        value = mimic[1] * q[mimic[0]] + mimic[2] if mimic else q.get(number, 0.0)
+        axis = np.array(joint.axis) / math.hypot(*joint.axis)
+        motion = np.eye(4)
+        if joint.type in ("revolute", "continuous"):
+            motion = transform(Rotation.from_rotvec(value * axis))
+        elif joint.type == "prismatic":
+            motion = transform(Rotation.identity(), value * axis)
+        poses.append(poses[-1] @ transform(Rotation.from_euler("xyz", joint.rpy), joint.xyz) @ motion)
+    return poses
+
+
+def loaded(folder: Path, text: str, base: str = "l0", tip: str = "l1") -> Chain:
+    path = folder / "robot.urdf"
+    path.write_text(text, encoding="utf-8")
+    return Chain.load(path, base, tip)
+
+
+def configurations(chain: Chain, count: int, seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-3.0, 3.0, (count, len(chain.joints)))
+
+
+def turned(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The angle [rad] between orientations, which quaternions of either sign may be."""
+    return (Rotation.from_quat(left).inv() * Rotation.from_quat(right)).magnitude()
+
+
+def test_the_puma_is_that_of_denavit_and_hartenberg() -> None:
+    """Position and orientation are the product Rz(q) Tz(d) Tx(a) Rx(alpha) over its links, at random configurations."""
+    chain = Chain.load(PUMA, "base_link", "tool0")
+    assert chain.joints == ("j1", "j2", "j3", "j4", "j5", "j6")
+    assert set(chain.kinds.values()) == {"angle"}
+    q = configurations(chain, 200)
+    position, quaternion = chain.pose(q)
+    assert position.shape == (200, 3)
+    for row in range(200):
+        pose = np.eye(4)
+        for angle, (d, a, alpha) in zip(q[row], DENAVIT_HARTENBERG, strict=True):
+            pose = pose @ transform(Rotation.from_euler("z", angle), (0.0, 0.0, d))
+            pose = pose @ transform(Rotation.from_euler("x", alpha), (a, 0.0, 0.0))
+        pose = pose @ transform(Rotation.identity(), (0.0, 0.0, TOOL))
+        np.testing.assert_allclose(position[row], pose[:3, 3], atol=EXACT)
+        np.testing.assert_allclose(Rotation.from_quat(quaternion[row]).as_matrix(), pose[:3, :3], atol=EXACT)
+
+
+@pytest.mark.parametrize("run", ["inspect1", "wander1"])
+def test_recorded_joints_are_recorded_poses(run: str) -> None:
+    """What a controller told the joints is, through the kinematics, the pose that it told the tool.
+
+    The file rounds joints to 1e-5°, positions to 1e-4 mm, quaternions to 1e-7. The six joints' roundings, at most 1 m
+    from the tool, are together at most 5.2e-7 m and rad; those of a quaternion's parts at most 2e-7 rad.
+    """
+    with COMMANDS.open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["run"] == run]
+    chain = Chain.load(PUMA, "base_link", "tool0")
+    q = np.radians([[float(row[f"{joint}_deg"]) for joint in chain.joints] for row in rows])
+    position, quaternion = chain.pose(q)
+    told = np.array([[float(row[f"{axis}_mm"]) / 1e3 for axis in "xyz"] for row in rows])
+    assert np.ptp(told, axis=0).max() > 0.05, "the tool must move"
+    np.testing.assert_allclose(position, told, atol=5.2e-7 + 0.5e-7)
+    assert turned(quaternion, np.array([[float(row[f"q{part}"]) for part in "xyzw"] for row in rows])).max() < 7.2e-7
+
+
+@settings(max_examples=200)
+@given(st.lists(joints, min_size=1, max_size=7), st.integers(0, 2**32 - 1))
+def test_random_chains(tmp_path_factory: pytest.TempPathFactory, chain: list[Given], seed: int) -> None:
+    """Poses of tip and links, the order of the joints and their kinds: against the definition, by 4x4 matrices."""
+    arm = loaded(tmp_path_factory.mktemp("random"), written(chain), tip=f"l{len(chain)}")
+    assert set(arm.joints) == {f"j{number}" for number in moving(chain)}
+    for name, kind in arm.kinds.items():
+        assert kind == ("length" if chain[int(name[1:])].type == "prismatic" else "angle")
+    if all(follows(chain, joint) is None for joint in chain):
+        assert list(arm.joints) == sorted(arm.joints)
+    q = configurations(arm, 3, seed)
+    position, quaternion = arm.pose(q)
+    frames = arm.frames(q)
+    assert arm.links == tuple(f"l{number}" for number in range(len(chain) + 1))
+    for row in range(3):
+        poses = by_matrices(chain, {int(name[1:]): value for name, value in zip(arm.joints, q[row], strict=True)})
+        np.testing.assert_allclose(frames[row], poses, atol=20.0 * EXACT)  # of some 40 m
+        np.testing.assert_allclose(position[row], poses[-1][:3, 3], atol=20.0 * EXACT)
+        np.testing.assert_allclose(Rotation.from_quat(quaternion[row]).as_matrix(), poses[-1][:3, :3], atol=EXACT)
+
+
+@settings(max_examples=100)
+@given(st.lists(joints, min_size=1, max_size=7), st.integers(0, 2**32 - 1))
+def test_the_jacobian_is_the_slope_of_the_pose(
+    tmp_path_factory: pytest.TempPathFactory, chain: list[Given], seed: int
+) -> None:
+    """Central differences over 1e-5 agree: their own error is of the order 1e-10 of the third derivative."""
+    arm = loaded(tmp_path_factory.mktemp("random"), written(chain), tip=f"l{len(chain)}")
+    q = configurations(arm, 3, seed)
+    jacobian = arm.jacobian(q)
+    assert jacobian.shape == (3, 6, len(arm.joints))
+    for joint in range(len(arm.joints)):
+        step = np.zeros_like(q)
+        step[:, joint] = 1e-5
+        (after, turned_after), (before, turned_before) = arm.pose(q + step), arm.pose(q - step)
+        turn = Rotation.from_quat(turned_after) * Rotation.from_quat(turned_before).inv()
+        np.testing.assert_allclose(jacobian[:, :3, joint], (after - before) / 2e-5, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(jacobian[:, 3:, joint], turn.as_rotvec() / 2e-5, rtol=1e-7, atol=1e-7)
+
+
+def test_pinocchio_agrees(tmp_path: Path) -> None:
+    """Pose and Jacobian of the PUMA and of random chains without mimic are those of pinocchio, where it is at hand."""
+    pinocchio = pytest.importorskip("pinocchio")
+    random = np.random.default_rng(3)
+    types = ["revolute", "prismatic", "fixed", "revolute"]
+    arms = [(PUMA, "tool0", Chain.load(PUMA, "base_link", "tool0"))]
+    for number in range(30):
+        chain = [
+            Given(str(random.choice(types)), *map(tuple, random.uniform(-2.0, 2.0, (3, 3)).tolist())) for _ in range(7)
+        ]
+        path = tmp_path / f"{number}.urdf"
+        path.write_text(written(chain).replace("</joint>", '<limit effort="1" velocity="1"/></joint>'))
+        arms.append((path, "l7", Chain.load(path, "l0", "l7")))
+    for path, tip, arm in arms:
+        model = pinocchio.buildModelFromUrdf(str(path))
+        data, frame = model.createData(), model.getFrameId(tip)
+        columns = [model.joints[model.getJointId(name)].idx_v for name in arm.joints]
+        q = configurations(arm, 20)
+        position, quaternion = arm.pose(q)
+        jacobian = arm.jacobian(q)
+        for row in range(20):
+            state = pinocchio.neutral(model)
+            state[[model.joints[model.getJointId(name)].idx_q for name in arm.joints]] = q[row]
+            pinocchio.framesForwardKinematics(model, data, state)
+            np.testing.assert_allclose(position[row], data.oMf[frame].translation, atol=20.0 * EXACT)
+            oriented = Rotation.from_quat(quaternion[row]).as_matrix()
+            np.testing.assert_allclose(oriented, data.oMf[frame].rotation, atol=EXACT)
+            world = pinocchio.computeFrameJacobian(model, data, state, frame, pinocchio.LOCAL_WORLD_ALIGNED)
+            np.testing.assert_allclose(jacobian[row], world[:, columns], atol=20.0 * EXACT)
+
+
+def test_a_mimic_of_a_mimic_outside_of_the_chain(tmp_path: Path) -> None:
+    """A joint that follows one of another branch, which follows a third, needs the third: factors multiply."""
+    text = """<robot name="gripper"><link name="l0"/><link name="l1"/><link name="a"/><link name="b"/>
+      <joint name="finger" type="prismatic"><parent link="l0"/><child link="l1"/><axis xyz="0 3 0"/>
+        <mimic joint="second" multiplier="0.5" offset="0.1"/></joint>
+      <joint name="second" type="prismatic"><parent link="l0"/><child link="a"/>
+        <mimic joint="screw" multiplier="-0.2" offset="0.4"/></joint>
+      <joint name="screw" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
+    chain = loaded(tmp_path, text)
+    assert chain.kinds == {"screw": "angle"}
+    position, _ = chain.pose(np.array([[3.0]]))
+    np.testing.assert_allclose(position, [[0.0, 0.5 * (-0.2 * 3.0 + 0.4) + 0.1, 0.0]], atol=EXACT)
+    np.testing.assert_allclose(chain.jacobian(np.array([[3.0]]))[0, :, 0], [0.0, -0.1, 0.0, 0.0, 0.0, 0.0], atol=EXACT)
+
+
+def test_what_is_left_out_has_its_default(tmp_path: Path) -> None:
+    """A joint without origin and axis turns about x where its parent is; a mimic without numbers does the same."""
+    text = ONE.format(
+        f'<joint name="j" type="revolute">{ENDS}</joint><joint name="k" type="revolute"><parent link="l1"/>'
+        '<child link="l2"/><mimic joint="j"/></joint>'
+    )
+    position, quaternion = loaded(tmp_path, text, tip="l2").pose(np.array([[0.3]]))
+    np.testing.assert_array_equal(position, [[0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(Rotation.from_quat(quaternion).as_rotvec(), [[2.0 * 0.3, 0.0, 0.0]], atol=EXACT)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.8e308])
+def test_a_row_without_a_joint_is_nan_as_a_whole(tmp_path: Path, bad: float) -> None:
+    """Also where that joint moves nothing of an output; the rows beside it are as without it."""
+    slide = Given("prismatic", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    turn = Given("revolute", (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    for number, chain in enumerate([[slide], [turn], [slide, turn]]):
+        arm = loaded(tmp_path, written(chain), tip=f"l{len(chain)}")
+        q = configurations(arm, 3)
+        spoiled = q.copy()
+        spoiled[1, -1] = bad
+        for before, after in zip(
+            (*arm.pose(q), arm.jacobian(q)), (*arm.pose(spoiled), arm.jacobian(spoiled)), strict=True
+        ):
+            assert np.isnan(after[1]).all(), number
+            np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
+        assert np.isnan(arm.frames(spoiled)[1, :, :3]).all()
+
+
+def test_the_quaternion_does_not_jump() -> None:
+    """Along a motion of whole turns its sign is continuous."""
+    chain = Chain.load(PUMA, "base_link", "tool0")
+    way = np.linspace(0.0, 1.0, 2000)[:, None] * np.array([9.0, -7.0, 8.0, 20.0, -9.0, 30.0])
+    _, quaternion = chain.pose(way)
+    assert np.abs(np.diff(quaternion, axis=0)).max() < 0.05
+
+
+def test_joints_of_another_number_are_refused() -> None:
+    """A column too many or too few is no configuration."""
+    chain = Chain.load(PUMA, "base_link", "tool0")
+    for shape in ((4, 5), (4, 7), (6,)):
+        text = one_line(ConfigError, lambda shape=shape: chain.pose(np.zeros(shape)))
+        assert "expected (n, 6): j1, j2, j3, j4, j5, j6" in text
+
+
+def test_unknown_links() -> None:
+    """The error has the links that there are, the nearest first."""
+    text = one_line(UnknownNameError, lambda: Chain.load(PUMA, "base_link", "tool"))
+    assert "unknown link 'tool'; did you mean 'tool0'? accepted: base_link, link1" in text
+    one_line(UnknownNameError, lambda: Chain.load(PUMA, "world", "tool0"))
+
+
+def test_a_chain_the_other_way_round() -> None:
+    """No joints lead upwards; the error has the links that are above the tip."""
+    text = one_line(ConfigError, lambda: Chain.load(PUMA, "tool0", "link2"))
+    assert "no joints lead from link 'tool0' to 'link2'; above it: link1, base_link" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("joint1,joint2\n1,2\n", "not a URDF: syntax error: line 1"),
+        ("", "not a URDF: no element found"),
+        ("<sdf version='1.9'/>", "not a URDF: it begins with <sdf>, a URDF with <robot>"),
+        (BOMB, "it has a DOCTYPE, which a URDF does not need"),
+        (
+            '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="a"/></robot>',
+            "run `xacro robot.urdf > expanded.urdf` first",
+        ),
+        (
+            f'<joint name="j" type="floating">{ENDS}</joint>',
+            "joint 'j' is of type 'floating'; in a chain it must be revo",
+        ),
+        (f'<joint name="j" type="planar">{ENDS}</joint>', "is of type 'planar'"),
+        (f'<joint name="j">{ENDS}</joint>', "is of type ''"),
+        ('<joint name="j" type="fixed"><child link="l1"/></joint>', "joint 'j' has no <parent link=\"…\">"),
+        (f'<joint name="j" type="revolute">{ENDS}<axis xyz="0 0 0"/></joint>', "axis 0 0 0 is no direction"),
+        (f'<joint name="j" type="revolute">{ENDS}<axis xyz="0 1"/></joint>', 'axis xyz="0 1": expected 3 numbers'),
+        (f'<joint name="j" type="fixed">{ENDS}<origin rpy="0 0 nan"/></joint>', 'rpy="0 0 nan": expected 3 numbers'),
+        (f'<joint name="j" type="fixed">{ENDS}<origin xyz="${{x}} 0 0"/></joint>', "expected 3 numbers"),
+        (f'<joint name="j" type="fixed">{ENDS}<origin xyz="0 0 1e300"/></joint>', "each at most 1e+09"),
+        (
+            f'<joint name="j" type="fixed">{ENDS}<origin quat_xyzw="0 0 0 1"/></joint>',
+            "origin has quat_xyzw; known are xyz and rpy",
+        ),
+        (
+            f'<joint name="j" type="revolute">{ENDS}<mimic joint="j" multiplier="1 2"/></joint>',
+            'mimic multiplier="1 2": expected a number',
+        ),
+        (f'<joint name="j" type="revolute">{ENDS}<mimic joint="j"/></joint>', "joints mimic in a circle: j, j"),
+        (f'<joint name="j" type="revolute">{ENDS}<mimic joint="k"/></joint>', "mimic: unknown joint 'k'"),
+        (
+            f'<joint name="j" type="revolute">{ENDS}<mimic joint="k"/></joint>'
+            '<joint name="k" type="fixed"><parent link="l0"/><child link="l2"/></joint>',
+            "joint 'j' mimics 'k', which is fixed",
+        ),
+        (f'<joint name="j" type="fixed">{ENDS}</joint>' * 2, "two joints have the name 'j'"),
+        (
+            f'<joint name="j" type="fixed">{ENDS}</joint><joint name="k" type="fixed">{ENDS}</joint>',
+            "joint 'k': joint 'j' has the same child 'l1'",
+        ),
+        (
+            '<joint name="j" type="fixed"><parent link="l2"/><child link="l1"/></joint>'
+            '<joint name="k" type="fixed"><parent link="l1"/><child link="l2"/></joint>',
+            "the links go in a circle: l1, l2, l1",
+        ),
+    ],
+)
+def test_what_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    """Each mistake is one line that says where it is."""
+    text = ONE.format(text) if text.startswith("<joint") else text
+    line = one_line(ConfigError if "unknown" not in said else UnknownNameError, lambda: loaded(tmp_path, text))
+    assert line.startswith(str(tmp_path / "robot.urdf"))
+    assert said in line
+
+
+def test_files_that_are_no_text(tmp_path: Path) -> None:
+    """Absent, a folder, other encodings, in which an entity would hide."""
+    assert "no such file" in one_line(ConfigError, lambda: Chain.load(tmp_path / "a.urdf", "l0", "l1"))
+    assert "cannot be read" in one_line(ConfigError, lambda: Chain.load(tmp_path, "l0", "l1"))
+    path = tmp_path / "b.urdf"
+    path.write_bytes(BOMB.encode("utf-16"))
+    assert "not a text file in UTF-8" in one_line(ConfigError, lambda: Chain.load(path, "l0", "l1"))
+    path.write_bytes(b"<robot>" + b" " * (17 << 20) + b"</robot>")
+    assert "more than 16 MB" in one_line(ConfigError, lambda: Chain.load(path, "l0", "l1"))
+
+
+def test_a_fixed_joint_needs_no_axis(tmp_path: Path) -> None:
+    """Some programs write axis 0 0 0 for it, and a UTF-8 mark before the file."""
+    text = "\ufeff" + ONE.format(f'<joint name="j" type="fixed">{ENDS}<origin xyz="1 2 3"/><axis xyz="0 0 0"/></joint>')
+    chain = loaded(tmp_path, text)
+    assert chain.joints == ()
+    np.testing.assert_array_equal(chain.pose(np.zeros((2, 0)))[0], [[1.0, 2.0, 3.0]] * 2)
