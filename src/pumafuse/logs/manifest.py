@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -147,6 +148,20 @@ class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         return rotations.of_angles(value, self.letters), notes
 
 
+class Robot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A serial chain of a URDF, by which joints are a pose.
+
+    Attributes:
+        urdf: The file, beside ``run.toml``.
+        base: The link that stands.
+        tip: The link whose pose it is: the tool.
+    """
+
+    urdf: str
+    base: str
+    tip: str
+
+
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     """A source of a run: where its rows are, and its columns.
 
@@ -158,6 +173,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
         time: Their stamps.
         axes: For each axis its columns, which are added up.
         orientation: The columns of its orientation.
+        joints: The columns of the joints of the ``[robot]``, which are a pose.
     """
 
     file: str
@@ -167,6 +183,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     time: Time
     axes: dict[str, list[Column]]
     orientation: Orientation | None = None
+    joints: dict[str, list[Column]] = {}
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -176,7 +193,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def fields(self) -> list[str]:
         """All its columns and field paths."""
-        axes = [column for columns in self.axes.values() for column in columns]
+        axes = [column for columns in (*self.axes.values(), *self.joints.values()) for column in columns]
         turning = () if self.orientation is None else self.orientation.columns
         names = [*self.time.columns, *(column.column for column in axes), *turning]
         return [*names, *(name for one in axes for name in one.where)]
@@ -225,6 +242,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """What ``run.toml`` holds, in SI units."""
 
     command: CommandEntry
+    robot: Robot | None = None
     name: str = ""
     sensors: dict[str, SourceEntry] = {}
     reference: ReferenceEntry | None = None
@@ -274,7 +292,11 @@ def _manifest(tree: dict[str, Any], where: str) -> Manifest:
     for name in named:
         refuse_name(f"{where}: sensor", name)
     tree["sensors"] = {name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in named.items()}
-    return toml.struct(tree, Manifest, where)
+    listed = toml.struct(tree, Manifest, where)
+    moved = next((name for name, entry in listed.entries.items() if entry.joints), None)
+    if moved and listed.robot is None:
+        raise ConfigError(f"{where}: {moved} is in joints: give [robot] with its urdf, base and tip")
+    return listed
 
 
 def last_written(run: Path) -> float:
@@ -309,7 +331,9 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     axes = {axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in list(keys) if axis not in own}
     if "orientation" in keys:
         _check_orientation(keys["orientation"], axes, where, f"{path}.orientation")
-    if not axes and "orientation" not in keys:
+    if "joints" in keys:
+        keys["joints"] = _joints(keys["joints"], [*axes, *keys.keys() & {"orientation"}], where, f"{path}.joints")
+    if not axes and not keys.keys() & {"orientation", "joints"}:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in x = 'x_mm'")
     if "time" in keys:
         keys["time"] = _time(keys["time"], where, f"{path}.time")
@@ -358,6 +382,17 @@ def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path:
         raise ConfigError(f"{where}: {path}: the orientation has {twice}, which is an axis of its own, too; give one")
     if any(column.get("where") for columns in axes.values() for column in columns):
         raise ConfigError(f"{where}: {path}: axes with rows of their own have no orientation")
+
+
+def _joints(given: Any, beside: Iterable[str], where: str, path: str) -> dict[str, Any]:
+    """The columns of each joint."""
+    if not isinstance(given, dict) or not given:
+        raise ConfigError(f"{where}: {path}: expected a column for each joint, as in {{ j1 = 'j1_deg' }}")
+    if twice := next(iter(beside), None):
+        raise ConfigError(
+            f"{where}: {path}: the pose of the joints is x, y, z and an orientation; {twice} is given, too"
+        )
+    return {name: _columns(one, where, f"{path}.{name}") for name, one in cast(dict[str, Any], given).items()}
 
 
 def _columns(given: Any, where: str, path: str) -> list[Any]:

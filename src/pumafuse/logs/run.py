@@ -20,6 +20,7 @@ from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, I
 from ..errors import RunError, UnknownNameError, counted
 from ..model.arm import CANONICAL_AXES
 from ..space import rotations
+from ..space.kinematics import Chain
 from ..units import AN, Kind, ending, nanoseconds, unwrapped
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
@@ -559,6 +560,8 @@ def of_tables(
     """
     scored, notes, units = listed.reference, list[str](), dict(listed.command.kinds)
     entries, read = listed.entries, dict[tuple[str, ...], tables.Table]()
+    robot = listed.robot
+    chain = None if robot is None else Chain.load(folder / robot.urdf, robot.base, robot.tip)
     naive, zoned = list[str](), list[str]()
 
     def source(name: str) -> Source:
@@ -570,6 +573,8 @@ def of_tables(
         if known is not None:
             (zoned if known else naive).append(name)
         found = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units, entry.orientation)
+        if chain is not None and entry.joints:
+            found = _posed(found, read[entry.rows], entry.joints, chain, units)
         if entry.entity:
             found, note = found.on_timeline()
             notes.extend([] if note is None else [note])
@@ -685,6 +690,31 @@ def _source(
     advice = f"write time = ['{time.column}', '{beside}']" if beside else "name a finer column of time"
     _note_standing_clock(notes, source, advice)
     return source
+
+
+def _posed(
+    source: Source,
+    table: tables.Table,
+    joints: Mapping[str, Sequence[manifest.Column]],
+    chain: Chain,
+    units: dict[str, Kind],
+) -> Source:
+    """The source with the pose of the tip to which its joints move a chain.
+
+    Raises:
+        RunError: A joint of the chain has no column, or one of another kind.
+    """
+    values = list[FloatArray]()
+    for joint, kind in chain.kinds.items():
+        if joint not in joints:
+            raise RunError(f"{table.path}: no column for joint '{joint}' of the [robot]; there are {', '.join(joints)}")
+        for column in joints[joint]:
+            if column.kind not in (kind, None):
+                raise RunError(f"{table.path}: column '{column.column}' is no {kind}, which joint '{joint}' moves by")
+        values.append(np.sum([_own(table, one, table.numbers(one.column, one.ending)[0]) for one in joints[joint]], 0))
+    position, orientation = chain.pose(np.column_stack(values))
+    units |= dict.fromkeys(CARTESIAN, "length")
+    return replace(source, values=dict(zip(CARTESIAN, position.T.copy(), strict=True)), orientation=orientation)
 
 
 def _own(table: tables.Table, column: manifest.Column, numbers: FloatArray) -> FloatArray:

@@ -168,7 +168,9 @@ class _Rows:
         if entry is None:
             self._commands = [manifest.Column(name) for name in self._first.columns if name.startswith("command.")]
         else:
-            self._commands = list(chain.from_iterable(command.axes.values() if command else []))
+            self._commands = list(
+                chain.from_iterable([*command.axes.values(), *command.joints.values()] if command else [])
+            )
         self._held, self._stamp = list[pa.Table](), np.empty(0, dtype=np.int64)
         self._late, self._left_out, self._read = 0, 0, 0
 

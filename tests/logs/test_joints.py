@@ -1,0 +1,58 @@
+"""Commands and encoders in joints, as the pose of the tool."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv as pacsv
+import pytest
+
+import pumafuse as pf
+from pumafuse.logs.axes import in_axes
+
+RECORDED = Path(__file__).parents[1] / "space" / "commands.csv"  # joints and the poses that they are, of a PUMA 560
+URDF = Path(pf.__file__).parent / "data" / "pose-virtual" / "puma560.urdf"
+ROBOT = '[robot]\nurdf = "arm.urdf"\nbase = "base_link"\ntip = "tool0"\n'
+JOINTS = "joints = { " + ", ".join(f'j{one} = "j{one}_deg"' for one in range(1, 7)) + " }\n"
+HEAD = '[command]\nfile = "log.csv"\ntime = { rate_hz = 36 }\n'
+
+
+def read(folder: Path, text: str) -> pf.Run:
+    shutil.copy(RECORDED, folder / "log.csv")
+    shutil.copy(URDF, folder / "arm.urdf")
+    (folder / "run.toml").write_text(text)
+    return pf.Run.read(folder)
+
+
+def test_commands_in_joints_are_those_in_space(tmp_path: Path) -> None:
+    """The chain of the URDF leads to the pose that the controller wrote beside its joints."""
+    table = pacsv.read_csv(RECORDED)
+    run, _ = in_axes(read(tmp_path, ROBOT + HEAD + JOINTS), None)
+    for axis in "xyz":
+        np.testing.assert_allclose(run.command.values[axis], table[f"{axis}_mm"].to_numpy() / 1e3, atol=2e-7)
+    pose = HEAD + 'x = "x_mm"\ny = "y_mm"\nz = "z_mm"\norientation = { quaternion = ["qx", "qy", "qz", "qw"] }\n'
+    (tmp_path / "pose").mkdir()
+    told, _ = in_axes(read(tmp_path / "pose", pose), None)
+    for axis in ("rx", "ry", "rz"):
+        np.testing.assert_allclose(run.command.values[axis], told.command.values[axis], atol=1e-6)
+
+
+BAD = {
+    "no robot": (HEAD + JOINTS, r"command is in joints: give \[robot\]"),
+    "a joint without a column": (ROBOT + HEAD + 'joints = { j1 = "j1_deg" }\n', "no column for joint 'j2'"),
+    "a length": (ROBOT + HEAD + JOINTS.replace('"j3_deg"', '"x_mm"'), "column 'x_mm' is no angle"),
+    "axes beside joints": (ROBOT + HEAD + JOINTS + 'x = "x_mm"\n', "x is given, too"),
+    "no such link": (ROBOT.replace("tool0", "hand") + HEAD + JOINTS, "hand"),
+    "no such file": (ROBOT.replace("arm.urdf", "other.urdf") + HEAD + JOINTS, "other.urdf"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_joints_that_are_no_pose_are_refused_in_one_line(case: str, tmp_path: Path) -> None:
+    """The line says which joint, column or link."""
+    text, words = BAD[case]
+    with pytest.raises(pf.PumafuseError, match=words) as error:
+        read(tmp_path, text)
+    assert "\n" not in str(error.value)
