@@ -1,0 +1,96 @@
+"""What a registration does not guess: findings, and the one sentence of each."""
+
+from __future__ import annotations
+
+import enum
+from typing import TypeAlias
+
+import msgspec
+
+from ..units import DEG
+
+Vector: TypeAlias = tuple[float, float, float]
+
+
+class Finding(enum.Enum):
+    """What is wrong or not told."""
+
+    SHORT = "short"  # too few rows, or too little time
+    UNRELATED = "unrelated"  # the sensor does not move as the tool does
+    MIRRORED = "mirrored"  # the sensor's axes are left-handed
+    LINE = "line"  # the motion does not tell how the sensor is turned about an axis of the base
+    PLANE = "plane"  # the motion does not tell whether the sensor's axes are right-handed
+    SCALE = "scale"  # lengths of the sensor are not those of the commands
+    STILL = "still"  # the tool does not turn
+    ONE_AXIS = "one-axis"  # the tool turns about one axis of its own only
+    READING = "reading"  # an orientation follows if it is read in another way
+    ATTITUDE = "attitude"  # orientations are told in another frame than positions
+    ATTITUDE_UNRELATED = "attitude-unrelated"  # orientations follow in no way
+
+
+class Reading(enum.Enum):
+    """How the four numbers of an orientation are to be read."""
+
+    AS_TOLD = "as they are"
+    INVERSE = "as turning the other way"
+    W_FIRST = "with w first (order = 'wxyz')"
+    W_LAST = "with w last (order = 'xyzw')"
+
+
+class Found(msgspec.Struct, frozen=True, kw_only=True):
+    """A finding with its numbers.
+
+    Attributes:
+        finding: What it is.
+        size: SHORT: how long [s]; UNRELATED: correlation of speeds; SCALE: the base's lengths over the sensor's;
+            ATTITUDE: the angle between the frames [rad].
+        axis: LINE: in the base; ONE_AXIS: on the tool.
+        source: READING: whose, command or sensor.
+        reading: READING: how it follows.
+        unit: SCALE: the units of sensor and base that it looks like.
+    """
+
+    finding: Finding
+    size: float | None = None
+    axis: Vector | None = None
+    source: str | None = None
+    reading: Reading | None = None
+    unit: str | None = None
+
+    @property
+    def prevents(self) -> bool:
+        """Whether nothing is registered then."""
+        return self.finding in (Finding.SHORT, Finding.UNRELATED, Finding.MIRRORED)
+
+    def sentence(self, sensor: str) -> str:
+        """What to know of a sensor, and what to do."""
+        size, axis = self.size or 0.0, ", ".join(f"{one:.3f}" for one in self.axis or ())
+        match self.finding:
+            case Finding.SHORT:
+                what = f"has {size:.1f} s of measurements beside commands: too little to register it; record 10 s or more"
+            case Finding.UNRELATED:
+                what = f"does not move with the tool (correlation of speeds {size:+.2f}): is it of this run and clock?"
+            case Finding.MIRRORED:
+                what = "has left-handed axes beside the commands': is a sign wrong, or are two axes exchanged (run.toml)?"
+            case Finding.LINE:
+                what = f"saw motion along ({axis}) of the base only: how it is turned about that is not known"
+            case Finding.PLANE:
+                what = "saw motion in a plane only: its axes are taken to be right-handed, which nothing tells"
+            case Finding.SCALE:
+                unit = f", as if it were {self.unit}" if self.unit else ""
+                what = f"measures lengths that are to be multiplied by {size:.4g}{unit}: mend its unit or scale (run.toml)"
+            case Finding.STILL:
+                what = "saw a tool that does not turn: its marker stays as given, and the frame's place makes up for it"
+            case Finding.ONE_AXIS:
+                what = f"saw the tool turn about ({axis}) of its own only: along that the marker stays as given"
+            case Finding.READING:
+                reading = "" if self.reading is None else self.reading.value
+                what = f"and the commands turn alike if the orientations of the {self.source} are read {reading}"
+            case Finding.ATTITUDE:
+                what = (
+                    f"tells orientations in another frame than positions, turned by {size * DEG:.1f}°:"
+                    " its orientations are not used"
+                )
+            case Finding.ATTITUDE_UNRELATED:
+                what = "tells orientations that do not follow the commanded ones: they are not used"
+        return f"{sensor} {what}"

@@ -1,0 +1,126 @@
+"""What was told to the tool and what a sensor saw of it, and where the tool is by its commands.
+
+The arm answers by a dead time and a first-order plant, one for positions, one for orientations, between commands that
+are held: exact at any instant. An orientation R is Exp(θ) R₀, and each component of θ goes through the plant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from ..filter.response import response
+from ..model.arm import AxisModel
+from ..model.plants import FirstOrder
+
+_NS = 1e9  # in a second
+_PERIOD = 1.0  # s: the response does not depend on the update period
+_STEP = 1e-5  # s, by which dead times and time constants are varied for slopes
+
+
+class Motion(NamedTuple):
+    """What one source tells of the tool in one run.
+
+    Attributes:
+        time: When [s], ascending, (n,).
+        position: Where [m], (n, 3); a row with NaN tells nothing.
+        quaternion: How it is turned, as x, y, z, w, (n, 4); None where the source does not tell.
+    """
+
+    time: FloatArray
+    position: FloatArray
+    quaternion: FloatArray | None = None
+
+    def valid(self) -> Motion:
+        """The rows in which all is known, in the order of time, the first of each instant."""
+        good = np.isfinite(self.time) & np.isfinite(self.position).all(axis=1)
+        if self.quaternion is not None:
+            good &= np.isfinite(self.quaternion).all(axis=1) & (np.abs(self.quaternion) > 0.0).any(axis=1)
+        rows = np.flatnonzero(good)
+        return self.only(rows[np.unique(self.time[rows], return_index=True)[1]])
+
+    def only(self, rows: BoolArray | IntArray) -> Motion:
+        """Some rows."""
+        turned = None if self.quaternion is None else self.quaternion[rows]
+        return Motion(self.time[rows], self.position[rows], turned)
+
+
+class Plant(NamedTuple):
+    """How the arm answers.
+
+    Attributes:
+        delay: Dead time [s], the sensor's latency with it.
+        time_constant: τ of a first-order plant [s].
+    """
+
+    delay: float
+    time_constant: float
+
+    def changed(self, delay: float, share: float) -> Plant:
+        """With a dead time that is longer [s], and a time constant that is longer by a small share."""
+        return Plant(self.delay + delay, self.time_constant * float(np.exp(share)))
+
+    @property
+    def lag(self) -> float:
+        """At constant velocity [s]."""
+        return self.delay + self.time_constant
+
+
+class Poses(NamedTuple):
+    """Where the tool is: position [m], (n, 3), and rotation matrix tool to base, (n, 3, 3)."""
+
+    position: FloatArray
+    rotation: FloatArray
+
+
+class Answer:
+    """Where the tool is by the commands of several runs whenever a sensor measures: all rows after one another.
+
+    Attributes:
+        turns: Whether the orientation is commanded.
+    """
+
+    def __init__(self, command: Sequence[Motion], time: Sequence[FloatArray]) -> None:
+        self.turns = all(one.quaternion is not None for one in command)
+        self._time = time
+        self._start = [float(one.time[0]) for one in command]
+        self._given = [np.round((one.time - one.time[0]) * _NS).astype(np.int64) for one in command]
+        self._position = [one.position for one in command]
+        rotations = [Rotation.from_quat(one.quaternion) for one in command if one.quaternion is not None]
+        if self.turns:
+            self._reference = Rotation.concatenate(rotations).mean()
+            self._angle = [(one * self._reference.inv()).as_rotvec() for one in rotations]
+
+    def poses(self, position: Plant, rotation: Plant) -> Poses:
+        """The poses under the plants of both."""
+        where = self._through(self._position, position)
+        if not self.turns:
+            return Poses(where, np.broadcast_to(np.eye(3), (len(where), 3, 3)))
+        turned = Rotation.from_rotvec(self._through(self._angle, rotation)) * self._reference
+        return Poses(where, turned.as_matrix())
+
+    def slopes(self, position: Plant, rotation: Plant, here: Poses) -> tuple[list[FloatArray], list[FloatArray]]:
+        """How position and orientation [rad along the base's axes] change with dead time [s] and log τ, (n, 3) each."""
+        moved, turned = list[FloatArray](), list[FloatArray]()
+        for delay, share in ((_STEP, 0.0), (0.0, _STEP)):
+            there = self.poses(position.changed(delay, share), rotation.changed(delay, share))
+            moved.append((there.position - here.position) / _STEP)
+            turn = there.rotation @ here.rotation.swapaxes(1, 2)
+            turned.append(0.5 / _STEP * np.stack([turn[:, i - 1, i - 2] - turn[:, i - 2, i - 1] for i in range(3)], -1))
+        return moved, turned
+
+    def _through(self, levels: Sequence[FloatArray], plant: Plant) -> FloatArray:
+        """Three axes of all runs through a plant, (n, 3)."""
+        axis, found = AxisModel(plant=FirstOrder(time_constant=plant.time_constant)), list[FloatArray]()
+        for start, given, level, time in zip(self._start, self._given, levels, self._time, strict=True):
+            at = np.round((time - plant.delay - start) * _NS).astype(np.int64)
+            answers = [
+                first + response(axis, _PERIOD, 0.0, given, column, first, at)
+                for first, column in zip(level[0].tolist(), level.T, strict=True)
+            ]
+            found.append(np.stack(answers, axis=-1))
+        return np.concatenate(found)

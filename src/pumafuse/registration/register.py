@@ -1,0 +1,456 @@
+"""Registration: where a sensor stands, what it sees on the tool, and how late it is, from any motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..arrays import FloatArray
+from ..toml import Interval
+from .findings import Finding, Found, Reading, Vector
+from .intervals import half_widths
+from .motion import Answer, Motion, Plant
+from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, crossed, fitted, influence
+from .start import Rough, aligned_turns, despiked, kabsch, read, rough, unit
+
+_SETTLED = 6.0  # rough lags after the first command: how the arm moved before is forgotten
+_AT_LEAST, _FEWEST = 5.0, 60  # s and rows of a sensor beside commands
+_ROWS, _COARSE = 8000, 1000  # that are looked at, evenly, in the end and to begin with
+_DEAD = 0.6  # of the lag, to begin with
+_FOLLOWS = 0.3  # correlation of speeds
+_LEFT = 0.5  # of what a sensor saw, which no frame explains: it does not move with the tool
+_TURNS = np.radians(0.5)  # of the tool, root mean square: arms err by as much in orientation
+_BESIDE = 2e-3  # m beside a line, root mean square: arms err by a quarter of that
+_MIRROR, _EITHER = 0.5, 1.5  # times the noise that a mirrored sensor leaves: it is one, or may be one
+_ALIKE = 0.3  # of two sets of directions that a rotation leaves: 17 degrees
+_CLEARER = 0.5  # times as much is left by the right reading
+_SURELY = 0.1  # likewise, of orientations that follow as they are
+_LEVER = 0.15  # m: arms err by 0.5 mm and 0.2 degrees
+_TILT = 0.05  # of a number per step in a direction that nothing tells: less is told
+_UNIT = 0.05  # tolerance of a factor between units
+_OTHER_UNIT = 0.25  # logarithm of a scale from which it is one of a unit
+_OTHER = 0.02  # from which a scale is named: arms' own kinematics are wrong by a tenth of that
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "m": 1.0}  # in m
+
+
+class Place(NamedTuple):
+    """A place and an orientation in another frame: where [m], and a rotation vector [rad]."""
+
+    at: Vector = (0.0, 0.0, 0.0)
+    rotation: Vector = (0.0, 0.0, 0.0)
+
+
+class Quantity(NamedTuple):
+    """A number and its 95 % interval."""
+
+    value: float
+    ci95: Interval
+
+
+class Registered(msgspec.Struct, frozen=True, kw_only=True):
+    """A place and an orientation with 95 % intervals, infinite where the motion does not tell the number.
+
+    Attributes:
+        at: Where [m].
+        at_ci95: Intervals.
+        rotation: As a rotation vector [rad].
+        rotation_ci95: Intervals; of a marker of which no orientation is known: infinite.
+    """
+
+    at: Vector
+    at_ci95: tuple[Interval, Interval, Interval]
+    rotation: Vector
+    rotation_ci95: tuple[Interval, Interval, Interval]
+
+
+class Response(msgspec.Struct, frozen=True, kw_only=True):
+    """How what a sensor tells answers to commands.
+
+    Attributes:
+        lag: The arm's and the sensor's latency together, at constant velocity [s].
+        delay: The dead time in it [s].
+        time_constant: τ of a first-order plant [s]; dead time and τ make up for each other.
+    """
+
+    lag: Quantity
+    delay: Quantity
+    time_constant: Quantity
+
+
+class Registration(msgspec.Struct, frozen=True, kw_only=True):
+    """What :func:`registered` finds.
+
+    Attributes:
+        frame: Base from sensor; None where a finding prevents it.
+        marker: Tool from marker; likewise.
+        position: The response of positions.
+        rotation: That of orientations; None where it was taken to be that of positions.
+        latency: The sensor's [s], where the arm's lag was given.
+        rms: What is left of positions [m].
+        rms_rotation: What is left of orientations [rad]; None where they were not used.
+        rows: How many measurements were looked at.
+        findings: What is wrong or not told.
+    """
+
+    frame: Registered | None = None
+    marker: Registered | None = None
+    position: Response | None = None
+    rotation: Response | None = None
+    latency: Quantity | None = None
+    rms: float | None = None
+    rms_rotation: float | None = None
+    rows: int = 0
+    findings: tuple[Found, ...] = ()
+
+
+def registered(
+    command: Sequence[Motion],
+    sensor: Sequence[Motion],
+    *,
+    marker: Place | None = None,
+    fix_marker: bool = False,
+    arm_lag: float | None = None,
+) -> Registration:
+    """Frame, marker and lag of a sensor.
+
+    Args:
+        command: What the tool was told in the base's frame, one entry a run.
+        sensor: What the sensor told in its own frame and by the same clock, likewise.
+        marker: Tool from marker as far as it is known: what motion does not tell stays so. None: zeros.
+        fix_marker: Whether it stays as it is.
+        arm_lag: The arm's lag [s]; the sensor's latency is what is left.
+    """
+    both = [(a, _within(b, a.time)) for a, b in ((a.valid(), b.valid()) for a, b in zip(command, sensor, strict=True))]
+    both = [(a, b) for a, b in both if len(b.time) >= _FEWEST]
+    seconds = sum(float(b.time[-1] - b.time[0]) for _, b in both)
+    if seconds < _AT_LEAST:
+        return Registration(findings=(Found(finding=Finding.SHORT, size=seconds),))
+    told, seen = [a for a, _ in both], [b for _, b in both]
+    about = rough(told, seen)
+    if about.correlation < _FOLLOWS:
+        return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
+    seen = [_within(b, a.time, _SETTLED * max(about.lag, 0.0)) for a, b in both]
+    return _fitted(_begun(told, seen, about, marker or Place(), fix_marker), fix_marker, arm_lag)
+
+
+def _within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
+    """What a sensor told while there were commands."""
+    if not len(given):
+        return sensor.only(np.zeros(0, np.int64))
+    return sensor.only((sensor.time >= given[0] + settling) & (sensor.time <= given[-1]))
+
+
+def _thinned(sensor: Sequence[Motion], rows: int) -> list[Motion]:
+    """About so many rows at most."""
+    step = -(-sum(len(one.time) for one in sensor) // rows)
+    return [one.only(np.arange(0, len(one.time), step)) for one in sensor]
+
+
+def _rows(command: Sequence[Motion], sensor: Sequence[Motion], mean: FloatArray, *, attitude: bool) -> Rows:
+    """Measurements about a point beside the arm's answer."""
+    turned = [Rotation.from_quat(one.quaternion).as_matrix() for one in sensor if one.quaternion is not None]
+    return Rows(
+        Answer(command, [one.time for one in sensor]),
+        np.concatenate([one.position for one in sensor]) - mean,
+        np.concatenate(turned) if attitude else None,
+    )
+
+
+class _Begin(NamedTuple):
+    """Where the least squares begin.
+
+    Attributes:
+        command: Of all runs, read so that orientations follow.
+        sensor: Likewise, in the base's units.
+        mean: A point in the middle of what the sensor measures [m].
+        attitude: Whether its orientations are used.
+        either: Whether a mirrored sensor would do as well.
+        state: The start.
+        findings: What was found on the way.
+    """
+
+    command: list[Motion]
+    sensor: list[Motion]
+    mean: FloatArray
+    attitude: bool
+    either: bool
+    state: State
+    findings: list[Found]
+
+
+def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Place, fix_marker: bool) -> _Begin:
+    """Unit, handedness and reading of orientations, from positions alone at first."""
+    few, found = _thinned(sensor, _COARSE), list[Found]()
+    mean = np.concatenate([despiked(one.position) for one in few]).mean(axis=0)
+    proper, mirrored = (_coarse(command, few, mean, about, marker, fix_marker, sign) for sign in (1.0, -1.0))
+    spread = float(np.sqrt(np.mean((proper.state.scale * (np.concatenate([despiked(b.position) for b in few]) - mean)) ** 2)))
+    left, other = float(proper.off.noise()[0]), float(mirrored.off.noise()[0])
+    state = proper.state
+    begin = _Begin(command, sensor, mean, False, other < _EITHER * left, state, found)
+    if min(left, other) > _LEFT * spread:
+        found.append(Found(finding=Finding.UNRELATED, size=about.correlation))
+    elif other < _MIRROR * left:
+        found.append(Found(finding=Finding.MIRRORED))
+    if found:
+        return begin
+    factor, unit_found = _unit_of(proper, [len(one.time) for one in few])
+    found += unit_found
+    sensor = [one._replace(position=factor * one.position) for one in sensor]
+    state = state._replace(scale=1.0)
+    begin = begin._replace(sensor=sensor, mean=factor * mean, state=state)
+    if sensor[0].quaternion is None or not Answer(command, []).turns:
+        return begin
+    return _with_attitude(begin, about, marker, fix_marker)
+
+
+def _coarse(
+    command: list[Motion],
+    sensor: list[Motion],
+    mean: FloatArray,
+    about: Rough,
+    marker: Place,
+    fix_marker: bool,
+    sign: float,
+) -> Fit:
+    """A fit to the positions of a few rows, scale free; of a mirrored sensor where the sign is −1."""
+    plant = Plant(_DEAD * about.lag, max((1.0 - _DEAD) * about.lag, 1e-3))
+    rows = _rows(command, sensor, mean, attitude=False)
+    poses, rows = rows.answer.poses(plant, plant), rows._replace(centred=rows.centred * [1.0, 1.0, sign])
+    known = np.array(marker.at)
+    path = poses.position + poses.rotation @ known
+    seen = np.concatenate([despiked(one.position) for one in sensor]) - mean
+    scale = about.scale if np.isfinite(about.scale) else 1.0
+    rotation = kabsch(unit(path), unit(seen * [1.0, 1.0, sign]))[0]
+    turn = Rotation.from_rotvec(marker.rotation).as_matrix()
+    state = State(rotation, path.mean(axis=0), known, turn, scale, plant, plant)
+    told = _turned(poses.rotation)[1]
+    markers = np.zeros((3, 0)) if fix_marker else told
+    return fitted(rows, state, _free(np.eye(3), markers, turn=False, scale=True, own=False))
+
+
+def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Directions on the tool along which a marker's place is not told, and is told, as columns."""
+    moved = rotation - rotation.mean(axis=0)
+    square, directions = np.linalg.eigh(np.einsum("nij,nik->jk", moved, moved) / len(moved))
+    told = square >= _TURNS**2
+    if told.sum() < 2:  # a rotation moves two directions or three
+        told[:] = False
+    return directions[:, ~told], directions[:, told]
+
+
+def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, own: bool) -> FloatArray:
+    """The steps that are allowed, as columns, (17, k).
+
+    Args:
+        rotation: Axes about which the frame may turn, (3, r).
+        marker: Directions in which the marker may move, (3, m).
+        turn: Whether the marker may turn.
+        scale: Whether the scale is free.
+        own: Whether orientations have a plant of their own.
+    """
+    plants = np.eye(4) if own else np.vstack([np.eye(2), np.eye(2)])
+    blocks = [
+        (ROTATION, rotation), (CENTRE, np.eye(3)), (MARKER, marker), (TURN, np.eye(3) if turn else np.zeros((3, 0))),
+        (SCALE, np.eye(1) if scale else np.zeros((1, 0))), (slice(POSITION.start, ANGLE.stop), plants),
+    ]  # fmt: skip
+    columns = list[FloatArray]()
+    for where, block in blocks:
+        column = np.zeros((SIZE, block.shape[1]))
+        column[where] = block
+        columns.append(column)
+    return np.hstack(columns)
+
+
+def _unit_of(fit: Fit, lengths: Sequence[int]) -> tuple[float, list[Found]]:
+    """By what to multiply a sensor's lengths, and that they need it."""
+    scale = fit.state.scale
+    wide = float(half_widths(fit.influence[:, SCALE], lengths)[0])
+    if abs(np.log(scale)) < max(_OTHER_UNIT, wide):
+        return 1.0, []
+    for (name, one), (read_as, other) in product(_UNITS.items(), _UNITS.items()):
+        if abs(np.log(scale * other / one)) < _UNIT:
+            unit = f"in {name}, read as {read_as}"
+            return one / other, [Found(finding=Finding.SCALE, size=one / other, unit=unit)]
+    return scale, [Found(finding=Finding.SCALE, size=scale)]
+
+
+def _with_attitude(begin: _Begin, about: Rough, marker: Place, fix_marker: bool) -> _Begin:
+    """With the sensor's orientations, where they follow; read otherwise where they follow then."""
+    few = _thinned(begin.sensor, _COARSE)
+    left = {
+        (source, reading): _apart(begin, few, source, reading)[0]
+        for source, reading in product(("sensor", "command"), Reading)
+        if source == "sensor" or reading is not Reading.AS_TOLD
+    }
+    best = min(left, key=lambda one: left[one])
+    told = ("sensor", Reading.AS_TOLD)
+    if left[told] <= max(left[best] / _CLEARER, _SURELY):
+        best = told
+    least, frame, alone = _apart(begin, few, *best)
+    if least > _ALIKE:
+        _, frame, alone = _apart(begin, few, *told)
+        angle = float(Rotation.from_matrix(alone[0] @ begin.state.rotation.T).magnitude())
+        kind = Finding.ATTITUDE if alone[1] < _ALIKE else Finding.ATTITUDE_UNRELATED
+        return begin._replace(findings=[*begin.findings, Found(finding=kind, size=angle)])
+    command, sensor = _read_as(begin.command, begin.sensor, *best)
+    state, found = begin.state, list(begin.findings)
+    if best != told:
+        found.append(Found(finding=Finding.READING, source=best[0], reading=best[1]))
+    few = _thinned(sensor, _COARSE)
+    if best[0] == "command":
+        state = _coarse(command, few, begin.mean, about, marker, fix_marker, 1.0).state._replace(scale=1.0)
+    rows = _rows(command, few, begin.mean, attitude=True)
+    assert rows.turned is not None
+    if not fix_marker:
+        arm = rows.answer.poses(state.position, state.angle).rotation
+        state = state._replace(turn=Rotation.from_matrix(arm.swapaxes(1, 2) @ frame @ rows.turned).mean().as_matrix())
+    state = state._replace(rotation=frame)
+    return begin._replace(command=command, sensor=sensor, attitude=True, state=state, findings=found)
+
+
+def _read_as(
+    command: list[Motion], sensor: list[Motion], source: str, reading: Reading
+) -> tuple[list[Motion], list[Motion]]:
+    """Commands and sensor, the orientations of one of them read otherwise."""
+
+    def otherwise(motions: list[Motion]) -> list[Motion]:
+        return [
+            one if one.quaternion is None else one._replace(quaternion=read(one.quaternion, reading)) for one in motions
+        ]
+
+    return (otherwise(command), sensor) if source == "command" else (command, otherwise(sensor))
+
+
+def _apart(
+    begin: _Begin, few: list[Motion], source: str, reading: Reading
+) -> tuple[float, FloatArray, tuple[FloatArray, float]]:
+    """What one frame leaves of positions and orientations, that frame, and both of orientations alone."""
+    command, sensor = _read_as(begin.command, few, source, reading)
+    rows, state = _rows(command, sensor, begin.mean, attitude=True), begin.state
+    poses = rows.answer.poses(state.position, state.angle)
+    path, seen = unit(poses.position + poses.rotation @ state.marker), unit(rows.centred)
+    assert rows.turned is not None
+    turns = aligned_turns(Rotation.from_matrix(poses.rotation), Rotation.from_matrix(rows.turned))
+    size = max(float(np.sqrt(np.mean(np.sum(turns[0] ** 2, axis=1)))), _TURNS) * np.sqrt(len(turns[0]) / len(path))
+    told, measured = (one / size for one in turns)
+    left, frame = kabsch(np.vstack([path, told]), np.vstack([seen, measured]))[::-1]
+    return left, frame, kabsch(told, measured)
+
+
+def _fitted(begin: _Begin, fix_marker: bool, arm_lag: float | None) -> Registration:
+    """The least squares over all, and what they do not tell."""
+    found = begin.findings
+    if any(one.prevents for one in found):
+        return Registration(findings=tuple(found))
+    sensor = _thinned(begin.sensor, _ROWS)
+    rows, state = _rows(begin.command, sensor, begin.mean, attitude=begin.attitude), begin.state
+    poses = rows.answer.poses(state.position, state.angle)
+    blind, told = _turned(poses.rotation)
+    if fix_marker:
+        blind = told = np.zeros((3, 0))
+    elif blind.shape[1] == 3:
+        found.append(Found(finding=Finding.STILL, source=None if rows.answer.turns else "command"))
+    elif blind.shape[1] == 1:
+        found.append(Found(finding=Finding.ONE_AXIS, axis=_vector(blind[:, 0])))
+    loose, held = _about(poses.position + poses.rotation @ state.marker, poses.rotation, begin.attitude)
+    if loose.shape[1]:
+        found.append(Found(finding=Finding.LINE, axis=_vector(loose[:, 0])))
+    elif begin.either and not (begin.attitude and told.shape[1]):
+        found.append(Found(finding=Finding.PLANE))
+    own = begin.attitude and len(told.T) > 0
+    turn = begin.attitude and not fix_marker
+    fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
+    lengths = [len(one.time) for one in sensor]
+    step = influence(rows, fit.state, fit.off, _free(held, told, turn=turn, scale=True, own=own))[:, SCALE]
+    scale, wide = float(np.exp(step.sum())), float(half_widths(step, lengths)[0])
+    if abs(np.log(scale)) > max(_OTHER, wide) and not any(one.finding is Finding.SCALE for one in found):
+        found.append(Found(finding=Finding.SCALE, size=scale))
+    return _told(fit, begin, lengths, loose, blind, own, arm_lag)
+
+
+def _about(path: FloatArray, rotation: FloatArray, attitude: bool) -> tuple[FloatArray, FloatArray]:
+    """Axes of the base about which the motion does not tell how the sensor is turned, and about which it does."""
+    about = path - path.mean(axis=0)
+    if attitude:
+        turned = Rotation.from_matrix(rotation)
+        about = np.vstack([about, _LEVER * (turned * turned.mean().inv()).as_rotvec()])
+    square, axes = np.linalg.eigh(np.sum(about**2) * np.eye(3) - about.T @ about)
+    told = square >= _BESIDE**2 * len(path)
+    return axes[:, ~told], axes[:, told]
+
+
+def _vector(of: FloatArray) -> Vector:
+    x, y, z = of.tolist()
+    return x, y, z
+
+
+def _told(
+    fit: Fit, begin: _Begin, lengths: Sequence[int], loose: FloatArray, blind: FloatArray, own: bool, arm_lag: float | None
+) -> Registration:
+    """The numbers with their intervals."""
+    state = fit.state
+    values, slopes = _numbers(state, begin.mean)
+    half = half_widths(fit.influence @ slopes.T, lengths)
+    lost = np.zeros((SIZE, loose.shape[1] + blind.shape[1]))
+    lost[ROTATION, : loose.shape[1]], lost[MARKER, loose.shape[1] :] = loose, blind
+    half[(np.abs(slopes @ lost) > _TILT).any(axis=1)] = np.inf
+    if not begin.attitude:
+        half[9:12] = np.inf
+    told = [Quantity(one, (one - by, one + by)) for one, by in zip(values.tolist(), half.tolist(), strict=True)]
+    position, rotation = (Response(lag=a, delay=b, time_constant=c) for a, b, c in (told[12:15], told[15:18]))
+    noise = fit.off.rms()
+    latency = None
+    if arm_lag is not None:
+        low, high = position.lag.ci95
+        latency = Quantity(position.lag.value - arm_lag, (low - arm_lag, high - arm_lag))
+    return Registration(
+        frame=_registered(told[:6]),
+        marker=_registered(told[6:12]),
+        position=position,
+        rotation=rotation if own else None,
+        latency=latency,
+        rms=noise[0],
+        rms_rotation=noise[1] if begin.attitude else None,
+        rows=sum(lengths),
+        findings=tuple(begin.findings),
+    )
+
+
+def _registered(told: Sequence[Quantity]) -> Registered:
+    """From six numbers."""
+    x, y, z, a, b, c = told
+    return Registered(
+        at=(x.value, y.value, z.value),
+        at_ci95=(x.ci95, y.ci95, z.ci95),
+        rotation=(a.value, b.value, c.value),
+        rotation_ci95=(a.ci95, b.ci95, c.ci95),
+    )
+
+
+def _numbers(state: State, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Frame, marker, and lag, delay, τ of both plants, (18,), and how a step changes them, (18, 17)."""
+    middle = state.scale * state.rotation @ mean
+    values, slopes = np.zeros(18), np.zeros((18, SIZE))
+    values[0:3], values[6:9] = state.centre - middle, state.marker
+    slopes[0:3, CENTRE], slopes[6:9, MARKER] = np.eye(3), np.eye(3)
+    slopes[0:3, ROTATION] = crossed(middle[None])[0]
+    for first, matrix, where in ((3, state.rotation, ROTATION), (9, state.turn, TURN)):
+        values[first : first + 3] = Rotation.from_matrix(matrix).as_rotvec()
+        slopes[first : first + 3, where] = _of_vector(values[first : first + 3])
+    for first, plant, where in ((12, state.position, POSITION), (15, state.angle, ANGLE)):
+        values[first : first + 3] = plant.lag, plant.delay, plant.time_constant
+        slopes[first : first + 3, where] = [[1.0, plant.time_constant], [1.0, 0.0], [0.0, plant.time_constant]]
+    return values, slopes
+
+
+def _of_vector(vector: FloatArray) -> FloatArray:
+    """How a rotation vector changes with a small rotation from the left, (3, 3): the inverse of its left Jacobian."""
+    angle = float(np.linalg.norm(vector))
+    cross = crossed(vector[None])[0]
+    rest = 1.0 / 12.0 if angle < 1e-3 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+    return np.eye(3) - 0.5 * cross + rest * cross @ cross

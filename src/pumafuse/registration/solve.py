@@ -1,0 +1,239 @@
+"""Frame, marker, lag and plant at once, by robust least squares: Gauss and Newton's steps on the rotations themselves.
+
+A row is off by e = p + R m − c − s S (z − z̄) [m] and, where the sensor tells an orientation, by the rotation that
+takes S R_sensor Qᵀ to R [rad]; p, R are the arm's response, z and R_sensor what is measured, S the frame's rotation,
+m the marker's place, Q its rotation, c where the mean z̄ of what is measured lies, s a scale. A row counts as
+Cauchy's distribution would have it, by how far it is off as a whole: no axes are preferred.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..arrays import FloatArray, median
+from .motion import Answer, Plant, Poses
+
+ROTATION, CENTRE, MARKER, TURN, SCALE, POSITION, ANGLE = (
+    slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 13), slice(13, 15), slice(15, 17)
+)  # fmt: skip  # of a step: delay and log τ in the last two
+SIZE = 17
+_CAUCHY = 3.0  # standard deviations from which a row counts half
+_MEDIAN = 1.5382  # of the length of three standard normal deviates
+_LEAST = 1e-9  # m or rad: rounding
+_STEPS = 50  # at most
+_HALVED = 6  # times that a step which leads up is halved
+_ENOUGH = 1e-12  # of the sum per row: a step that gains less is the last
+_SINGULAR = 1e-11  # of the largest eigenvalue: what is smaller is not told by the rows
+_SHORTEST, _LONGEST = 1e-3, 2.0  # s, of a time constant
+_FASTEST = 0.3  # s, by which a dead time changes in a step, and logarithm by which τ does
+
+
+class State(NamedTuple):
+    """What is looked for.
+
+    Attributes:
+        rotation: S, base from sensor, (3, 3).
+        centre: Where the mean of what the sensor measures lies in the base [m], (3,).
+        marker: Its place on the tool [m], (3,).
+        turn: Q, tool from marker, (3, 3).
+        scale: Of the base's lengths over the sensor's.
+        position: The plant of positions.
+        angle: The plant of orientations.
+    """
+
+    rotation: FloatArray
+    centre: FloatArray
+    marker: FloatArray
+    turn: FloatArray
+    scale: float
+    position: Plant
+    angle: Plant
+
+    def moved(self, step: FloatArray) -> State:
+        """After a step, (17,)."""
+        plants = [
+            Plant(
+                one.delay + float(np.clip(by[0], -_FASTEST, _FASTEST)),
+                float(np.clip(one.time_constant * np.exp(np.clip(by[1], -1.0, 1.0)), _SHORTEST, _LONGEST)),
+            )
+            for one, by in ((self.position, step[POSITION]), (self.angle, step[ANGLE]))
+        ]
+        return State(
+            Rotation.from_rotvec(step[ROTATION]).as_matrix() @ self.rotation,
+            self.centre + step[CENTRE],
+            self.marker + step[MARKER],
+            Rotation.from_rotvec(step[TURN]).as_matrix() @ self.turn,
+            self.scale * float(np.exp(step[SCALE][0])),
+            *plants,
+        )
+
+
+class Rows(NamedTuple):
+    """What a sensor measured, the rows of all runs after one another.
+
+    Attributes:
+        answer: Where the tool is by its commands.
+        centred: z − z̄ [m], (n, 3); z̄ is any point in the middle.
+        turned: R_sensor, (n, 3, 3); None where it is not told.
+    """
+
+    answer: Answer
+    centred: FloatArray
+    turned: FloatArray | None
+
+
+class Off(NamedTuple):
+    """How far rows are off.
+
+    Attributes:
+        blocks: Lengths [m], (n, 3), and angles [rad] where the sensor tells orientation, (n, 3).
+        poses: Where the tool is.
+    """
+
+    blocks: list[FloatArray]
+    poses: Poses
+
+    def noise(self) -> FloatArray:
+        """The standard deviation of each block, by the median."""
+        return np.array([max(median(_length(one)) / _MEDIAN, _LEAST) for one in self.blocks])
+
+    def rms(self) -> list[float]:
+        """Of each block, over rows that are within ten medians."""
+        lengths = [_length(one) for one in self.blocks]
+        kept = [one[one <= 10.0 * median(one) + _LEAST] for one in lengths]
+        return [float(np.sqrt(np.mean(one**2))) for one in kept]
+
+    def cost(self, noise: FloatArray) -> float:
+        """Cauchy's sum."""
+        pairs = zip(self.blocks, noise.tolist(), strict=True)
+        return float(sum(np.log1p((_length(one) / (_CAUCHY * sd)) ** 2).sum() for one, sd in pairs))
+
+
+class Fit(NamedTuple):
+    """The least squares that were found.
+
+    Attributes:
+        state: What was looked for.
+        off: How far each row is off.
+        influence: By how much each row moves each number of a step, (n, 17): their sums are 0.
+    """
+
+    state: State
+    off: Off
+    influence: FloatArray
+
+
+def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
+    """The robust least squares from a start.
+
+    Args:
+        rows: What was measured.
+        state: The start.
+        free: The steps that are allowed, as columns, (17, k).
+    """
+    off = residual(rows, state)
+    for _ in range(_STEPS):
+        noise = off.noise()
+        information, score = _normal(rows, state, off, noise, free, expected=False)
+        total = score.sum(axis=0)
+        step = -_inverse(information) @ total
+        if -(total @ step) < _ENOUGH * len(score):
+            break
+        better = _better(rows, state, free @ step, off.cost(noise), noise)
+        if better is None:
+            break
+        state, off = better
+    return Fit(state, off, influence(rows, state, off, free))
+
+
+def influence(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArray:
+    """By how much each row moves each number of a step, (n, 17), at the least squares; their sum leads there."""
+    information, score = _normal(rows, state, off, off.noise(), free, expected=True)
+    return -score @ _inverse(information) @ free.T
+
+
+def residual(rows: Rows, state: State) -> Off:
+    """How far each row is off."""
+    poses = rows.answer.poses(state.position, state.angle)
+    seen = state.scale * rows.centred @ state.rotation.T
+    blocks = [poses.position + poses.rotation @ state.marker - state.centre - seen]
+    if rows.turned is not None:
+        measured = state.rotation @ rows.turned @ state.turn.T
+        blocks.append(Rotation.from_matrix(poses.rotation @ measured.swapaxes(1, 2)).as_rotvec())
+    return Off(blocks, poses)
+
+
+def _better(rows: Rows, state: State, step: FloatArray, cost: float, noise: FloatArray) -> tuple[State, Off] | None:
+    """After a step, halved until it leads down; None where it does not."""
+    for _ in range(_HALVED):
+        there = state.moved(step)
+        off = residual(rows, there)
+        if off.cost(noise) < cost:
+            return there, off
+        step = 0.5 * step
+    return None
+
+
+def _normal(
+    rows: Rows, state: State, off: Off, noise: FloatArray, free: FloatArray, *, expected: bool
+) -> tuple[FloatArray, FloatArray]:
+    """The information of the free steps, (k, k), and each row's slope of half the sum, (n, k).
+
+    Args:
+        rows: What was measured.
+        state: Where.
+        off: How far rows are off there.
+        noise: Of each block.
+        free: The steps that are allowed.
+        expected: Whether the information is that of Cauchy's curvature, of which intervals are made, or the larger one
+            of Gauss and Newton, which leads down more safely.
+    """
+    information, score = 0.0, 0.0
+    for slope, one, sd in zip(_slopes(rows, state, off.poses), off.blocks, noise.tolist(), strict=True):
+        inner = slope @ free
+        far = (_length(one) / (_CAUCHY * sd)) ** 2
+        weight = 1.0 / ((1.0 + far) * sd**2)
+        curved = weight * (1.0 - 2.0 / 3.0 * far / (1.0 + far)) if expected else weight
+        flat = inner.reshape(-1, inner.shape[-1])
+        information = information + (flat * np.repeat(curved, 3)[:, None]).T @ flat
+        score = score + np.matmul((one * weight[:, None])[:, None], inner)[:, 0]
+    return np.asarray(information), np.asarray(score)
+
+
+def _slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
+    """How each block changes with a step, (n, 3, 17)."""
+    moved, turned = rows.answer.slopes(state.position, state.angle, poses)
+    seen = state.scale * rows.centred @ state.rotation.T
+    arm = poses.rotation @ state.marker
+    place = np.zeros((len(seen), 3, SIZE))
+    place[:, :, ROTATION] = crossed(seen)
+    place[:, :, CENTRE] = -np.eye(3)
+    place[:, :, MARKER] = poses.rotation
+    place[:, :, SCALE] = -seen[:, :, None]
+    place[:, :, POSITION] = np.stack(moved, axis=-1)
+    place[:, :, ANGLE] = np.stack([np.cross(one, arm) for one in turned], axis=-1)
+    if rows.turned is None:
+        return [place]
+    angle = np.zeros((len(seen), 3, SIZE))
+    angle[:, :, ROTATION] = -np.eye(3)
+    angle[:, :, TURN] = state.rotation @ rows.turned @ state.turn.T
+    angle[:, :, ANGLE] = np.stack(turned, axis=-1)
+    return [place, angle]
+
+
+def crossed(vectors: FloatArray) -> FloatArray:
+    """The matrices that take w to v × w, (n, 3, 3)."""
+    return np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2)
+
+
+def _inverse(information: FloatArray) -> FloatArray:
+    """Of a matrix whose numbers have units of their own; what rows do not tell does not move."""
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    return np.linalg.pinv(information / np.outer(size, size), rcond=_SINGULAR, hermitian=True) / np.outer(size, size)
+
+
+def _length(vectors: FloatArray) -> FloatArray:
+    return np.linalg.norm(vectors, axis=1)
