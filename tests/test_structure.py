@@ -24,6 +24,7 @@ ROOMS = [
     "pieces",
     "simulation",
     "tuning",
+    "registration",
     "identification",
     "live",
     "views",

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .model.arm import ArmModel, AxisModel, Gain, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, Plant, SecondOrder
+    from .registration.runs import RegisteredSensor, Registrations, RegistrationSummary, register
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
     from .simulation.true_arm import TrueAxis
@@ -64,6 +65,7 @@ _NAMES = {
     "model.arm": ["ArmModel", "AxisModel", "Gain", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
     "model.plants": ["FirstOrder", "Plant", "SecondOrder"],
+    "registration.runs": ["RegisteredSensor", "RegistrationSummary", "Registrations", "register"],
     "simulation.scenario": ["Scenario"],
     "simulation.simulate": ["Simulated", "simulate"],
     "simulation.true_arm": ["TrueAxis"],
@@ -83,13 +85,13 @@ __all__ = [
     "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
     "Events", "FirstOrder", "Fitted", "FittedLag", "FusionConfig", "Gain", "Health", "Identification", "Latency",
     "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "Outcome", "PartLag", "Plan",
-    "PlannedTrial", "Plant", "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Rotated",
-    "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor",
-    "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary",
-    "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary",
-    "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize", "error_figure", "fuse",
-    "fused_figure", "identify", "latency", "plan", "score", "simulate", "summarise", "to_rerun", "tune",
-    "validation_figure", "verify",
+    "PlannedTrial", "Plant", "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack",
+    "RegisteredSensor", "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score",
+    "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary",
+    "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Trace", "Trial", "TrialResult",
+    "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult",
+    "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency",
+    "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 

@@ -128,6 +128,30 @@ def fuse(
 
 
 @app.command()
+def register(
+    runs: Runs,
+    config: Annotated[
+        Path | None,
+        Option("--config", "-c", metavar="FUSION.TOML", help="Arm and sensors; default: found in the runs."),
+    ] = None,
+    sensor: Annotated[str | None, Option(metavar="NAME", help="Which one; default: each that gives x, y, z.")] = None,
+    fix: Annotated[str | None, Option(metavar="marker", help="What stays as configured.")] = None,
+    output: Annotated[
+        Path | None, Option("--output", "-o", metavar="DIR", help="Where fusion.toml and arm.toml go.")
+    ] = None,
+    json: Json = False,
+    since: From = None,
+    until: To = None,
+    force: Force = False,
+) -> None:
+    """Find where a sensor stands, what it sees on the tool, and how late it is, from any motion."""
+    _check_interval(since, until)
+    from . import register as command
+
+    command.run(runs, config, sensor, _names(fix) or (), output, json, force, (since, until))
+
+
+@app.command()
 def compare(
     folders: Annotated[list[Path], Argument(metavar="DIR...", help="Result folders of `pumafuse fuse`.")],
     reference: Annotated[Path | None, Option(metavar="FILE_OR_RUN", help="Default: each folder's own.")] = None,

@@ -15,7 +15,22 @@ from ..toml import Interval
 from .findings import Finding, Found, Reading, Vector
 from .intervals import half_widths
 from .motion import Answer, Motion, Plant
-from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, crossed, fitted, influence
+from .solve import (
+    ANGLE,
+    CENTRE,
+    MARKER,
+    POSITION,
+    ROTATION,
+    SCALE,
+    SIZE,
+    TURN,
+    Fit,
+    Rows,
+    State,
+    crossed,
+    fitted,
+    influence,
+)
 from .start import Rough, aligned_turns, despiked, kabsch, read, rough, unit
 
 _SETTLED = 6.0  # rough lags after the first command: how the arm moved before is forgotten
@@ -62,10 +77,10 @@ class Registered(msgspec.Struct, frozen=True, kw_only=True):
         rotation_ci95: Intervals; of a marker of which no orientation is known: infinite.
     """
 
-    at: Vector
-    at_ci95: tuple[Interval, Interval, Interval]
-    rotation: Vector
-    rotation_ci95: tuple[Interval, Interval, Interval]
+    at: Vector = msgspec.field(name="at_mm")
+    at_ci95: tuple[Interval, Interval, Interval] = msgspec.field(name="at_mm_ci95")
+    rotation: Vector = msgspec.field(name="rotation_vector_deg")
+    rotation_ci95: tuple[Interval, Interval, Interval] = msgspec.field(name="rotation_vector_deg_ci95")
 
 
 class Response(msgspec.Struct, frozen=True, kw_only=True):
@@ -188,7 +203,9 @@ def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Pl
     few, found = _thinned(sensor, _COARSE), list[Found]()
     mean = np.concatenate([despiked(one.position) for one in few]).mean(axis=0)
     proper, mirrored = (_coarse(command, few, mean, about, marker, fix_marker, sign) for sign in (1.0, -1.0))
-    spread = float(np.sqrt(np.mean((proper.state.scale * (np.concatenate([despiked(b.position) for b in few]) - mean)) ** 2)))
+    spread = float(
+        np.sqrt(np.mean((proper.state.scale * (np.concatenate([despiked(b.position) for b in few]) - mean)) ** 2))
+    )
     left, other = float(proper.off.noise()[0]), float(mirrored.off.noise()[0])
     state = proper.state
     begin = _Begin(command, sensor, mean, False, other < _EITHER * left, state, found)
@@ -390,7 +407,13 @@ def _vector(of: FloatArray) -> Vector:
 
 
 def _told(
-    fit: Fit, begin: _Begin, lengths: Sequence[int], loose: FloatArray, blind: FloatArray, own: bool, arm_lag: float | None
+    fit: Fit,
+    begin: _Begin,
+    lengths: Sequence[int],
+    loose: FloatArray,
+    blind: FloatArray,
+    own: bool,
+    arm_lag: float | None,
 ) -> Registration:
     """The numbers with their intervals."""
     state = fit.state

@@ -53,7 +53,9 @@ def rough(command: Sequence[Motion], sensor: Sequence[Motion]) -> Rough:
                     left, right = (np.concatenate(one) for one in zip(*_shifted(pairs, lag), strict=True))
                     alike = _correlation(left, right)
                     if alike > best.correlation:
-                        scale = np.median(left[_upper(left)]) / np.median(right[_upper(left)]) if by == of == 0 else np.nan
+                        scale = (
+                            np.median(left[_upper(left)]) / np.median(right[_upper(left)]) if by == of == 0 else np.nan
+                        )
                         best = Rough(lag * _TICK, float(scale), alike)
     return best
 

@@ -1,0 +1,94 @@
+"""`pumafuse register`."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+from rich.console import Console
+
+from .. import folders
+from ..fusion.config import FusionConfig
+from ..logs.run import Run
+from ..registration.register import Registered
+from ..registration.runs import RegisteredSensor, register
+from ..toml import Interval
+from ..units import DEG, MM, MS
+from .tables import print_tables, table
+
+SUMMARY = "registration.json"
+_OURS = frozenset({SUMMARY, "fusion.toml", "arm.toml"})
+_NOT_ALL = 3  # exit code: some sensor was not registered
+
+
+def run(
+    paths: Sequence[Path],
+    config: Path | None,
+    sensor: str | None,
+    fix: Sequence[str],
+    output: Path | None,
+    json: bool,
+    force: bool,
+    part: tuple[float | None, float | None] = (None, None),
+) -> None:
+    """Register sensors and write the configuration; the arguments are the options of the command.
+
+    Raises:
+        PumafuseError: No sensor can be registered, or the output folder must not be replaced.
+        Exit: With 3 where one of several sensors is not registered.
+    """
+    if output is not None:
+        folders.check_writable(output, force, [SUMMARY], _OURS.__contains__)
+    given = None if config is None else FusionConfig.load(config)
+    runs = [Run.read(path).between(*part) for path in paths]
+    with Console(stderr=True).status("looking for frames and markers"):
+        found = register(runs, given, sensor=sensor, fix=fix)
+    if output is not None:
+        with folders.replacing(output) as new:
+            found.config.save(new)
+            (new / SUMMARY).write_text(found.to_json(), encoding="utf-8")
+    if json:
+        typer.echo(found.to_json(), nl=False)
+    else:
+        for name, one in found.details.sensors.items():
+            _show(name, one)
+        if output is not None:
+            folder = shlex.quote(str(output))
+            typer.echo(f"written to {output}\nnext: pumafuse fuse RUN -c {folder}/fusion.toml -o DIR")
+    if any(one.frame is None for one in found.details.sensors.values()):
+        raise typer.Exit(_NOT_ALL)
+
+
+def _show(name: str, one: RegisteredSensor) -> None:
+    """Print what was found of one sensor."""
+    if one.frame is None or one.marker is None or one.lag is None or one.latency is None:
+        typer.echo(f"{name}: not registered")
+        return
+    turned = "" if one.angular_rms is None else f" and {one.angular_rms * DEG:.3g}°"
+    typer.echo(f"{name}: {one.rows} measurements; left over {(one.rms or 0.0) * MM:.3g} mm{turned} RMS")
+    rows = [*_places("frame", one.frame), *_places("marker", one.marker)]
+    rows.append(["lag, ms", f"{one.lag * MS:.2f}", _limits(one.lag_ci95, MS, ".2f")])
+    rows.append(["latency_ms", f"{one.latency * MS:.2f}", _limits(one.latency_ci95, MS, ".2f")])
+    print_tables([table(["number", "found", "95 % interval"], rows)])
+
+
+def _places(what: str, found: Registered) -> list[list[str]]:
+    """Rows of a place and an orientation."""
+    rows: list[list[str]] = []
+    for key, values, limits, scale in (
+        ("at_mm", found.at, found.at_ci95, MM),
+        ("rotation_vector_deg", found.rotation, found.rotation_ci95, DEG),
+    ):
+        if key == "rotation_vector_deg" and what == "marker" and not any(values):
+            continue
+        for axis, value, interval in zip("xyz", values, limits, strict=True):
+            rows.append([f"{what}.{key}, {axis}", f"{value * scale:.3f}", _limits(interval, scale, ".3f")])
+    return rows
+
+
+def _limits(interval: Interval | None, scale: float, form: str) -> str:
+    if interval is None or abs(interval[0]) == float("inf"):
+        return "the motion does not tell"
+    return " to ".join(format(end * scale, form) for end in interval)

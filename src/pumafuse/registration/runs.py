@@ -1,0 +1,284 @@
+"""Registration of the sensors of recorded runs: :func:`register`."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from .. import toml
+from ..discovery.roles import relations
+from ..discovery.survey import Survey
+from ..errors import ConfigError, PumafuseWarning, RunError, UnknownNameError
+from ..fusion.config import FusionConfig, Placement, Sensor, Tool
+from ..fusion.placing import in_base, with_tool
+from ..logs.axes import reference_orientation
+from ..logs.clock import without_strays
+from ..logs.frames import CARTESIAN
+from ..logs.run import Run, Source
+from ..model.arm import ArmModel, AxisModel
+from ..model.plants import FirstOrder
+from ..space.rotations import TURNING
+from ..toml import Interval
+from ..tuning.latency import first_guess
+from ..units import Kind, seconds
+from .findings import Vector
+from .motion import Motion
+from .register import Place, Registered, Registration, Response, registered
+
+FIXED = ("marker",)  # what can be left as it is
+_DIGITS = 6  # of m and rad in a configuration: a micrometre
+_SHORTEST = 1e-3  # s, of a plant
+
+
+class RegisteredSensor(msgspec.Struct, frozen=True, kw_only=True):
+    """What was found of one sensor.
+
+    Attributes:
+        frame: Where it stands; None where a finding prevents it.
+        marker: What it sees on the tool, likewise.
+        lag: From a command to what the sensor tells of it, at constant velocity: the arm's lag and the sensor's latency
+            together [s].
+        lag_ci95: Its 95 % interval.
+        latency: The sensor's own [s]: where the arm's lag is known, else beyond that of the earliest sensor.
+        latency_ci95: Its interval.
+        rms: What the registration leaves of positions, root mean square [m].
+        angular_rms: Likewise of orientations [rad]; None where none is compared.
+        rows: How many measurements were looked at.
+        findings: What is wrong with it, or not told by the motion, by name.
+        notes: The same in sentences.
+    """
+
+    frame: Registered | None = None
+    marker: Registered | None = None
+    lag: float | None = msgspec.field(name="lag_ms", default=None)
+    lag_ci95: Interval | None = msgspec.field(name="lag_ms_ci95", default=None)
+    latency: float | None = msgspec.field(name="latency_ms", default=None)
+    latency_ci95: Interval | None = msgspec.field(name="latency_ms_ci95", default=None)
+    rms: float | None = msgspec.field(name="rms_mm", default=None)
+    angular_rms: float | None = msgspec.field(name="rms_deg", default=None)
+    rows: int = 0
+    findings: list[str] = []
+    notes: list[str] = []
+
+
+class RegistrationSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What ``register --json`` prints.
+
+    Attributes:
+        pumafuse: Version that made it.
+        runs: Names of the runs.
+        sensors: By sensor.
+    """
+
+    pumafuse: str
+    runs: list[str]
+    sensors: dict[str, RegisteredSensor]
+
+
+@dataclass(frozen=True, repr=False)
+class Registrations:
+    """The result of :func:`register`.
+
+    Attributes:
+        config: The configuration with frame, marker and latency of each sensor that was registered.
+        details: What it is in numbers [SI].
+    """
+
+    config: FusionConfig
+    details: RegistrationSummary
+
+    def __repr__(self) -> str:
+        return f"Registrations({', '.join(self.details.runs)}: {', '.join(self.details.sensors)})"
+
+    def to_json(self) -> str:
+        """All of it as JSON, in the units of the names."""
+        tree = toml.reported(self.details)
+        return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode() + "\n"
+
+
+def register(
+    runs: Sequence[Run] | Run,
+    config: FusionConfig | None = None,
+    *,
+    sensor: str | None = None,
+    fix: Iterable[str] = (),
+) -> Registrations:
+    """Find where sensors stand, what they see on the tool, and how late they are, from any motion.
+
+    Args:
+        runs: Recorded runs of one set-up.
+        config: Arm and sensors, whose markers are where the search begins; the arm's lag is believed. None: the arm is
+            found, too, and the earliest sensor is taken to have no latency.
+        sensor: The one to register; None: each that gives x, y and z.
+        fix: ``marker``: it stays as configured.
+
+    Returns:
+        The configuration with frames, markers and latencies, and their 95 % intervals.
+
+    Warns:
+        PumafuseWarning: For what is wrong with a sensor or not told by the motion.
+
+    Raises:
+        PumafuseError: No sensor can be registered; says why.
+    """
+    every = [without_strays(run) for run in ([runs] if isinstance(runs, Run) else runs)]
+    if unknown := next((one for one in fix if one not in FIXED), None):
+        raise UnknownNameError("--fix", "what is", unknown, FIXED)
+    names = _sensors(every, config, sensor)
+    lag = None if config is None else float(np.mean([config.arm.lag_of(axis) for axis in CARTESIAN]))
+    found = {name: _registered(every, name, config, lag, fixed=bool(list(fix))) for name in names}
+    placed = {name: one for name, one in found.items() if one.frame is not None}
+    said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
+    if not placed:
+        raise RunError("; ".join(note for notes in said.values() for note in notes))
+    earliest = min(one.position.lag.value for one in placed.values() if one.position) if lag is None else lag
+    details = {name: _details(one, earliest, said[name]) for name, one in found.items()}
+    latencies = {name: details[name].latency or 0.0 for name in placed}
+    if config is None:
+        config = _configuration(every, placed, latencies)
+    else:
+        config = _with_places(with_tool(config, every[0]), placed, latencies)
+    for notes in said.values():
+        for note in notes:
+            warnings.warn(note, PumafuseWarning, stacklevel=2)
+    summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=[run.name for run in every], sensors=details)
+    return Registrations(config, summary)
+
+
+def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | None) -> list[str]:
+    """The sensors to register.
+
+    Raises:
+        RunError: There is none, or no commands in x, y and z.
+        UnknownNameError: The one that is asked for is in no run, or not configured.
+        ConfigError: The arm has no axes x, y, z.
+    """
+    for run in runs:
+        if not set(CARTESIAN) <= run.command.values.keys():
+            raise RunError(f"{run.command.label}: a sensor is registered beside commands in x, y and z; there are only"
+                           f" {', '.join(run.command.values) or 'orientations'}")  # fmt: skip
+    if config is not None and not set(CARTESIAN) <= config.arm.axes.keys():
+        raise ConfigError(f"arm '{config.arm.name}': sensors are registered along axes x, y and z, which it has not")
+    every = dict.fromkeys(name for run in runs for name in run.sensors)
+    known = list(every) if config is None else [name for name in every if name in config.sensors]
+    if sensor is not None and sensor not in known:
+        raise UnknownNameError("--sensor", "sensor", sensor, known)
+    names = [
+        name
+        for name in ([sensor] if sensor else known)
+        if any(name in run.sensors and set(CARTESIAN) <= run.sensors[name].values.keys() for run in runs)
+    ]
+    if not names:
+        raise RunError(f"no sensor gives x, y and z, by which it could be registered; there are: {', '.join(every)}")
+    return names
+
+
+def _registered(
+    runs: Sequence[Run], name: str, config: FusionConfig | None, lag: float | None, *, fixed: bool
+) -> Registration:
+    """The registration of one sensor by the runs that have it."""
+    pairs = [(_motion(run.command), _motion(run.sensors[name])) for run in runs if name in run.sensors]
+    marker = None if config is None or name not in config.sensors else config.sensors[name].marker
+    known = None if marker is None else Place(marker.at, marker.rotation)
+    command, sensor = [told for told, _ in pairs], [seen for _, seen in pairs]
+    return registered(command, sensor, marker=known, fix_marker=fixed, arm_lag=lag)
+
+
+def _motion(source: Source) -> Motion:
+    position = np.column_stack([source.values[axis] for axis in CARTESIAN])
+    return Motion(seconds(source.stamp), position, source.orientation)
+
+
+def _details(one: Registration, arm_lag: float, notes: list[str]) -> RegisteredSensor:
+    """What was found of one sensor; ``arm_lag`` [s] is believed."""
+    names = [found.finding.value for found in one.findings]
+    if one.position is None:
+        return RegisteredSensor(findings=names, notes=notes)
+    lag, (low, high) = one.position.lag
+    return RegisteredSensor(
+        frame=one.frame,
+        marker=one.marker,
+        lag=lag,
+        lag_ci95=(low, high),
+        latency=lag - arm_lag,
+        latency_ci95=(low - arm_lag, high - arm_lag),
+        rms=one.rms,
+        angular_rms=one.rms_rotation,
+        rows=one.rows,
+        findings=names,
+        notes=notes,
+    )
+
+
+def _placement(found: Registered | None) -> Placement | None:
+    """A place as a configuration has it; None for one that is where the robot's is."""
+    if found is None:
+        return None
+    at, rotation = (_rounded(one) for one in (found.at, found.rotation))
+    return Placement(at=at, rotation=rotation) if any(at) or any(rotation) else None
+
+
+def _rounded(vector: Vector) -> Vector:
+    x, y, z = (round(one, _DIGITS) for one in vector)
+    return x, y, z
+
+
+def _with_places(
+    config: FusionConfig, found: Mapping[str, Registration], latencies: Mapping[str, float]
+) -> FusionConfig:
+    """The configuration with frame, marker and latency of sensors."""
+    sensors = {
+        name: msgspec.structs.replace(
+            config.sensors[name],
+            frame=_placement(one.frame),
+            marker=_placement(one.marker),
+            latency=round(latencies[name], _DIGITS),
+        )
+        for name, one in found.items()
+    }
+    return msgspec.structs.replace(config, sensors={**config.sensors, **sensors})
+
+
+def _configuration(
+    runs: Sequence[Run], found: Mapping[str, Registration], latencies: Mapping[str, float]
+) -> FusionConfig:
+    """A configuration to begin with: the arm that was found, and noise as it looks along the base's axes."""
+    first = min(found.values(), key=lambda one: one.position.lag.value if one.position else np.inf)
+    response, turning = first.position, first.rotation or first.position
+    assert response is not None and turning is not None
+    tool = reference_orientation(runs[0])
+    axes = {axis: _axis("length", response) for axis in CARTESIAN}
+    if tool is not None:
+        axes |= {axis: _axis("angle", turning) for axis in TURNING}
+    period = float(np.median(np.diff(runs[0].command.stamp))) / 1e9
+    arm = ArmModel(
+        name="registered",
+        update_period=float(f"{period:.4g}"),
+        delay=max(round(response.delay.value, _DIGITS), 0.0),
+        axes=axes,
+    )
+    bare = {name: Sensor(sd=max(one.rms or 0.0, 1e-6)) for name, one in found.items()}
+    config = FusionConfig(arm=arm, sensors=bare, tool=None if tool is None else Tool(reference=tool))
+    config = _with_places(config, found, latencies)
+    placed = [in_base(run, config)[0] for run in runs]
+    guessed = first_guess([Survey(Path(run.name), run, relations(run)) for run in placed])
+    sensors = {
+        name: msgspec.structs.replace(
+            guessed.sensors[name], latency=one.latency, frame=one.frame, marker=one.marker, scale=1.0, bias_sd=0.0
+        )
+        for name, one in config.sensors.items()
+        if name in guessed.sensors
+    }
+    known = {axis: one for axis, one in arm.axes.items() if axis in guessed.arm.axes}
+    arm = msgspec.structs.replace(guessed.arm, delay=arm.delay, axes={**guessed.arm.axes, **known})
+    return msgspec.structs.replace(guessed, arm=arm, tool=config.tool, sensors=sensors)
+
+
+def _axis(kind: Kind, response: Response) -> AxisModel:
+    return AxisModel(kind=kind, plant=FirstOrder(time_constant=max(response.time_constant.value, _SHORTEST)))
