@@ -13,7 +13,7 @@ import pumafuse as pf
 from pumafuse.logs.axes import in_axes
 
 RECORDED = Path(__file__).parents[1] / "space" / "commands.csv"  # joints and the poses that they are, of a PUMA 560
-URDF = Path(pf.__file__).parent / "data" / "pose-virtual" / "puma560.urdf"
+URDF = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"
 ROBOT = '[robot]\nurdf = "arm.urdf"\nbase = "base_link"\ntip = "tool0"\n'
 JOINTS = "joints = { " + ", ".join(f'j{one} = "j{one}_deg"' for one in range(1, 7)) + " }\n"
 HEAD = '[command]\nfile = "log.csv"\ntime = { rate_hz = 36 }\n'

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from pumafuse.errors import ConfigError, UnknownNameError
 from pumafuse.space.kinematics import Chain
 from refusals import one_line
 
-PUMA = Path(str(files("pumafuse") / "data" / "pose-virtual" / "puma560.urdf"))
+PUMA = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"
 COMMANDS = Path(__file__).with_name("commands.csv")
 # d [m], a [m], alpha [rad] of each link: what the controller of the recorded PUMA 560 computes with
 DENAVIT_HARTENBERG = [

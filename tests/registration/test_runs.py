@@ -1,0 +1,109 @@
+"""``register`` of recorded runs, and what is fused with what it writes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import pumafuse as pf
+
+RUNS = Path(__file__).parents[2] / "examples" / "pose-virtual"
+TRUE = {  # of the simulation that the runs are from: how each sensor is turned [deg], what it sees [mm]
+    "mocap": ((-148.119668, 52.631573, -6.871825), (30.0, -50.0, 120.0)),
+    "tracker": ((-1.993468, 0.207007, -112.001045), (0.0, 62.0, 35.0)),
+}
+
+
+def pumafuse(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pumafuse", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def registered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("register") / "out"
+    done = pumafuse("register", RUNS / "inspect1", "-o", folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_frames_and_markers_are_those_of_the_set_up(registered: Path) -> None:
+    """Rotations within 0.35° and markers within 2.5 mm: the arm's own kinematics are wrong by about as much."""
+    config = pf.FusionConfig.load(registered / "fusion.toml")
+    for name, (rotation, marker) in TRUE.items():
+        sensor = config.sensors[name]
+        assert sensor.frame is not None
+        assert sensor.marker is not None
+        turned = Rotation.from_rotvec(sensor.frame.rotation) * Rotation.from_rotvec(rotation, degrees=True).inv()
+        assert turned.magnitude() < np.radians(0.35)
+        np.testing.assert_allclose(np.array(sensor.marker.at) * 1e3, marker, atol=2.5)
+
+
+def test_what_is_written_as_json_is_what_is_configured(registered: Path) -> None:
+    """Numbers are in the units of their names, each with an interval that holds it."""
+    told = json.loads((registered / "registration.json").read_text())
+    config = pf.FusionConfig.load(registered / "fusion.toml")
+    for name, one in told["sensors"].items():
+        frame = config.sensors[name].frame
+        assert frame is not None
+        np.testing.assert_allclose(one["frame"]["at_mm"], np.array(frame.at) * 1e3, atol=1e-3)
+        for value, (low, high) in zip(one["frame"]["at_mm"], one["frame"]["at_mm_ci95"], strict=True):
+            assert low < value < high
+        low, high = one["lag_ms_ci95"]
+        assert low < one["lag_ms"] < high
+
+
+@pytest.mark.parametrize("sensor", ["mocap", "tracker"])
+def test_another_run_of_the_set_up_is_fused_by_it(registered: Path, sensor: str) -> None:
+    """About the arm's constant error the tool is known to half a millimetre and 0.3°, untuned, from a first guess."""
+    run = pf.Run.read(RUNS / "wander1")
+    est = pf.fuse(run, pf.FusionConfig.load(registered / "fusion.toml"), sensors=[sensor])
+    assert est.reference is not None
+    settled = est.time > 3.0
+    for axis, estimate in est.axes.items():
+        known = np.interp(est.time, est.reference.time, est.reference.position[axis])
+        scatter = float(np.std((estimate.position - known)[settled]))
+        assert scatter < (np.radians(0.3) if axis.startswith("r") else 0.5e-3), axis
+
+
+def test_a_marker_that_is_fixed_stays(tmp_path: Path, registered: Path) -> None:
+    """With ``--fix marker`` the frame alone is found, beside the marker that somebody measured."""
+    done = pumafuse(
+        "register", RUNS / "inspect1", "-c", registered / "fusion.toml", "--sensor", "tracker", "--fix", "marker",
+        "-o", tmp_path / "out",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    before, after = (pf.FusionConfig.load(one / "fusion.toml").sensors for one in (registered, tmp_path / "out"))
+    assert before["tracker"].marker == after["tracker"].marker
+    assert before["mocap"] == after["mocap"]
+
+
+BAD = {
+    "an unknown sensor": (("--sensor", "camera"), "unknown sensor 'camera'"),
+    "nothing to fix": (("--fix", "frame"), "--fix"),
+    "no such configuration": (("-c", "nowhere.toml"), "nowhere.toml: no such file"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_be_registered_is_one_line(case: str) -> None:
+    """The line says what, and what is accepted."""
+    arguments, words = BAD[case]
+    done = pumafuse("register", RUNS / "inspect1", *arguments)
+    assert done.returncode not in (0, 70)
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert words in done.stderr
+
+
+def test_commands_without_a_position_register_nothing() -> None:
+    """A sensor is registered beside commands in x, y and z."""
+    time = np.arange(0.0, 8.0, 0.02)
+    run = pf.Run.from_arrays(time, {"pan": np.sin(time)}, {"camera": (time, {"pan": np.sin(time)})})
+    with pytest.raises(pf.RunError, match=r"beside commands in x, y and z; there are only pan"):
+        pf.register(run)
