@@ -15,7 +15,7 @@ from .. import toml
 from ..discovery.roles import relations
 from ..discovery.survey import Survey
 from ..errors import ConfigError, PumafuseWarning, RunError, UnknownNameError
-from ..fusion.config import FusionConfig, Placement, Sensor, Tool
+from ..fusion.config import SD_BOUNDS, FusionConfig, Placement, Sensor, Tool
 from ..fusion.placing import in_base, with_tool
 from ..logs.axes import reference_orientation
 from ..logs.clock import without_strays
@@ -27,9 +27,10 @@ from ..space.rotations import TURNING
 from ..toml import Interval
 from ..tuning.latency import first_guess
 from ..units import Kind, seconds
+from .beside import later
 from .findings import Vector
 from .motion import Motion
-from .register import Place, Registered, Registration, Response, registered
+from .register import Place, Quantity, Registered, Registration, Response, registered
 
 FIXED = ("marker",)  # what can be left as it is
 _DIGITS = 6  # of m and rad in a configuration: a micrometre
@@ -137,13 +138,10 @@ def register(
     said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
     if not placed:
         raise RunError("; ".join(note for notes in said.values() for note in notes))
-    earliest = min(one.position.lag.value for one in placed.values() if one.position) if lag is None else lag
-    details = {name: _details(one, earliest, said[name]) for name, one in found.items()}
-    latencies = {name: details[name].latency or 0.0 for name in placed}
-    if config is None:
-        config = _configuration(every, placed, latencies)
-    else:
-        config = _with_places(with_tool(config, every[0]), placed, latencies)
+    begun = _arm(every, placed) if config is None else with_tool(config, every[0])
+    latencies = _latencies(every, placed, begun, lag)
+    details = {name: _details(one, latencies.get(name), said[name]) for name, one in found.items()}
+    config = _configuration(every, placed, latencies, begun) if config is None else _placed(begun, placed, latencies)
     for notes in said.values():
         for note in notes:
             warnings.warn(note, PumafuseWarning, stacklevel=2)
@@ -195,19 +193,48 @@ def _motion(source: Source) -> Motion:
     return Motion(seconds(source.stamp), position, source.orientation)
 
 
-def _details(one: Registration, arm_lag: float, notes: list[str]) -> RegisteredSensor:
-    """What was found of one sensor; ``arm_lag`` [s] is believed."""
+def _latencies(
+    runs: Sequence[Run], found: Mapping[str, Registration], config: FusionConfig, lag: float | None
+) -> dict[str, Quantity]:
+    """The latency of each sensor [s]: of the one with the surest lag beyond the arm's, of others beside that one.
+
+    Where the arm's lag is not known, the earliest sensor has none.
+    """
+    lags = {name: one.position.lag for name, one in found.items() if one.position is not None}
+    surest = min(lags, key=lambda name: lags[name].ci95[1] - lags[name].ci95[0])
+    beside = {surest: Quantity(0.0, (0.0, 0.0))}
+    seen = _placed(config, found, {name: Quantity(0.0, (0.0, 0.0)) for name in found})
+    in_space = [in_base(run, seen)[0] for run in runs]
+    for name in lags.keys() - {surest}:
+        both = [run for run in in_space if {name, surest} <= run.sensors.keys()]
+        told = later([_motion(run.sensors[surest]) for run in both], [_motion(run.sensors[name]) for run in both])
+        beside[name] = told or _shifted(lags[name], -lags[surest].value)
+    if lag is None:
+        earliest = min(one.value for one in beside.values())
+        return {name: _shifted(one, -earliest) for name, one in beside.items()}
+    low, high = _shifted(lags[surest], -lag).ci95
+    return {
+        name: Quantity(one.value + lags[surest].value - lag, (one.ci95[0] + low, one.ci95[1] + high))
+        for name, one in beside.items()
+    }
+
+
+def _shifted(one: Quantity, by: float) -> Quantity:
+    return Quantity(one.value + by, (one.ci95[0] + by, one.ci95[1] + by))
+
+
+def _details(one: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:
+    """What was found of one sensor."""
     names = [found.finding.value for found in one.findings]
     if one.position is None:
         return RegisteredSensor(findings=names, notes=notes)
-    lag, (low, high) = one.position.lag
     return RegisteredSensor(
         frame=one.frame,
         marker=one.marker,
-        lag=lag,
-        lag_ci95=(low, high),
-        latency=lag - arm_lag,
-        latency_ci95=(low - arm_lag, high - arm_lag),
+        lag=one.position.lag.value,
+        lag_ci95=one.position.lag.ci95,
+        latency=None if latency is None else latency.value,
+        latency_ci95=None if latency is None else latency.ci95,
         rms=one.rms,
         angular_rms=one.rms_rotation,
         rows=one.rows,
@@ -229,29 +256,26 @@ def _rounded(vector: Vector) -> Vector:
     return x, y, z
 
 
-def _with_places(
-    config: FusionConfig, found: Mapping[str, Registration], latencies: Mapping[str, float]
-) -> FusionConfig:
+def _placed(config: FusionConfig, found: Mapping[str, Registration], latencies: Mapping[str, Quantity]) -> FusionConfig:
     """The configuration with frame, marker and latency of sensors."""
     sensors = {
         name: msgspec.structs.replace(
             config.sensors[name],
             frame=_placement(one.frame),
             marker=_placement(one.marker),
-            latency=round(latencies[name], _DIGITS),
+            latency=round(latencies[name].value, _DIGITS),
         )
         for name, one in found.items()
     }
     return msgspec.structs.replace(config, sensors={**config.sensors, **sensors})
 
 
-def _configuration(
-    runs: Sequence[Run], found: Mapping[str, Registration], latencies: Mapping[str, float]
-) -> FusionConfig:
-    """A configuration to begin with: the arm that was found, and noise as it looks along the base's axes."""
+def _arm(runs: Sequence[Run], found: Mapping[str, Registration]) -> FusionConfig:
+    """The arm as the earliest sensor saw it answer."""
     first = min(found.values(), key=lambda one: one.position.lag.value if one.position else np.inf)
     response, turning = first.position, first.rotation or first.position
-    assert response is not None and turning is not None
+    assert response is not None
+    assert turning is not None
     tool = reference_orientation(runs[0])
     axes = {axis: _axis("length", response) for axis in CARTESIAN}
     if tool is not None:
@@ -263,9 +287,15 @@ def _configuration(
         delay=max(round(response.delay.value, _DIGITS), 0.0),
         axes=axes,
     )
-    bare = {name: Sensor(sd=max(one.rms or 0.0, 1e-6)) for name, one in found.items()}
-    config = FusionConfig(arm=arm, sensors=bare, tool=None if tool is None else Tool(reference=tool))
-    config = _with_places(config, found, latencies)
+    sensors = {name: Sensor(sd=max(one.rms or 0.0, SD_BOUNDS[0])) for name, one in found.items()}
+    return FusionConfig(arm=arm, sensors=sensors, tool=None if tool is None else Tool(reference=tool))
+
+
+def _configuration(
+    runs: Sequence[Run], found: Mapping[str, Registration], latencies: Mapping[str, Quantity], begun: FusionConfig
+) -> FusionConfig:
+    """A configuration to begin with: the arm that was found, and noise as it looks along the base's axes."""
+    config = _placed(begun, found, latencies)
     placed = [in_base(run, config)[0] for run in runs]
     guessed = first_guess([Survey(Path(run.name), run, relations(run)) for run in placed])
     sensors = {
@@ -275,8 +305,8 @@ def _configuration(
         for name, one in config.sensors.items()
         if name in guessed.sensors
     }
-    known = {axis: one for axis, one in arm.axes.items() if axis in guessed.arm.axes}
-    arm = msgspec.structs.replace(guessed.arm, delay=arm.delay, axes={**guessed.arm.axes, **known})
+    known = {axis: one for axis, one in begun.arm.axes.items() if axis in guessed.arm.axes}
+    arm = msgspec.structs.replace(guessed.arm, delay=begun.arm.delay, axes={**guessed.arm.axes, **known})
     return msgspec.structs.replace(guessed, arm=arm, tool=config.tool, sensors=sensors)
 
 
