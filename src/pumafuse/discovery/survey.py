@@ -6,8 +6,8 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,14 @@ import numpy as np
 from ..errors import RunError
 from ..logs.axes import in_axes
 from ..logs.clock import without_strays
-from ..logs.run import Run
+from ..logs.run import Run, Source
+from ..space.rotations import TURNING
 from ..units import MS
 from .contents import Part, parts_of, period_of, without_clock
 from .following import Following
+from .own_frames import FOLLOWS as TURNS
+from .own_frames import OwnFrame, own_frames
 from .roles import Roles, relations, roles_of
-from .sensors import REFERENCE
 
 FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
@@ -36,11 +38,13 @@ class Survey:
 
     Attributes:
         log: The file or folder.
-        run: The run in it, in the arm's axes.
+        run: The run in it, in the arm's axes, without sensors in frames of their own. Axes rx, ry, rz are in it where
+            a sensor follows how the tool is turned.
         relations: How each sensor, and ``reference``, follows the commands, by its name and the axis.
         parts: Its tables or topics; none where it has a ``run.toml``.
         roles: Who is who; None where a ``run.toml`` says it.
         manifest: What that ``run.toml`` holds.
+        own_frames: The sensors that seem to stand in frames of their own.
         interpolation: In which steps the run's commands go on between those of the log [s]; 0: they are the log's.
     """
 
@@ -50,6 +54,7 @@ class Survey:
     parts: Sequence[Part] = ()
     roles: Roles | None = None
     manifest: Mapping[str, Any] | None = None
+    own_frames: Mapping[str, OwnFrame] = field(default_factory=dict[str, OwnFrame])
     interpolation: float = 0.0
 
     @property
@@ -72,23 +77,56 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     """
     described = log if log.name == "run.toml" else log / "run.toml"
     if os.path.isfile(described):  # noqa: PTH113 - Path.is_file raises on a name that is too long
-        run, _ = in_axes(Run.read(described), None)
-        return Survey(log, run, relations(run), manifest=tomllib.loads(described.read_text(encoding="utf-8")))
+        manifest = tomllib.loads(described.read_text(encoding="utf-8"))
+        run = without_strays(Run.read(described))
+        aside = own_frames(run)
+        run, related = _as_axes(run, aside)
+        return Survey(log, run, related, manifest=manifest, own_frames=aside)
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
     if not roles.sensors:
         raise RunError(f"{log}: commands, but nothing that measures where they lead: {_reasons(roles, parts)}")
-    related = relations(without_strays(roles.run))
+    run = without_strays(roles.run)
+    aside = own_frames(run)
+    run, related = _as_axes(run, aside)
     follow = any(abs(one.correlation) >= _SURELY for one in related.values())
-    roles = roles.without({key: why for key, one in related.items() if follow and (why := _does_not_follow(one))})
-    kept = {(one.name, axis) for one in roles.sensors for axis in one.axes}
-    kept |= {(REFERENCE, axis) for axis in roles.reference.axes} if roles.reference else set()
-    related = {key: one for key, one in related.items() if key in kept}
-    found = Survey(log, without_strays(roles.run), related, parts, roles)
+    why_not = {key: why for key, one in related.items() if follow and (why := _does_not_follow(one))}
+    if why_not := {key: why for key, why in why_not.items() if key[1] not in TURNING}:
+        roles = roles.without(why_not)
+        run, related = _as_axes(without_strays(roles.run), aside)
+    found = Survey(log, run, related, parts, roles, own_frames=aside)
     if step := interpolation(found):
         command = found.run.command.interpolated(step)
         found = replace(found, run=replace(found.run, command=command), interpolation=step)
     return found
+
+
+def _as_axes(run: Run, aside: Collection[str]) -> tuple[Run, dict[tuple[str, str], Following]]:
+    """A run in the arm's axes without some sensors, and how the others follow.
+
+    Orientations that do not follow the commanded one are left out, as of a marker that is turned on the tool, and
+    where none does the commanded one, too: nobody measures how the tool is turned. What is seen from a frame of its
+    own needs it for the marker.
+    """
+    run = replace(run, sensors={name: source for name, source in run.sensors.items() if name not in aside})
+    run, _ = in_axes(run, None)
+    related = relations(run)
+    turned = {
+        name
+        for name in ("reference", *run.sensors)
+        if any(abs(related[name, axis].correlation) >= TURNS for axis in TURNING if (name, axis) in related)
+    }
+    sensors = {name: source if name in turned else _without_turning(source) for name, source in run.sensors.items()}
+    reference = run.reference if run.reference is None or "reference" in turned else _without_turning(run.reference)
+    run = replace(run, sensors=sensors, reference=reference)
+    if not aside and not turned & set(run.sensors):
+        run = replace(run.each(lambda _, source: _without_turning(source)), tool=None)
+    every = {**run.sensors, **({} if run.reference is None else {"reference": run.reference})}
+    return run, {(name, axis): one for (name, axis), one in related.items() if axis in every[name].values}
+
+
+def _without_turning(source: Source) -> Source:
+    return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
 def _does_not_follow(one: Following) -> str:
