@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import bag_files
 import pumafuse as pf
 from discovery.test_survey import asked, write, written
 from pumafuse.arrays import FloatArray
@@ -235,3 +236,33 @@ def test_axes_that_are_exchanged_or_dead_are_no_frame(tmp_path: Path) -> None:
             columns["z_m"] = np.random.default_rng(1).normal(scale=1e-3, size=700)
         write(folder / "tracker.csv", columns)
         assert not survey(folder).own_frames, change
+
+
+POSES = {
+    "PoseStamped": ("pose", "position", "orientation"),
+    "TransformStamped": ("transform", "translation", "rotation"),
+}
+
+
+@pytest.mark.parametrize("kind", POSES)
+def test_messages_of_poses_are_poses(kind: str, tmp_path: Path) -> None:
+    """Position and orientation of a message at once: `pose` in run.toml."""
+    from mcap_ros2.writer import Writer
+
+    inside, place, turning = POSES[kind]
+    with (tmp_path / "bag.mcap").open("wb") as file:
+        writer, name = Writer(file), f"geometry_msgs/msg/{kind}"
+        schema = writer.register_msgdef(name, bag_files.definition_of(name))
+        for topic, late in (("/command", 0.0), ("/tracker", LATE)):
+            columns, there = poses(late=late)
+            ns = 1_790_000_000_000_000_000 + np.rint(columns["t_s"] * 1e9).astype(np.int64)
+            at = np.column_stack([columns[f"{axis}_m"] for axis in "xyz"])
+            for stamp, point, turn in zip(ns.tolist(), at.tolist(), there.as_quat().tolist(), strict=True):
+                header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "base"}
+                pose = {place: dict(zip("xyz", point, strict=True)), turning: dict(zip("xyzw", turn, strict=True))}
+                message = {"header": header, inside: pose, "child_frame_id": "tool0"}
+                message = message if kind == "TransformStamped" else {"header": header, inside: pose}
+                writer.write_message(topic, schema, message, log_time=stamp, publish_time=stamp)
+        writer.finish()
+    check_follows(survey(tmp_path / "bag.mcap"), tmp_path / "out")
+    assert (tmp_path / "out" / "run.toml").read_text().count(f'pose = "{inside}"') == 2

@@ -222,7 +222,7 @@ def seen_turned(angle: float, axis: str = "y", noise: float = 5e-4) -> pf.Run:
 def late_arm(delay: float = 80.0) -> pf.FusionConfig:
     """An arm that is 10 ms later than its delay [ms], as it holds each command for 20 ms."""
     axes = "".join(f'\n[axes.{axis}]\nplant = "first-order"\ntime_constant_ms = 0.1' for axis in "xyz")
-    arm = pf.ArmModel.parse(f"update_period_ms = 20.0\ndelay_ms = {delay}{axes}")
+    arm = pf.ArmModel.parse(f"name = 'late'\nupdate_period_ms = 20.0\ndelay_ms = {delay}{axes}")
     return pf.FusionConfig.parse('arm = "arm.toml"\n[sensors.camera]\nsd_mm = 0.5', arm)
 
 

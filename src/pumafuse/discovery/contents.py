@@ -233,7 +233,8 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
     signals, left_out, joints, times = list[Signal](), dict[str, str](), _joints(table), list[str]()
     counts = {name for name in table.columns if _counts(table, name) is not None}
     paths, rows = list(_numeric_paths(table)), _axes_in_rows(table)
-    attitudes = attitudes_in(table, paths) if rows == [{}] else []
+    told = attitudes_in(table, paths) if rows == [{}] else []
+    attitudes = [one for one in told if one.turns]
     turning = {path for one in attitudes for path in one.columns.columns}
     for path, where in product(paths, rows):
         name, listed = _called(path, where), labels.get(leaf(path), [])
@@ -251,7 +252,7 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
             signals.append(found)
         elif found:
             left_out[name] = found
-    signals = [_placed(one, attitudes) for one in _without_quaternions(signals, left_out)]
+    signals = [_placed(one, told) for one in _without_quaternions(signals, left_out)]
     beside = [names.role_words(one.column) for one in signals if one.axis in CARTESIAN]
     left_out |= {path: "turning" for one in attitudes if one.role_words not in beside for path in one.columns.columns}
     clock, notes = _clock(table, signals, sorted(counts))

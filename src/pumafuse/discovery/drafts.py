@@ -96,9 +96,8 @@ def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
         lines.append(_line(_pair(axis, columns[0] if len(columns) == 1 else columns), how + BASES[signals[0].basis]))
     if stream.attitude and not pose:
         asked = "DECIDE: " if stream.attitude.doubt else ""
-        told = {key: value for key, value in to_builtins(stream.attitude.columns).items() if value}
-        told = {key: list(value) if isinstance(value, tuple) else value for key, value in told.items()}
-        told = told if told.get("order") != "xyzw" else {key: value for key, value in told.items() if key != "order"}
+        every: dict[str, Any] = to_builtins(stream.attitude.columns)
+        told = {key: value for key, value in every.items() if value and value != "xyzw"}
         lines.append(_line(_pair("orientation", told), f"{asked}{stream.attitude.basis}"))
     return lines
 
@@ -247,6 +246,6 @@ def _value(value: Any) -> str:
     if isinstance(value, Mapping):
         pairs = (_pair(key, one) for key, one in cast(Mapping[str, Any], value).items())
         return f"{{ {', '.join(pairs)} }}"
-    if isinstance(value, list):
-        return f"[{', '.join(_value(one) for one in cast(list[Any], value))}]"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_value(one) for one in cast(Sequence[Any], value))}]"
     return tomli_w.dumps({"v": value}).removeprefix("v = ").rstrip("\n")

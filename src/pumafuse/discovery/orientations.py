@@ -44,7 +44,7 @@ _UR = re.compile(r"(?i)tcp_?pose[_\[]$")  # x, y, z in m and a rotation vector i
 
 @dataclass(frozen=True)
 class Attitude:
-    """Columns of an orientation that turns.
+    """Columns of an orientation.
 
     Attributes:
         columns: As ``run.toml`` has them.
@@ -73,6 +73,12 @@ class Attitude:
         return bool(self.columns.quaternion and self.doubt)
 
     @property
+    def turns(self) -> bool:
+        """Whether it ever changes: one that does not tells nothing."""
+        known = self.quaternion[np.isfinite(self.quaternion[:, 0])]
+        return len(known) >= _FEWEST and float(rotations.angle_between(known, known[:1]).max()) > _STILL
+
+    @property
     def farthest(self) -> float:
         """How far it is from its mean at the most [rad]."""
         mean = rotations.of_vectors(rotations.mean(self.quaternion)[None])
@@ -93,15 +99,9 @@ def may_be_part(name: str) -> bool:
 
 
 def attitudes_in(table: Table, paths: Iterable[str]) -> list[Attitude]:
-    """The orientations of a table that turn; ``paths`` are those of its numbers."""
+    """The orientations of a table; ``paths`` are those of its numbers."""
     paths = list(paths)
-    found = [*_quaternions(table, paths), *_angles(table, paths)]
-    return [one for one in found if _turns(one.quaternion)]
-
-
-def _turns(quaternion: FloatArray) -> bool:
-    known = quaternion[np.isfinite(quaternion[:, 0])]
-    return len(known) >= _FEWEST and float(rotations.angle_between(known, known[:1]).max()) > _STILL
+    return [*_quaternions(table, paths), *_angles(table, paths)]
 
 
 def _plain(table: Table, columns: Sequence[str]) -> FloatArray | None:
@@ -153,9 +153,10 @@ def _angles(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
         place = {
             group[part]: axis for part, axis in zip("012" if listed else "xyz", CARTESIAN, strict=True) if part in group
         }
-        forms = [tuple("345")] if listed else [one for one in (rotations.TURNING, *_EULER) if set(one) <= group.keys()]
+        known: list[tuple[str, str, str]] = [("3", "4", "5")] if listed else [rotations.TURNING, *_EULER]
+        forms = [one for one in known if set(one) <= group.keys()]
         position = _plain(table, list(place)) if len(place) == len(CARTESIAN) else None
-        if len(forms) != 1 or position is None or not (np.nanmax(position, axis=0) > np.nanmin(position, axis=0)).any():
+        if len(forms) != 1 or position is None or not _moves(position):
             continue
         columns = _three(group, forms[0])
         made = _of_list(columns) if listed else _of_angles(table, columns, _EULER.get(forms[0], ""))
@@ -163,6 +164,11 @@ def _angles(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
             quaternion, unsure = made.read(table)[0], _unsure(made, names.unit_of(columns[0]))
             doubt = "" if listed else f"are {', '.join(columns)} {unsure}? No name says it (run.toml)"
             yield Attitude(made, quaternion, "by name", place, "m" if listed else "", doubt)
+
+
+def _moves(position: FloatArray) -> bool:
+    known = position[np.isfinite(position).all(axis=1)]
+    return len(known) > 0 and bool(np.ptp(known, axis=0).any())
 
 
 def _three(group: Mapping[str, str], parts: Sequence[str]) -> tuple[str, str, str]:

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -24,11 +24,13 @@ from .following import Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
 from .roles import Roles, relations, roles_of
+from .sensors import REFERENCE
 
 FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
 _SURELY = 0.9  # correlation of changes from which a lag is known well
 SOONER = 2e-3  # s: lags are known to 1 ms
+_Relations: TypeAlias = dict[tuple[str, str], Following]  # by the name of a source and the axis
 _STEPS, _FINEST = 10, 1e-3  # of an update period; s
 
 
@@ -80,7 +82,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         manifest = tomllib.loads(described.read_text(encoding="utf-8"))
         run = without_strays(Run.read(described))
         aside = own_frames(run)
-        run, related = _as_axes(run, aside)
+        run = _along_axes(run, aside)
+        run, related = _followed(run, relations(run))
         return Survey(log, run, related, manifest=manifest, own_frames=aside)
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
@@ -88,12 +91,15 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         raise RunError(f"{log}: commands, but nothing that measures where they lead: {_reasons(roles, parts)}")
     run = without_strays(roles.run)
     aside = own_frames(run)
-    run, related = _as_axes(run, aside)
+    run = _along_axes(run, aside)
+    related = relations(run)
     follow = any(abs(one.correlation) >= _SURELY for one in related.values())
     why_not = {key: why for key, one in related.items() if follow and (why := _does_not_follow(one))}
-    if why_not := {key: why for key, why in why_not.items() if key[1] not in TURNING}:
-        roles = roles.without(why_not)
-        run, related = _as_axes(without_strays(roles.run), aside)
+    roles = roles.without({key: why for key, why in why_not.items() if key[1] not in TURNING})
+    kept = {(one.name, axis) for one in roles.sensors for axis in (*one.axes, *TURNING)}
+    kept |= {(REFERENCE, axis) for axis in (*roles.reference.axes, *TURNING)} if roles.reference else set()
+    related = {key: one for key, one in related.items() if key in kept}
+    run, related = _followed(_along_axes(without_strays(roles.run), aside), related)
     found = Survey(log, run, related, parts, roles, own_frames=aside)
     if step := interpolation(found):
         command = found.run.command.interpolated(step)
@@ -101,28 +107,32 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     return found
 
 
-def _as_axes(run: Run, aside: Collection[str]) -> tuple[Run, dict[tuple[str, str], Following]]:
-    """A run in the arm's axes without some sensors, and how the others follow.
+def _along_axes(run: Run, aside: Collection[str]) -> Run:
+    """A run in the arm's axes, without the sensors that stand aside."""
+    kept = {name: source for name, source in run.sensors.items() if name not in aside}
+    return in_axes(replace(run, sensors=kept), None)[0]
 
-    Orientations that do not follow the commanded one are left out, as of a marker that is turned on the tool, and
-    where none does the commanded one, too: nobody measures how the tool is turned. What is seen from a frame of its
-    own needs it for the marker.
+
+def _followed(run: Run, related: _Relations) -> tuple[Run, _Relations]:
+    """A run without orientations that do not follow the commanded one, and how the rest of it follows.
+
+    A marker may be turned on the tool. Where no sensor follows the commanded orientation, nobody measures it.
     """
-    run = replace(run, sensors={name: source for name, source in run.sensors.items() if name not in aside})
-    run, _ = in_axes(run, None)
-    related = relations(run)
-    turned = {
-        name
-        for name in ("reference", *run.sensors)
-        if any(abs(related[name, axis].correlation) >= TURNS for axis in TURNING if (name, axis) in related)
-    }
-    sensors = {name: source if name in turned else _without_turning(source) for name, source in run.sensors.items()}
-    reference = run.reference if run.reference is None or "reference" in turned else _without_turning(run.reference)
-    run = replace(run, sensors=sensors, reference=reference)
-    if not aside and not turned & set(run.sensors):
+    every = {**run.sensors, **({} if run.reference is None else {REFERENCE: run.reference})}
+    turned = {name for name in every if _turns_along(run.command, name, related)}
+    every = {name: source if name in turned else _without_turning(source) for name, source in every.items()}
+    run = replace(run, sensors={name: every[name] for name in run.sensors}, reference=every.get(REFERENCE))
+    if run.sensors and turned.isdisjoint(run.sensors):
         run = replace(run.each(lambda _, source: _without_turning(source)), tool=None)
-    every = {**run.sensors, **({} if run.reference is None else {"reference": run.reference})}
     return run, {(name, axis): one for (name, axis), one in related.items() if axis in every[name].values}
+
+
+def _turns_along(command: Source, name: str, related: _Relations) -> bool:
+    """Whether a source follows the commanded orientation on its axes together, each as far as it is told to turn."""
+    turning = [axis for axis in TURNING if (name, axis) in related]
+    power = np.array([np.nanvar(command.values[axis]) for axis in turning])
+    correlation = np.array([related[name, axis].correlation for axis in turning])
+    return bool(turning) and float(power @ correlation) >= TURNS * float(power.sum())
 
 
 def _without_turning(source: Source) -> Source:

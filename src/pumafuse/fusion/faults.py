@@ -527,7 +527,7 @@ def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatAr
 
     def misfit(rotated: FloatArray) -> float:
         left = value - rotated
-        left = left - step @ np.linalg.lstsq(step, left)[0]
+        left = np.asarray(left - step @ np.linalg.lstsq(step, left)[0], dtype=np.float64)
         return float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
 
     return turn, misfit(led), misfit(led @ turn.T)
