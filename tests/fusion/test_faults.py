@@ -194,3 +194,74 @@ def trunk(place: Path) -> list[pf.Run]:
         for name, rows in zip(("encoder", "camera"), seen, strict=True):
             runs.append(pf.Run.from_arrays(time, command, {name: rows}, name=name))
     return runs
+
+
+def looks_turned(run: pf.Run, config: pf.FusionConfig) -> list[float]:
+    """The angles of the sensors that are said to be turned [deg]."""
+    found = [one for one in notes(run, config) if "looks turned by" in one]
+    assert all("pumafuse register" in one for one in found)
+    return [float(one.partition("looks turned by ")[2].partition("°")[0]) for one in found]
+
+
+def seen_turned(angle: float, axis: str = "y", noise: float = 5e-4) -> pf.Run:
+    """A run in x, y, z of an arm that is 90 ms late; its camera stands elsewhere, turned about an axis [deg]."""
+    t, part = 0.02 * np.arange(1000), np.radians(angle)
+
+    def places(at: np.ndarray) -> np.ndarray:
+        return np.array([0.15, 0.1, 0.2]) * (1.0 - np.cos(np.maximum(at, 0.0)[:, None] * np.array([0.9, 1.4, 0.6])))
+
+    one, two = (place for place in range(3) if "xyz"[place] != axis)
+    turn = np.eye(3)
+    turn[[one, one, two, two], [one, two, one, two]] = np.cos(part), np.sin(part), -np.sin(part), np.cos(part)
+    seen = places(t - 0.09) @ turn.T + np.random.default_rng(5).normal(0.0, noise, (1000, 3))
+    seen += np.array([1.0, -2.0, 0.5]) * bool(angle)
+    told, measured = (dict(zip("xyz", value.T, strict=True)) for value in (places(t), seen))
+    return pf.Run.from_arrays(t, told, {"camera": (t, measured)})
+
+
+def late_arm(delay: float = 80.0) -> pf.FusionConfig:
+    """An arm that is 10 ms later than its delay [ms], as it holds each command for 20 ms."""
+    axes = "".join(f'\n[axes.{axis}]\nplant = "first-order"\ntime_constant_ms = 0.1' for axis in "xyz")
+    arm = pf.ArmModel.parse(f"name = 'late'\nupdate_period_ms = 20.0\ndelay_ms = {delay}{axes}")
+    return pf.FusionConfig.parse('arm = "arm.toml"\n[sensors.camera]\nsd_mm = 0.5', arm)
+
+
+def by_camera(run: pf.Run, **values: np.ndarray) -> pf.Run:
+    """The run with other values of some axes of its camera."""
+    camera = run.sensors["camera"]
+    return replace(run, sensors={"camera": replace(camera, values={**camera.values, **values})})
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+@pytest.mark.parametrize("angle", [3.0, -5.0, 12.0, 40.0, 130.0])
+def test_a_sensor_that_is_turned_is_named_with_its_angle(angle: float, axis: str) -> None:
+    """To 0.2 degrees, from 3 degrees on, wherever it stands; and nothing else is said of it."""
+    run = seen_turned(angle, axis)
+    assert looks_turned(run, late_arm()) == pytest.approx([abs(angle)], abs=0.2)
+    assert len(notes(run, late_arm())) == 1
+
+
+@pytest.mark.parametrize("delay", [30.0, 130.0])
+def test_an_arm_with_a_wrong_delay_has_no_turned_sensor(delay: float) -> None:
+    """A model that is 50 ms off is off by the speed, in all directions alike."""
+    assert not looks_turned(seen_turned(0.0), late_arm(delay))
+
+
+def test_noise_a_gain_and_a_straight_line_are_no_turn() -> None:
+    """Much noise; 2 degrees; 0.8 times as far on one axis; one axis that moves, others that tremble."""
+    assert not looks_turned(seen_turned(0.0, noise=0.1), late_arm())
+    assert not looks_turned(seen_turned(2.0), late_arm())
+    run = seen_turned(0.0)
+    assert not looks_turned(by_camera(run, x=0.8 * run.sensors["camera"].values["x"]), late_arm())
+    draw, still = np.random.default_rng(2), np.zeros(1000)
+    line = by_camera(run, **{axis: draw.normal(0.0, 5e-4, 1000) for axis in "xy"})
+    line = replace(line, command=replace(line.command, values={**line.command.values, "x": still, "y": still}))
+    assert not looks_turned(line, late_arm())
+
+
+def test_two_wrong_signs_are_no_turn() -> None:
+    """Half a turn about y is what x and z with a wrong sign are: that is said, as before."""
+    run = seen_turned(0.0)
+    seen = run.sensors["camera"].values
+    found = notes(by_camera(run, x=-seen["x"], z=-seen["z"]), late_arm())
+    assert len(found) == 1 and "moves against the commands of x, z" in found[0]

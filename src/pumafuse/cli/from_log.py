@@ -12,6 +12,7 @@ import typer
 from ..discovery.drafts import drafts
 from ..discovery.guesses import guess
 from ..discovery.survey import survey
+from ..errors import RunError
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Mode
@@ -50,6 +51,12 @@ def run(
     """
     results.check_writable(output, force, with_run=True)
     found = survey(log)
+    if not found.run.sensors:
+        name, one = next(iter(found.own_frames.items()))
+        raise RunError(
+            f"{log}: nothing measures along the commands' axes: {name} {one.words}; `pumafuse init {log} -o DIR`, then"
+            " `pumafuse register DIR`"
+        )
     arm, begins = guess(found)
     texts, here = drafts(found, arm, begins, output), Path()
     begun = FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))

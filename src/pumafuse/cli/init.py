@@ -18,7 +18,7 @@ from ..discovery.roles import Stream
 from ..discovery.survey import Survey, survey
 from ..errors import ConfigError, counted, printable
 from ..folders import write_file
-from ..units import MS, SCREEN
+from ..units import DEG, MS, SCREEN
 from .tables import print_tables, table
 
 _FEW = 4  # columns that are named
@@ -48,6 +48,10 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     place = shlex.quote(str(folder))
     typer.echo(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
     tuned, fused = f"{place}/tuned", f"{place}/fused"
+    if found.own_frames:
+        typer.echo(f"  pumafuse register {place} -o {place}/registered")
+    if not found.run.sensors:
+        return
     typer.echo(f"  pumafuse latency {place}")
     typer.echo(f"  pumafuse tune {place} -c {place}/fusion.toml -o {tuned} --fit noise,delay,plant")
     typer.echo(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
@@ -104,6 +108,10 @@ def _rate(stamp: np.ndarray) -> tuple[str, str]:
 
 def _axis_rows(what: str, stream: Stream) -> Iterator[list[str]]:
     because = stream.why
+    if stream.attitude:
+        angle = f"up to {stream.attitude.farthest * DEG:.3g}° from its mean"
+        yield [what, "orientation", " ".join(stream.attitude.columns.columns), stream.attitude.basis, angle, because]
+        what = because = ""
     for axis, signals in stream.axes.items():
         low, high = (f(signals[0].plain[np.isfinite(signals[0].plain)]) for f in (np.min, np.max))
         columns = " + ".join(_where(one) for one in signals)

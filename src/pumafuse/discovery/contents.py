@@ -24,12 +24,14 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, counted, printable
 from ..logs import formats, recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, without_sentinels
+from ..logs.frames import CARTESIAN
 from ..logs.manifest import Time
 from ..logs.messages import PATH, PATH_TIME
 from ..logs.run import Source, standing_clock
 from ..logs.stamps import packets
 from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
 from . import names
+from .orientations import Attitude, attitudes_in, may_be_part
 
 _TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
 _ACCEPTED = "accepted: CSV, JSON, Parquet, .xlsx, .mat, .npy, .npz, MCAP, bags of ROS, .ulg, .rrd"
@@ -158,6 +160,7 @@ class Part:
         signals: Its columns of positions.
         left_out: Its other columns of numbers, and why they are none.
         notes: What is to be said of it.
+        attitudes: Its orientations, each beside x, y, z of the same source.
     """
 
     file: Path
@@ -170,6 +173,7 @@ class Part:
     signals: tuple[Signal, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
     notes: tuple[str, ...] = ()
+    attitudes: tuple[Attitude, ...] = ()
 
     @property
     def label(self) -> str:
@@ -228,9 +232,13 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
     """A part with its clock and its columns, from its table."""
     signals, left_out, joints, times = list[Signal](), dict[str, str](), _joints(table), list[str]()
     counts = {name for name in table.columns if _counts(table, name) is not None}
-    for path, where in product(_numeric_paths(table), _axes_in_rows(table)):
+    paths, rows = list(_numeric_paths(table)), _axes_in_rows(table)
+    told = attitudes_in(table, paths) if rows == [{}] else []
+    attitudes = [one for one in told if one.turns]
+    turning = {path for one in attitudes for path in one.columns.columns}
+    for path, where in product(paths, rows):
         name, listed = _called(path, where), labels.get(leaf(path), [])
-        if path in where:
+        if path in where or path in turning:
             continue
         if names.is_time(path):
             times.append(path)
@@ -244,7 +252,9 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
             signals.append(found)
         elif found:
             left_out[name] = found
-    signals = _without_quaternions(signals, left_out)
+    signals = [_placed(one, told) for one in _without_quaternions(signals, left_out)]
+    beside = [names.role_words(one.column) for one in signals if one.axis in CARTESIAN]
+    left_out |= {path: "turning" for one in attitudes if one.role_words not in beside for path in one.columns.columns}
     clock, notes = _clock(table, signals, sorted(counts))
     if clock is None and rate:
         clock = _counted(table, rate)
@@ -258,7 +268,17 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
         signals=_with_units([one for one in signals if one.column not in used]),
         left_out={path: why for path, why in left_out.items() if path not in mine},
         notes=(*notes, *(() if clock is None else clock.notes), *place.notes, *table.notes),
+        attitudes=tuple(one for one in attitudes if one.role_words in beside),
     )
+
+
+def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
+    """A column beside an orientation as the axis that it is by that."""
+    for one in attitudes:
+        if axis := one.place.get(signal.column):
+            known = {"unit": one.place_unit, "basis": "name"} if one.place_unit else {}
+            return replace(signal, axis=axis, **known)
+    return signal
 
 
 def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
@@ -774,7 +794,7 @@ def _wanted(topic: Topic) -> list[str]:
     streamed = not several and times[1] - times[0] < _STREAM_NS * (topic.count - 1)
     if PATH_TIME in topic.fields and not streamed:
         return [PATH]
-    wanted = [name for name in topic.fields if not names.no_position(name)]
+    wanted = [name for name in topic.fields if may_be_part(name) or not names.no_position(name)]
     return prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
 
 

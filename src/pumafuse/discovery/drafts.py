@@ -13,7 +13,9 @@ from msgspec import to_builtins
 
 from ..errors import printable
 from ..logs.columns import leaf
-from ..units import MS, SCREEN, ending
+from ..logs.frames import CARTESIAN
+from ..space.rotations import TURNING
+from ..units import DEG, MS, SCREEN, ending
 from .contents import Signal
 from .guesses import ArmGuess, SensorGuess
 from .roles import Stream
@@ -36,7 +38,7 @@ def drafts(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess], fol
     return {
         "run.toml": _run_toml(found, arm, folder),
         "arm.toml": _arm_toml(found, arm),
-        "fusion.toml": _fusion_toml(arm, sensors),
+        "fusion.toml": _fusion_toml(found, arm, sensors),
     }
 
 
@@ -56,7 +58,7 @@ def _run_toml(found: Survey, arm: ArmGuess, folder: Path) -> str:
     levels = {
         f"{axis}_{SCREEN[one.kind].unit}": _digits(one.start * SCREEN[one.kind].scale, 6)
         for axis, one in arm.axes.items()
-        if one.start is not None
+        if one.start is not None and axis not in TURNING
     }
     if levels:
         lines.append(_line(_pair("start", levels), "its sensor says so: not at its first command"))
@@ -85,11 +87,33 @@ def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
     if set(time) <= {"column", "nanoseconds"}:
         time = list(time.values()) if clock.time.nanoseconds else clock.time.column
     lines.append(_line(_pair("time", time), clock.basis))
-    for axis, signals in stream.axes.items():
+    pose = _pose(stream)
+    if pose and stream.attitude:
+        lines.append(_line(_pair("pose", pose), "in m, and how it is turned"))
+    for axis, signals in stream.axes.items() if not pose else ():
         columns: list[Any] = [_column(one) for one in signals]
         how = "DECIDE: unit " if signals[0].basis == "range" else "unit "
         lines.append(_line(_pair(axis, columns[0] if len(columns) == 1 else columns), how + BASES[signals[0].basis]))
+    if stream.attitude and not pose:
+        asked = "DECIDE: " if stream.attitude.doubt else ""
+        every: dict[str, Any] = to_builtins(stream.attitude.columns)
+        told = {key: value for key, value in every.items() if value and value != "xyzw"}
+        lines.append(_line(_pair("orientation", told), f"{asked}{stream.attitude.basis}"))
     return lines
+
+
+def _pose(stream: Stream) -> str:
+    """Where a message has its whole pose, if its axes and its orientation are this; else empty."""
+    columns = stream.attitude.columns.quaternion if stream.attitude else None
+    if columns is None or tuple(stream.axes) != CARTESIAN:
+        return ""
+    whole, dot, word = columns[0].removesuffix(".x").rpartition(".")
+    position = {("transform", "rotation"): "translation"}.get((whole, word), "position")
+    is_pose = word == ("rotation" if whole == "transform" else "orientation")
+    places = [[(f"{whole}{dot}{position}.{axis}", "m")] for axis in CARTESIAN]
+    found = [[(one.column, one.unit) for one in signals] for signals in stream.axes.values()]
+    turning = tuple(f"{whole}{dot}{word}.{part}" for part in "xyzw")
+    return (whole or ".") if is_pose and places == found and turning == columns else ""
 
 
 def _column(one: Signal) -> Any:
@@ -132,7 +156,7 @@ def _arm_toml(found: Survey, arm: ArmGuess) -> str:
     return "\n".join([*lines, ""])
 
 
-def _fusion_toml(arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
+def _fusion_toml(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
     lines = [
         "# How far the arm and each sensor are trusted. `pumafuse tune` finds better numbers.",
         _pair("arm", "arm.toml"),
@@ -154,6 +178,12 @@ def _fusion_toml(arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
             _line(_pair(f"input_noise_{unit}_rtHz", _digits(one.input_noise * scale)), left),
             _line(_pair(f"drift_{unit}_rts", _digits(one.drift * scale)), "likewise"),
         ]
+    if found.run.tool is not None:
+        reference = [_digits(angle * DEG, 8) for angle in found.run.tool]
+        lines += ["", _header(["tool"])]
+        lines.append(_line(_pair("reference_rotation_vector_deg", reference), "the mean commanded orientation"))
+    for name, one in found.own_frames.items():
+        lines += ["", f"# Not used: {printable(name)} {one.words}", f"# {_header(['sensors', name])}"]
     for name, one in sensors.items():
         lines += ["", _header(["sensors", name])]
         lines += _by_kind("sd", one.sd, arm, "its scatter from one measurement to the next")
@@ -216,6 +246,6 @@ def _value(value: Any) -> str:
     if isinstance(value, Mapping):
         pairs = (_pair(key, one) for key, one in cast(Mapping[str, Any], value).items())
         return f"{{ {', '.join(pairs)} }}"
-    if isinstance(value, list):
-        return f"[{', '.join(_value(one) for one in cast(list[Any], value))}]"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_value(one) for one in cast(Sequence[Any], value))}]"
     return tomli_w.dumps({"v": value}).removeprefix("v = ").rstrip("\n")

@@ -116,9 +116,11 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
         for axis, mine in leads.items()
         if mine
     }
-    shortest = max(min(lags.values(), default=_UNKNOWN_LAG), 0.0)
+    speeds = [one.speeds.lag - 0.5 * period for one in found.own_frames.values()]
+    unknown = max(float(np.median(speeds)), 0.0) if speeds else _UNKNOWN_LAG
+    shortest = max(min(lags.values(), default=unknown), 0.0)
     delay = _DELAY_SHARE * shortest
-    axes = {axis: _axis(found, axis, leads[axis], lags.get(axis, _UNKNOWN_LAG), delay) for axis in run.axes}
+    axes = {axis: _axis(found, axis, leads[axis], lags.get(axis, unknown), delay) for axis in run.axes}
     sensors = {name: _sensor(found, name, latencies, first, leads, pairs.get(name)) for name in run.sensors}
     return ArmGuess(period, delay, axes), sensors
 

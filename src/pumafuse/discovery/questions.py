@@ -32,6 +32,9 @@ def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
         signals = [some[0] for one in streams for some in one.axes.values()]
         units = " and ".join(sorted({one.unit for one in signals}))
         yield "units", units, _sure([one.column for one in signals if one.basis == "range"])
+        if oriented := [one.attitude for one in streams if one.attitude]:
+            bases = ", ".join(f"{', '.join(one.columns.columns)}: {one.basis}" for one in oriented)
+            yield "orientations", bases, _sure([one.columns.columns[0] for one in oriented if one.doubt])
         who = ", ".join(f"{one.name} is a sensor" for one in roles.sensors)
         moved = [one.name for one in streams if "follow" in one.why]
         yield "who is who", f"{roles.command.part.label} is commanded, {who}", _sure(moved, "by how they move")
@@ -51,6 +54,9 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
     roles = found.roles
     streams = [] if roles is None else [roles.command, *roles.sensors, *filter(None, [roles.reference])]
     yield from dict.fromkeys(one.part.clock.doubt for one in streams if one.part.clock and one.part.clock.doubt)
+    yield from dict.fromkeys(one.attitude.doubt for one in streams if one.attitude and one.attitude.doubt)
+    for name, one in found.own_frames.items():
+        yield f"{name} {one.words}: `pumafuse register` finds where it stands, and what it sees of the tool"
     if found.interpolation:
         yield (
             "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"

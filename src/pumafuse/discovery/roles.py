@@ -13,14 +13,18 @@ from msgspec import structs
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, printable
+from ..logs.axes import FARTHEST_TURN
+from ..logs.frames import CARTESIAN
 from ..logs.messages import PATH_TIME
 from ..logs.run import Run, Source
-from ..units import AN, KINDS, OF_KIND, TURN, Kind, kind_of
+from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
 from .contents import Part, Signal, no_commands, without_clock
 from .following import LATEST, Following, following
 from .matching import far_shift
 from .names import Role
+from .orientations import Attitude, in_order
+from .own_frames import speeds_follow
 
 _SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
 _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
@@ -50,6 +54,7 @@ class Stream:
         why: How that is known.
         part: Where it is.
         axes: For each axis its columns, which are added up.
+        attitude: Its orientation, if it tells one.
     """
 
     name: str
@@ -57,13 +62,15 @@ class Stream:
     why: str
     part: Part
     axes: Mapping[str, Sequence[Signal]]
+    attitude: Attitude | None = None
 
     @property
     def source(self) -> Source:
         """Its rows that have a value."""
         assert self.part.clock is not None
         values = {axis: np.sum([one.value for one in signals], axis=0) for axis, signals in self.axes.items()}
-        source = Source(self.part.clock.stamp, values, self.part.label)
+        turned = None if self.attitude is None else self.attitude.quaternion
+        source = Source(self.part.clock.stamp, values, self.part.label, orientation=turned)
         if self.part.entity:
             source, _ = source.on_timeline()
         has_own_rows = any(one.where for signals in self.axes.values() for one in signals)
@@ -164,13 +171,14 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             continue
         matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
         if stream.role is None and axes:
-            late = _follows(command, matched)
+            late = _follows(command, matched) or _as_fast(command, matched)
             matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
             why_not = "neither its name nor its motion says what it is: it does not follow the commands"
         if axes and matched.role:
             kept.append(matched)
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
+    command, *kept = _in_order([command, *kept], left_out)
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
     sensors = [one for one in kept if one.role == "sensor"]
     references = [one for one in kept if one.role == "reference"]
@@ -182,6 +190,32 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     left_out += [(one, "what the controller itself reports: no measurement of where the tool is") for one in reports]
     sensors = [one for one in sensors if one not in reports]
     return _with_units(Roles(command, sensors, references[0] if references else None, left_out))
+
+
+def _in_order(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
+    """The commands and what follows them, with quaternions in the order in which both turn alike.
+
+    Without a commanded orientation that no rotation vector can follow: the reason is added to ``left_out``.
+    """
+    command, *others = streams
+    if command.attitude and command.attitude.is_open:
+        known = next((one for one in others if one.attitude and not one.attitude.is_open), None)
+        if known is not None:
+            command = replace(command, attitude=_ordered(command, known, leads=True))
+    for place, one in enumerate(others):
+        if command.attitude and not command.attitude.is_open and one.attitude and one.attitude.is_open:
+            others[place] = replace(one, attitude=_ordered(one, command, leads=False))
+    if command.attitude and command.attitude.farthest > FARTHEST_TURN:
+        far = f"the tool is told to turn by {command.attitude.farthest * DEG:.0f}° from its mean orientation: too far"
+        left_out.append((replace(command, axes={}), far))
+        command = replace(command, attitude=None)
+    return [command, *others]
+
+
+def _ordered(stream: Stream, known: Stream, *, leads: bool) -> Attitude:
+    assert stream.attitude and known.attitude and stream.part.clock and known.part.clock
+    mine, theirs = stream.part.clock.stamp, known.part.clock.stamp
+    return in_order(stream.attitude, mine, known.attitude, theirs, leads=leads)
 
 
 def relations(run: Run) -> dict[tuple[str, str], Following]:
@@ -263,7 +297,7 @@ def _streams(part: Part) -> list[Stream]:
     groups: dict[tuple[str, str, str, bool], list[Signal]] = {}
     beside = {names.last(one) for one in (*(signal.column for signal in part.signals), *part.left_out)}
     for signal in part.signals:
-        called = "_".join(dict.fromkeys(names.role_words(signal.name)))
+        called = _joined(names.role_words(signal.name))
         listed, copy, measured = names.family(signal.column, beside)
         if copy or measured:
             signal = replace(signal, axis=names.axis_of(measured or signal.column.removesuffix(copy), []))
@@ -287,8 +321,16 @@ def _streams(part: Part) -> list[Stream]:
         role, why = next((one for one in (wanted, *order, by_type, by_state) if one[0]), (None, ""))
         name = key if roles[key] == 1 else names.plain(f"{listed or key or part.stem}{copy}")
         name = name if len(groups) > 1 and name else names.plain(part.stem)
-        found.append(Stream(name or "log", role, why, part, _axes(signals)))  # pyright: ignore[reportArgumentType]
+        axes, attitude = _axes(signals), None
+        if any(axis in CARTESIAN for axis in axes):
+            attitude = next((one for one in part.attitudes if key == _joined(one.role_words)), None)
+        found.append(Stream(name or "log", role, why, part, axes, attitude))  # pyright: ignore[reportArgumentType]
     return found
+
+
+def _joined(words: Iterable[str]) -> str:
+    """Words of roles as a name, each once."""
+    return "_".join(dict.fromkeys(words))
 
 
 def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
@@ -321,7 +363,8 @@ def _apart(stream: Stream) -> list[Stream]:
 
     def of(word: str, rests: Iterable[tuple[str, ...]]) -> Stream:
         axes = {names.axis_of("_".join(rest), []): stream.axes[by_word[word][rest]] for rest in rests}
-        return Stream(names.plain(word) or stream.name, None, "", stream.part, axes)
+        mine = [one for one in stream.part.attitudes if _is_of(one, word, by_word)]
+        return Stream(names.plain(word) or stream.name, None, "", stream.part, axes, next(iter(mine), None))
 
     ways = list[list[Stream]]()
     for word, mine in by_word.items():
@@ -335,6 +378,12 @@ def _apart(stream: Stream) -> list[Stream]:
             ways.append([of(word, every), *(of(other, rests) for other, rests in shared.items())])
     best = max(ways, key=lambda way: _followers(way[0], way), default=[stream])
     return best if len(best) > 1 and _followers(best[0], best)[0] else [stream]
+
+
+def _is_of(attitude: Attitude, word: str, every: Iterable[str]) -> bool:
+    """Whether a word that tells sources apart is in the names of an orientation; without one, whether no other is."""
+    inside = names.words(attitude.columns.columns[0])
+    return word in inside if word else not any(one in inside for one in every if not _AXIS_WORD.fullmatch(one))
 
 
 def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream: Stream) -> bool:
@@ -406,6 +455,14 @@ def _follows(command: Stream, stream: Stream) -> str:
     gains = [one.slope for one in behind]
     alike = len(behind) > len(found) / 2 and max(gains) < _GAINS * min(gains)
     return f"{float(np.median([one.lag for one in behind])) * 1e3:.0f} ms late" if alike else ""
+
+
+def _as_fast(command: Stream, stream: Stream) -> str:
+    """The same of a stream whose speed follows the commanded one, as in a frame of its own."""
+    speeds = speeds_follow(command.source, stream.source)
+    if speeds is None or speeds.correlation < _SAME or not -_AT_ONCE < speeds.lag < LATEST:
+        return ""
+    return f"{speeds.lag * 1e3:.0f} ms late, by its speed"
 
 
 def _copies(command: Stream, stream: Stream) -> bool:

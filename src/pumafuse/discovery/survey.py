@@ -6,20 +6,23 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..errors import RunError
 from ..logs.axes import in_axes
 from ..logs.clock import without_strays
-from ..logs.run import Run
+from ..logs.run import Run, Source
+from ..space.rotations import TURNING
 from ..units import MS
 from .contents import Part, parts_of, period_of, without_clock
 from .following import Following
+from .own_frames import FOLLOWS as TURNS
+from .own_frames import OwnFrame, own_frames
 from .roles import Roles, relations, roles_of
 from .sensors import REFERENCE
 
@@ -27,6 +30,7 @@ FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
 _SURELY = 0.9  # correlation of changes from which a lag is known well
 SOONER = 2e-3  # s: lags are known to 1 ms
+_Relations: TypeAlias = dict[tuple[str, str], Following]  # by the name of a source and the axis
 _STEPS, _FINEST = 10, 1e-3  # of an update period; s
 
 
@@ -36,11 +40,13 @@ class Survey:
 
     Attributes:
         log: The file or folder.
-        run: The run in it, in the arm's axes.
+        run: The run in it, in the arm's axes, without sensors in frames of their own. Axes rx, ry, rz are in it where
+            a sensor follows how the tool is turned.
         relations: How each sensor, and ``reference``, follows the commands, by its name and the axis.
         parts: Its tables or topics; none where it has a ``run.toml``.
         roles: Who is who; None where a ``run.toml`` says it.
         manifest: What that ``run.toml`` holds.
+        own_frames: The sensors that seem to stand in frames of their own.
         interpolation: In which steps the run's commands go on between those of the log [s]; 0: they are the log's.
     """
 
@@ -50,6 +56,7 @@ class Survey:
     parts: Sequence[Part] = ()
     roles: Roles | None = None
     manifest: Mapping[str, Any] | None = None
+    own_frames: Mapping[str, OwnFrame] = field(default_factory=dict[str, OwnFrame])
     interpolation: float = 0.0
 
     @property
@@ -72,23 +79,64 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     """
     described = log if log.name == "run.toml" else log / "run.toml"
     if os.path.isfile(described):  # noqa: PTH113 - Path.is_file raises on a name that is too long
-        run, _ = in_axes(Run.read(described), None)
-        return Survey(log, run, relations(run), manifest=tomllib.loads(described.read_text(encoding="utf-8")))
+        manifest = tomllib.loads(described.read_text(encoding="utf-8"))
+        run = without_strays(Run.read(described))
+        aside = own_frames(run)
+        run = _along_axes(run, aside)
+        run, related = _followed(run, relations(run))
+        return Survey(log, run, related, manifest=manifest, own_frames=aside)
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
     if not roles.sensors:
         raise RunError(f"{log}: commands, but nothing that measures where they lead: {_reasons(roles, parts)}")
-    related = relations(without_strays(roles.run))
+    run = without_strays(roles.run)
+    aside = own_frames(run)
+    run = _along_axes(run, aside)
+    related = relations(run)
     follow = any(abs(one.correlation) >= _SURELY for one in related.values())
-    roles = roles.without({key: why for key, one in related.items() if follow and (why := _does_not_follow(one))})
-    kept = {(one.name, axis) for one in roles.sensors for axis in one.axes}
-    kept |= {(REFERENCE, axis) for axis in roles.reference.axes} if roles.reference else set()
+    why_not = {key: why for key, one in related.items() if follow and (why := _does_not_follow(one))}
+    roles = roles.without({key: why for key, why in why_not.items() if key[1] not in TURNING})
+    kept = {(one.name, axis) for one in roles.sensors for axis in (*one.axes, *TURNING)}
+    kept |= {(REFERENCE, axis) for axis in (*roles.reference.axes, *TURNING)} if roles.reference else set()
     related = {key: one for key, one in related.items() if key in kept}
-    found = Survey(log, without_strays(roles.run), related, parts, roles)
+    run, related = _followed(_along_axes(without_strays(roles.run), aside), related)
+    found = Survey(log, run, related, parts, roles, own_frames=aside)
     if step := interpolation(found):
         command = found.run.command.interpolated(step)
         found = replace(found, run=replace(found.run, command=command), interpolation=step)
     return found
+
+
+def _along_axes(run: Run, aside: Collection[str]) -> Run:
+    """A run in the arm's axes, without the sensors that stand aside."""
+    kept = {name: source for name, source in run.sensors.items() if name not in aside}
+    return in_axes(replace(run, sensors=kept), None)[0]
+
+
+def _followed(run: Run, related: _Relations) -> tuple[Run, _Relations]:
+    """A run without orientations that do not follow the commanded one, and how the rest of it follows.
+
+    A marker may be turned on the tool. Where no sensor follows the commanded orientation, nobody measures it.
+    """
+    every = {**run.sensors, **({} if run.reference is None else {REFERENCE: run.reference})}
+    turned = {name for name in every if _turns_along(run.command, name, related)}
+    every = {name: source if name in turned else _without_turning(source) for name, source in every.items()}
+    run = replace(run, sensors={name: every[name] for name in run.sensors}, reference=every.get(REFERENCE))
+    if run.sensors and turned.isdisjoint(run.sensors):
+        run = replace(run.each(lambda _, source: _without_turning(source)), tool=None)
+    return run, {(name, axis): one for (name, axis), one in related.items() if axis in every[name].values}
+
+
+def _turns_along(command: Source, name: str, related: _Relations) -> bool:
+    """Whether a source follows the commanded orientation on its axes together, each as far as it is told to turn."""
+    turning = [axis for axis in TURNING if (name, axis) in related]
+    power = np.array([np.nanvar(command.values[axis]) for axis in turning])
+    correlation = np.array([related[name, axis].correlation for axis in turning])
+    return bool(turning) and float(power @ correlation) >= TURNS * float(power.sum())
+
+
+def _without_turning(source: Source) -> Source:
+    return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
 def _does_not_follow(one: Following) -> str:

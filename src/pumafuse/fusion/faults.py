@@ -8,17 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from ..arrays import FloatArray, TimeArray, median
 from ..discovery.matching import SMALL_SHIFT, Grid, Match, matches, without_spikes
+from ..discovery.own_frames import angle_of
 from ..discovery.tracking import FOLLOWS, GAIN, Tracking
 from ..errors import RunError
 from ..filter.outcome import ABSENT, Outcome
 from ..filter.response import response
-from ..units import OF_KIND, Kind, mistaken, wraps
+from ..logs.frames import CARTESIAN
+from ..model.arm import CANONICAL_AXES
+from ..space.rotations import nearest
+from ..units import DEG, MM, OF_KIND, Kind, mistaken, wraps
 from .config import FusionConfig
 from .segments import Segment
 from .setup import turn_of
@@ -35,7 +40,15 @@ _CLEAR, _LOST = 0.9, 0.5  # correlations: a cause is clear; the commands do not 
 _SCALE = 10.0  # factor on a motion up to which it may be a scale that can be fitted
 _ALIKE_SIZE = 0.2  # by how much, over it, the same fault of two sensors may differ
 
-_Cause: TypeAlias = Literal["unit", "columns", "sign", "clock", "nothing"]
+_TURNED = math.radians(2.8)  # from which a sensor that is turned is named: of 3°, less how well it is known
+_SURELY = 4.0  # standard deviations of the angle, likewise
+_STRAIGHTER = 0.7  # of the misfit along its axes: turned back a sensor must leave half of the variance or less
+_ALIGNED = 0.8  # cosine of the angle from which on axes still follow their commands
+_EXCHANGED = 0.99  # cosine within which each axis is another one, or against one: columns or signs, no frame
+_HARDLY = 1e-3  # of the motion along its main direction, below which other directions tell nothing of a turn
+_PARTS = 8  # of a run, each of which is left out once: as the angle scatters then, so uncertain it is
+
+_Cause: TypeAlias = Literal["unit", "columns", "sign", "clock", "frame", "nothing"]
 
 
 @dataclass(frozen=True)
@@ -46,7 +59,7 @@ class Fault:
         sensors: Which; all that measure these axes if it is the commands that are wrong.
         axes: On which they are not.
         cause: What is wrong.
-        size: How late they are [s], or how many times as far they move.
+        size: How late they are [s], by how much they are turned [rad], or how many times as far they move.
         sentence: What shows it, and what to write instead.
         refused: Whether estimates would be wrong by construction.
         lost: Whether they follow the commands so little that nothing can be fitted to them.
@@ -282,8 +295,11 @@ def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[str]:
 
 
 def _not_following(segment: Segment, config: FusionConfig, given: _Given, trackings: _Trackings) -> list[Fault]:
-    found: list[Fault] = []
+    found = _turned_frames(segment, config, given, trackings)
+    turned = {name for one in found for name in one.sensors}
     for name, mine in trackings.items():
+        if name in turned:
+            continue
         if odd := [axis for axis, tracking in mine.items() if not tracking.follows]:
             grid = _busiest(segment, config.arm.update_period)
             causes = _matches(segment, config, name, {axis: given[name][axis] for axis in mine}, grid)
@@ -432,6 +448,94 @@ def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
             sentence = f"{one.sentence} ({others} too: is it the {one.cause} of the commands? Else mend each)"
             found.append(replace(one, sensors=tuple(names), sentence=sentence))
     return found
+
+
+# ---- a sensor that is turned against its axes ------------------------------------------------------------------------
+
+
+def _turned_frames(segment: Segment, config: FusionConfig, given: _Given, trackings: _Trackings) -> list[Fault]:
+    """The faults of sensors that see the commanded motion turned, by 3° or more."""
+    found = list[Fault]()
+    for name, mine in trackings.items():
+        axes = [axis for axis in (CARTESIAN if "x" in mine else CANONICAL_AXES) if axis in mine]
+        if len(axes) < 2 or (turned := _turned_frame(segment, config, name, given[name], axes)) is None:
+            continue
+        angle, along, back = turned
+        lengths = f"{_digits(back * MM, 2)} mm instead of {_digits(along * MM, 2)} mm"
+        sentence = (
+            f"sensor '{name}' looks turned by {angle * DEG:.1f}° against {', '.join(axes)}: turned back, it is"
+            f" within {lengths} of where the commands lead; `pumafuse register` finds how it stands, which is its frame"
+            " in fusion.toml"
+        )
+        found.append(Fault((name,), tuple(axes), "frame", angle, sentence, False, math.cos(angle) < _ALIGNED))
+    return found
+
+
+def _turned_frame(
+    segment: Segment,
+    config: FusionConfig,
+    name: str,
+    given: Mapping[str, tuple[TimeArray, FloatArray]],
+    axes: Sequence[str],
+) -> tuple[float, float, float] | None:
+    """By how much a sensor is turned [rad], and how far it is from the response as it is and turned back, RMS [m].
+
+    None where it is not turned surely. Where the response is late, or its noise wanders, is no turn: the speed of the
+    response and a constant are fitted beside it.
+    """
+    sensor = config.sensors[name]
+    stamp = reduce(np.intersect1d, (given[axis][0] for axis in axes))
+    stamp = stamp[:: 1 + len(stamp) // _ENOUGH]
+    if len(stamp) < _FEW:
+        return None
+    value = np.column_stack([_at(*given[axis], stamp) for axis in axes]) / sensor.scale
+    alike = np.all([without_spikes(one) for one in value.T], axis=0)
+    valid, value = stamp[alike] - round(sensor.latency * 1e9), value[alike]
+    if len(valid) < _FEW:
+        return None
+    every = np.concatenate([valid, valid - round(SMALL_SHIFT * 1e9)])
+    order, led = np.argsort(every, kind="stable"), np.empty((len(every), len(axes)))
+    for column, axis in enumerate(axes):
+        led[order, column] = _led(segment, config, axis, every[order])
+    led, before = np.split(led, 2)
+    parts = np.arange(len(valid)) * _PARTS // len(valid)
+    turn, along, back = _turn(value, led, led - before)
+    angle = angle_of(turn)
+    exchanged = math.cos(angle) < _ALIGNED and bool((np.abs(turn).max(axis=0) > _EXCHANGED).all())
+    if angle < _TURNED or back > _STRAIGHTER * along or exchanged:
+        return None
+    others = np.array(
+        [
+            angle_of(turn.T @ _turn(*(one[parts != part] for one in (value, led, led - before)))[0])
+            for part in range(_PARTS)
+        ]
+    )
+    scatter = math.sqrt((_PARTS - 1) / _PARTS * float(others @ others))
+    return None if angle < _SURELY * scatter else (angle, along, back)
+
+
+def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatArray, float, float]:
+    """The rotation by which measurements are turned against a response, (k, k), and the RMS along axes and turned back.
+
+    Where a response does not go, nothing tells of a turn: there it is none.
+    """
+    value, led, step = (one - one.mean(axis=0) for one in (value, led, step))
+    known = np.hstack([led, step])
+    seen = np.linalg.lstsq(known, value)[0][: led.shape[1]]  # value ≈ led · seen + …
+    moved = led.T @ led
+    turn = nearest(seen.T @ moved + _HARDLY * float(np.linalg.norm(moved, 2)) * np.eye(len(moved)))
+
+    def misfit(rotated: FloatArray) -> float:
+        left = value - rotated
+        left = np.asarray(left - step @ np.linalg.lstsq(step, left)[0], dtype=np.float64)
+        return float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+
+    return turn, misfit(led), misfit(led @ turn.T)
+
+
+def _at(stamp: TimeArray, value: FloatArray, chosen: TimeArray) -> FloatArray:
+    """The values of chosen stamps, all of which are there; both ascend."""
+    return value[np.searchsorted(stamp, chosen)]
 
 
 # ---- a begin in mid-motion, a latency below 0 ---------------------------------------------------------

@@ -6,6 +6,7 @@ of the rotation vector θ = Log(R R₀ᵀ) [rad] along the base's axes, relative
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -113,6 +114,21 @@ def between(quaternion: FloatArray, row: IntArray, share: FloatArray) -> FloatAr
 def matrix(vector: FloatArray) -> FloatArray:
     """The rotation matrix of a rotation vector [rad], (3,) → (3, 3)."""
     return turned(of_vectors(vector[None]), np.eye(3)).T
+
+
+def nearest(matrix: FloatArray) -> FloatArray:
+    """The proper rotation R that maximises tr(Rᵀ M) of a matrix M (Kabsch 1976), (k, k) with k of 2 or 3."""
+    left, _, right = np.linalg.svd(matrix)
+    left[:, -1] *= np.linalg.det(left) * np.linalg.det(right)  # no mirror
+    return np.asarray(left @ right, dtype=np.float64)
+
+
+def aligning(first: FloatArray, second: FloatArray) -> tuple[FloatArray, float]:
+    """The rotation that takes vectors nearest to others, (n, k) each, and the correlation of both so turned."""
+    matrix = second.T @ first
+    rotation = nearest(matrix)
+    power = math.sqrt(float(np.sum(first**2)) * float(np.sum(second**2)))
+    return rotation, float(np.sum(rotation * matrix)) / power if power > 0.0 else 0.0
 
 
 def left_jacobian(vector: FloatArray) -> FloatArray:

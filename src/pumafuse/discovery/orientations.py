@@ -1,0 +1,256 @@
+"""Columns of orientations: by their names, by what stands beside them, and by their numbers.
+
+Four columns are a quaternion where their names say so and their norm is 1 in all rows. Three angles are an orientation
+only beside x, y and z of the same source: alone they are axes of joints.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from msgspec import structs
+
+from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..errors import RunError
+from ..logs.columns import Table
+from ..logs.frames import CARTESIAN
+from ..logs.manifest import Orientation
+from ..space import rotations
+from ..units import ending
+from . import names
+
+_NORM = 1e-3  # from 1, of the norm of a quaternion in a text
+_FEWEST = 10  # rows
+_STILL = 1e-5  # rad: what turns less only changes its last digit
+_FULL = 1.001 * math.pi  # rad: a rotation vector is no longer
+_CHANGE_NS = 150_000_000  # over which turning is compared: long beside noise, short beside a motion
+_LATEST, _STEP = 0.6, 0.02  # s, up to which lag turning is compared, and in which steps
+_MOST = 1000  # changes that are compared
+_BETTER = 0.05  # share of the turning that the right order explains more than the other
+_FRONT, _BACK = r"^(?P<head>|.*[^A-Za-z]|.*[a-z](?=[A-Z]))", r"(?P<end>[\])]?)(?P<tail>|[^A-Za-z0-9].*)$"
+_QUATERNION = re.compile(
+    rf"{_FRONT}(?P<word>(?i:q|quat|quaternion|orientation|orient|ori|rotation|rot|attitude))"
+    rf"(?P<join>[_. \[(]?)(?P<part>[xyzwXYZW0-4]){_BACK}"
+)
+_NAMED, _NUMBERED = "wxyz", ("0123", "1234")  # parts of a quaternion, in the order of letters
+_ANGLE = re.compile(rf"{_FRONT}(?P<part>(?i:r[xyz]|roll|pitch|yaw|[abcwprxyz])|[0-5]){_BACK}")
+_EULER = {("a", "b", "c"): "kuka", ("w", "p", "r"): "fanuc", ("roll", "pitch", "yaw"): "rpy"}
+_UR = re.compile(r"(?i)tcp_?pose[_\[]$")  # x, y, z in m and a rotation vector in rad
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """Columns of an orientation.
+
+    Attributes:
+        columns: As ``run.toml`` has them.
+        quaternion: x, y, z, w, NaN in rows that have none, (rows, 4).
+        basis: How it is known what they are.
+        place: Which axes the columns beside them are, where its own names say it.
+        place_unit: Of these; empty: their names say it.
+        doubt: What may be wrong, as a question; empty: nothing.
+    """
+
+    columns: Orientation
+    quaternion: FloatArray
+    basis: str
+    place: Mapping[str, str] = field(default_factory=dict[str, str])
+    place_unit: str = ""
+    doubt: str = ""
+
+    @property
+    def role_words(self) -> list[str]:
+        """The words of its columns' names that say whose it is."""
+        return names.role_words(self.columns.columns[0])
+
+    @property
+    def is_open(self) -> bool:
+        """Whether no name says where w is."""
+        return bool(self.columns.quaternion and self.doubt)
+
+    @property
+    def turns(self) -> bool:
+        """Whether it ever changes: one that does not tells nothing."""
+        known = self.quaternion[np.isfinite(self.quaternion[:, 0])]
+        return len(known) >= _FEWEST and float(rotations.angle_between(known, known[:1]).max()) > _STILL
+
+    @property
+    def farthest(self) -> float:
+        """How far it is from its mean at the most [rad]."""
+        mean = rotations.of_vectors(rotations.mean(self.quaternion)[None])
+        return float(np.nanmax(rotations.angle_between(self.quaternion, mean)))
+
+    def exchanged(self) -> Attitude:
+        """The same with w at the other end."""
+        logged, order = self.quaternion, "wxyz"
+        if self.columns.order == "wxyz":
+            logged, order = logged[:, [3, 0, 1, 2]], "xyzw"
+        columns = structs.replace(self.columns, order=order)
+        return replace(self, columns=columns, quaternion=rotations.of_quaternions(logged, order))
+
+
+def may_be_part(name: str) -> bool:
+    """Whether a column may be one of a quaternion."""
+    return _QUATERNION.match(name) is not None
+
+
+def attitudes_in(table: Table, paths: Iterable[str]) -> list[Attitude]:
+    """The orientations of a table; ``paths`` are those of its numbers."""
+    paths = list(paths)
+    return [*_quaternions(table, paths), *_angles(table, paths)]
+
+
+def _plain(table: Table, columns: Sequence[str]) -> FloatArray | None:
+    """Columns of numbers, (rows, k); None where one is something else."""
+    try:
+        return np.column_stack([table.plain(one)[0] for one in columns])
+    except RunError:
+        return None
+
+
+def _groups(form: re.Pattern[str], paths: Iterable[str], keys: Sequence[str]) -> Iterator[dict[str, str]]:
+    """Columns whose names differ by one part and their unit, by that part in lower case."""
+    found: dict[tuple[str, ...], dict[str, str]] = {}
+    for path in paths:
+        if (match := form.match(path)) is not None:
+            tail = match["tail"].removesuffix(ending(match["tail"]) or "")
+            found.setdefault((*(match[key] for key in keys), tail), {}).setdefault(match["part"].lower(), path)
+    yield from found.values()
+
+
+def _quaternions(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
+    for group in _groups(_QUATERNION, paths, ("head", "word", "join", "end")):
+        parts = "".join(sorted(group))
+        if parts != _NAMED and parts not in _NUMBERED:
+            continue
+        columns = tuple(group[part] for part in ("xyzw" if parts == _NAMED else parts))
+        value = _plain(table, columns)
+        if value is None or not _are_units(value):
+            continue
+        x, y, z, w = columns
+        made = Orientation(quaternion=(x, y, z, w), order="xyzw" if parts == _NAMED else "wxyz")
+        doubt = f"is w the first of {x}, {y}, {z}, {w}? No name says it (run.toml, order)" if parts != _NAMED else ""
+        quaternion = rotations.of_quaternions(value, made.order)
+        yield Attitude(made, quaternion, "a guess: w first" if doubt else "by name", doubt=doubt)
+
+
+def _are_units(value: FloatArray) -> bool:
+    """Whether the norm is 1 in all rows, (rows, 4); without those of a sensor that is lost."""
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(value, axis=1)
+    known = norm[np.isfinite(norm) & (norm != 0.0)]
+    return len(known) >= _FEWEST and bool((np.abs(known - 1.0) < _NORM).all())
+
+
+def _angles(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
+    """Rotation vectors and Euler angles beside x, y and z that move."""
+    for group in _groups(_ANGLE, paths, ("head", "end")):
+        listed = group.keys() >= set("012345") and _UR.search(group["0"].rpartition("0")[0]) is not None
+        place = {
+            group[part]: axis for part, axis in zip("012" if listed else "xyz", CARTESIAN, strict=True) if part in group
+        }
+        known: list[tuple[str, str, str]] = [("3", "4", "5")] if listed else [rotations.TURNING, *_EULER]
+        forms = [one for one in known if set(one) <= group.keys()]
+        position = _plain(table, list(place)) if len(place) == len(CARTESIAN) else None
+        if len(forms) != 1 or position is None or not _moves(position):
+            continue
+        columns = _three(group, forms[0])
+        made = _of_list(columns) if listed else _of_angles(table, columns, _EULER.get(forms[0], ""))
+        if made is not None:
+            quaternion, unsure = made.read(table)[0], _unsure(made, names.unit_of(columns[0]))
+            doubt = "" if listed else f"are {', '.join(columns)} {unsure}? No name says it (run.toml)"
+            yield Attitude(made, quaternion, "by name", place, "m" if listed else "", doubt)
+
+
+def _moves(position: FloatArray) -> bool:
+    known = position[np.isfinite(position).all(axis=1)]
+    return len(known) > 0 and bool(np.ptp(known, axis=0).any())
+
+
+def _three(group: Mapping[str, str], parts: Sequence[str]) -> tuple[str, str, str]:
+    first, second, third = (group[part] for part in parts)
+    return first, second, third
+
+
+def _of_list(columns: tuple[str, str, str]) -> Orientation:
+    return Orientation(rotation_vector=columns, unit="rad")
+
+
+def _of_angles(table: Table, columns: tuple[str, str, str], convention: str) -> Orientation | None:
+    """Three angles as an orientation; None where their numbers or units are none of one."""
+    value, unit = _plain(table, columns), names.unit_of(columns[0])
+    if value is None or not np.isfinite(value).all(axis=1).any() or unit not in ("", "rad", "deg"):
+        return None
+    if convention:
+        largest = float(np.nanmax(np.abs(value)))
+        unit = unit or ("rad" if convention == "rpy" and largest <= 2.0 * math.pi else "deg")
+        return Orientation(euler=columns, convention=convention, unit=unit)
+    is_vector = unit != "deg" and float(np.nanmax(np.linalg.norm(value, axis=1))) <= _FULL
+    return Orientation(rotation_vector=columns, unit="rad") if is_vector else None
+
+
+def _unsure(made: Orientation, unit: str) -> str:
+    """What three angles are taken for, in words; ``unit`` is what their names say."""
+    guessed = "" if unit else f", in {made.unit}"
+    if made.rotation_vector:
+        return f"a rotation vector{guessed}"
+    kinds = {"kuka": "KUKA's angles about z, y, x", "fanuc": "FANUC's angles about x, y, z that stay"}
+    return f"{kinds.get(made.convention, 'angles about x, y and z that stay')}{guessed}"
+
+
+def in_order(attitude: Attitude, stamp: TimeArray, other: Attitude, other_stamp: TimeArray, *, leads: bool) -> Attitude:
+    """An orientation whose order is open in the order in which it turns with another one, where that tells.
+
+    Args:
+        attitude: Whose order is open.
+        stamp: Of its rows.
+        other: What is known.
+        other_stamp: Of its rows.
+        leads: Whether the first is commanded, and the other follows.
+    """
+    both = [attitude, attitude.exchanged()]
+    shares = [
+        _turning_alike((stamp, one.quaternion), (other_stamp, other.quaternion))
+        if leads
+        else _turning_alike((other_stamp, other.quaternion), (stamp, one.quaternion))
+        for one in both
+    ]
+    if abs(shares[0] - shares[1]) < _BETTER:
+        return attitude
+    best = both[int(np.argmax(shares))]
+    return replace(best, basis=f"w {'first' if best.columns.order == 'wxyz' else 'last'}: so it turns alike", doubt="")
+
+
+def _turning_alike(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, FloatArray]) -> float:
+    """The share of a turning motion that another one explains at its best lag, in whatever frame it is seen.
+
+    A frame turns all changes of orientation alike, by a proper rotation; a wrong order mirrors them.
+    """
+    (t, led), (s, seen) = (_rows(*one) for one in (leader, follower))
+    begin, end = (max(t[0], s[0]), min(t[-1], s[-1]) - _CHANGE_NS) if len(t) and len(s) else (0, 0)
+    if end <= begin:
+        return 0.0
+    time = np.linspace(begin, end, _MOST).astype(np.int64)
+    measured = _changes(s, seen, time)
+    return max(
+        rotations.aligning(_changes(t, led, time - round(lag * 1e9)), measured)[1]
+        for lag in np.arange(0.0, _LATEST, _STEP)
+    )
+
+
+def _rows(stamp: TimeArray, quaternion: FloatArray) -> tuple[TimeArray, FloatArray]:
+    known = np.flatnonzero(np.isfinite(quaternion[:, 0]) & (stamp != NO_STAMP))
+    known = known[np.argsort(stamp[known], kind="stable")]
+    return stamp[known], quaternion[known]
+
+
+def _changes(stamp: TimeArray, quaternion: FloatArray, time: TimeArray) -> FloatArray:
+    """By how much something turns over a short while from each time on, along the axes that stay [rad], (n, 3)."""
+    first, last = (
+        quaternion[np.clip(np.searchsorted(stamp, at, side="right") - 1, 0, None)] for at in (time, time + _CHANGE_NS)
+    )
+    return rotations.vectors(rotations.product(last, rotations.inverse(first)), np.zeros(3))

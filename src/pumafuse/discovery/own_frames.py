@@ -1,0 +1,136 @@
+"""Sensors that stand in frames of their own: they are as fast as the commands, and their axes do not follow.
+
+How fast a point moves is the same in every frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..logs.frames import CARTESIAN
+from ..logs.run import Run, Source
+from ..space import rotations
+from ..units import DEG
+from .following import Following, following
+
+FOLLOWS = 0.8  # correlation from which speeds follow, and below which an axis does not
+_WINDOW_NS = 150_000_000  # over which speeds are: long beside noise, short beside a motion
+_EXPLAINS = 0.25  # of what the axes leave of the motion: a frame that is turned leaves less
+_EXCHANGED = 0.9  # correlation from which an axis is another one: then columns are exchanged
+_FEWEST = 20  # rows
+
+
+@dataclass(frozen=True)
+class OwnFrame:
+    """Why a sensor seems to stand in a frame of its own.
+
+    Attributes:
+        speeds: How its speed follows the commanded one.
+        least: The correlation of the axis that follows worst.
+        angle: By how much it is turned [rad]; NaN of a mirrored frame.
+    """
+
+    speeds: Following
+    least: float
+    angle: float
+
+    @property
+    def words(self) -> str:
+        """The same as a sentence without its subject."""
+        turned = "mirrored" if math.isnan(self.angle) else f"turned by about {self.angle * DEG:.0f}°"
+        return (
+            f"looks to stand in a frame of its own, {turned}: speeds follow (correlation"
+            f" {self.speeds.correlation:+.2f}, {self.speeds.lag * 1e3:.0f} ms late), axes do not (down to"
+            f" {self.least:+.2f})"
+        )
+
+
+def own_frames(run: Run) -> dict[str, OwnFrame]:
+    """The sensors of a run that seem to stand in frames of their own, by name."""
+    found = {name: _own_frame(run.command, source) for name, source in run.sensors.items()}
+    return {name: one for name, one in found.items() if one is not None}
+
+
+def speeds_follow(command: Source, source: Source) -> Following | None:
+    """How the speed of a sensor follows the commanded one; None where one of them is in other axes, or stands still."""
+    axes = _axes(command, source)
+    (t, told), (s, seen) = _rows(command, axes), _rows(source, axes)
+    if len(axes) < 2 or min(len(t), len(s)) < _FEWEST:
+        return None
+    return following((t, _speed(t, told)), (s, _speed(s, seen)))
+
+
+def _axes(command: Source, source: Source) -> list[str]:
+    """Those of x, y and z that both have."""
+    return [axis for axis in CARTESIAN if axis in command.values and axis in source.values]
+
+
+def _own_frame(command: Source, source: Source) -> OwnFrame | None:
+    axes = _axes(command, source)
+    speeds = speeds_follow(command, source)
+    if speeds is None or speeds.correlation < FOLLOWS:
+        return None
+    (t, told), (s, seen) = _rows(command, axes), _rows(source, axes)
+    late = s - round(speeds.lag * 1e9)
+    inside = (late >= t[0]) & (late <= t[-1])
+    led = _path(t, told, late[inside])
+    led, seen = led - led.mean(axis=0), seen[inside] - np.median(seen[inside], axis=0)
+    near = np.abs(seen).max(axis=1) <= 2.0 * np.sqrt(np.sum(led**2, axis=1).max())  # no outlier
+    led, seen = led[near] - led[near].mean(axis=0), seen[near] - seen[near].mean(axis=0)
+    crossed = _correlations(seen, led)
+    moves = [place for place in range(len(axes)) if np.ptp(led[:, place]) > 0.0]
+    least = min((float(crossed[place, place]) for place in moves), default=1.0)
+    if least >= FOLLOWS:
+        return None
+    as_it_is = float(np.sum(seen * led)) / math.sqrt(float(np.sum(seen**2)) * float(np.sum(led**2)))
+    rotation, turned = rotations.aligning(seen, led)
+    _, mirrored = rotations.aligning(seen * np.where(np.arange(len(axes)) == 0, -1.0, 1.0), led)
+    is_mirrored = 1.0 - mirrored**2 < _EXPLAINS * (1.0 - turned**2)
+    exchanged = _exchanged(crossed, moves, signs=is_mirrored)
+    if exchanged or 1.0 - max(turned, mirrored) ** 2 > _EXPLAINS * (1.0 - as_it_is * abs(as_it_is)):
+        return None
+    return OwnFrame(speeds, least, math.nan if is_mirrored else angle_of(rotation))
+
+
+def _exchanged(crossed: FloatArray, moves: Sequence[int], *, signs: bool) -> bool:
+    """Whether each axis that moves is another one, as columns that are exchanged; ``signs``: or against one."""
+    size = np.abs(crossed) if signs else crossed
+    others = {int(np.argmax(size[:, place])) for place in moves}
+    return len(others) == len(moves) and all(size[:, place].max() >= _EXCHANGED for place in moves)
+
+
+def angle_of(rotation: FloatArray) -> float:
+    """By how much a rotation turns [rad], (k, k) with k of 2 or 3."""
+    cosine = (float(np.trace(rotation)) - (len(rotation) - 2)) / 2.0
+    return math.acos(min(max(cosine, -1.0), 1.0))
+
+
+def _correlations(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Of each column of the first with each of the second, (k, k); both are about zero."""
+    power = np.sqrt(np.sum(first**2, axis=0)[:, None] * np.sum(second**2, axis=0))
+    return (first.T @ second) / np.where(power > 0.0, power, np.inf)
+
+
+def _rows(source: Source, axes: Sequence[str]) -> tuple[TimeArray, FloatArray]:
+    """Stamps and positions, (n, k), of the rows that have all of the axes, in the order of time."""
+    value = np.column_stack([source.values[axis] for axis in axes]) if axes else np.empty((0, 0))
+    known = np.flatnonzero(np.isfinite(value).all(axis=1) & (source.stamp != NO_STAMP)) if axes else np.empty(0, int)
+    stamp, order = np.unique(source.stamp[known], return_index=True)
+    return stamp, value[known][order]
+
+
+def _speed(stamp: TimeArray, position: FloatArray) -> FloatArray:
+    """How far a point moves in the 0.15 s around each stamp [m], (n,)."""
+    half = _WINDOW_NS // 2
+    moved = _path(stamp, position, stamp + half) - _path(stamp, position, stamp - half)
+    return np.sqrt(np.sum(moved**2, axis=1))
+
+
+def _path(stamp: TimeArray, position: FloatArray, time: TimeArray) -> FloatArray:
+    """Where a point is at some times [m], (m, k)."""
+    return np.column_stack([np.interp(time, stamp, position[:, place]) for place in range(position.shape[1])])

@@ -1,0 +1,268 @@
+"""Orientations in logs that nothing describes: which columns, which order, and what becomes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import bag_files
+import pumafuse as pf
+from discovery.test_survey import asked, write, written
+from pumafuse.arrays import FloatArray
+from pumafuse.cli import from_log
+from pumafuse.discovery.survey import Survey, survey
+from pumafuse.errors import RunError
+from pumafuse.logs.axes import in_axes
+from pumafuse.space.rotations import TURNING
+
+LATE = 0.13  # s
+START = Rotation.from_euler("ZYX", [25.0, -40.0, 160.0], degrees=True)  # a tool that looks down, not along an axis
+NAMES = ("qx", "qy", "qz", "qw")
+
+
+def places(t: FloatArray) -> FloatArray:
+    """The tool point [m], (n, 3)."""
+    t = np.maximum(t, 0.0)[:, None]
+    return np.array([0.21, 0.16, 0.12]) * np.sin(t * np.array([0.9, 1.3, 1.9])) + np.array([0.5, -0.2, 0.4])
+
+
+def turned(t: FloatArray) -> Rotation:
+    """How the tool is turned: by up to 40° about axes that stay."""
+    t = np.maximum(t, 0.0)[:, None]
+    return Rotation.from_rotvec(np.array([0.4, 0.5, 0.3]) * np.sin(t * np.array([1.1, 0.8, 1.7]))) * START
+
+
+def poses(*, late: float = 0.0, seed: int = 0, frame: Rotation | None = None) -> tuple[dict[str, Any], Rotation]:
+    """Columns t_s, x_m, y_m, z_m and orientations of a source in a turned frame, with noise where it is late."""
+    t = 0.02 * np.arange(700) + (0.003 if late else 0.0)
+    rng, frame = np.random.default_rng(seed), frame or Rotation.identity()
+    at = frame.inv().apply(places(t - late) + rng.normal(scale=2e-4 * bool(late), size=(len(t), 3)))
+    shaken = Rotation.from_rotvec(rng.normal(scale=1e-3 * bool(late), size=(len(t), 3)))
+    return {"t_s": t, **{f"{axis}_m": at[:, k] for k, axis in enumerate("xyz")}}, frame.inv() * shaken * turned(
+        t - late
+    )
+
+
+def quaternion(rotation: Rotation, names: Sequence[str] = NAMES, order: str = "xyzw") -> dict[str, FloatArray]:
+    """The columns of a quaternion, of either sign, in the order of names, which are of x, y, z, w or w, x, y, z."""
+    value = rotation.as_quat() * np.where(np.arange(len(rotation)) // 50 % 2, 1.0, -1.0)[:, None]
+    value = value[:, [3, 0, 1, 2]] if order == "wxyz" else value
+    return dict(zip(names, value.T.round(7), strict=True))
+
+
+def log(folder: Path, told: dict[str, Any] | None, seen: dict[str, Any] | None, frame: Rotation | None = None) -> Path:
+    """A folder of commands and of a tracker with these columns of orientations."""
+    folder.mkdir()
+    for name, late, more, where in (("commands", 0.0, told, None), ("tracker", LATE, seen, frame)):
+        columns, _ = poses(late=late, frame=where)
+        write(folder / f"{name}.csv", {**columns, **(more or {})})
+    return folder
+
+
+def both() -> tuple[Rotation, Rotation]:
+    """Commanded and measured orientations."""
+    return poses()[1], poses(late=LATE)[1]
+
+
+def check_follows(found: Survey, folder: Path) -> tuple[pf.Run, pf.FusionConfig]:
+    """The tool turns as it was commanded, in the arm as in run.toml."""
+    run, config = written(found, folder)
+    assert tuple(config.arm.axes) == ("x", "y", "z", *TURNING)
+    assert all(config.arm.axes[axis].kind == "angle" for axis in TURNING) and config.tool is not None
+    there, mean = both()[0], Rotation.from_rotvec(config.tool.reference)
+    assert (mean * there.mean().inv()).magnitude() < 1e-6
+    told = in_axes(run, None)[0].command
+    wanted = (there * mean.inv()).as_rotvec()
+    assert np.abs(np.stack([told.values[axis] for axis in TURNING], axis=1) - wanted).max() < 1e-6
+    for axis in ("x", "y", "z", *TURNING):
+        one = found.relations["tracker", axis]
+        assert one.correlation > 0.99 and one.lag == pytest.approx(LATE, abs=0.004), axis
+    return run, config
+
+
+@pytest.mark.parametrize(
+    ("names", "order"),
+    [
+        (NAMES, "xyzw"),
+        (("q_w", "q_x", "q_y", "q_z"), "wxyz"),
+        (("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"), "wxyz"),
+        (("quat_x", "quat_y", "quat_z", "quat_w"), "xyzw"),
+        (("pose.orientation.x", "pose.orientation.y", "pose.orientation.z", "pose.orientation.w"), "xyzw"),
+        (("rotation.x", "rotation.y", "rotation.z", "rotation.w"), "xyzw"),
+        (("flangeQuatX", "flangeQuatY", "flangeQuatZ", "flangeQuatW"), "xyzw"),
+    ],
+)
+def test_quaternions_are_known_by_their_names(names: Sequence[str], order: str, tmp_path: Path) -> None:
+    """In whatever order they stand, and of whatever sign: the tool turns as scipy has it."""
+    told, seen = both()
+    found = survey(log(tmp_path / "log", quaternion(told, names, order), quaternion(seen, names, order)))
+    check_follows(found, tmp_path / "out")
+
+
+@pytest.mark.parametrize("numbers", ["0123", "1234"])
+@pytest.mark.parametrize("order", ["wxyz", "xyzw"])
+@pytest.mark.parametrize("leads", [True, False])
+def test_motion_tells_the_order_that_no_name_tells(numbers: str, order: str, leads: bool, tmp_path: Path) -> None:
+    """Of the commands or of a sensor, where the other one is known."""
+    told, seen = both()
+    open_ = tuple(f"q{number}" for number in numbers)
+    columns = (
+        [quaternion(told, open_, order), quaternion(seen)]
+        if leads
+        else [quaternion(told), quaternion(seen, open_, order)]
+    )
+    found = survey(log(tmp_path / "log", *columns))
+    check_follows(found, tmp_path / "out")
+    assert not [one for one in asked(found) if "is w the first" in one]
+
+
+def test_an_order_that_nothing_tells_is_asked_for(tmp_path: Path) -> None:
+    """Of both q0 to q3: w first, as the convention is, with a question."""
+    told, seen = both()
+    columns = [quaternion(one, ("q0", "q1", "q2", "q3"), "wxyz") for one in (told, seen)]
+    found = survey(log(tmp_path / "log", *columns))
+    run, _ = check_follows(found, tmp_path / "out")
+    assert run.command.orientation is not None
+    assert any("is w the first of q0, q1, q2, q3?" in one for one in asked(found))
+
+
+def test_four_joints_are_no_quaternion(tmp_path: Path) -> None:
+    """q0 to q3 whose norm is not 1 are axes of their own."""
+    told = {f"q{k}": 0.3 * (k + 1) * np.sin(0.02 * np.arange(700) * (0.7 + 0.2 * k)) for k in range(4)}
+    seen = {name: np.roll(value, 6) for name, value in told.items()}
+    found = survey(log(tmp_path / "log", told, seen))
+    assert set(found.run.axes) == {"x", "y", "z", *told}
+
+
+def test_the_pose_of_universal_robots_is_a_rotation_vector(tmp_path: Path) -> None:
+    """Six numbers of target_TCP_pose and actual_TCP_pose in one table: m, and a rotation vector in rad."""
+    rows: dict[str, Any] = {"timestamp": 0.02 * np.arange(700)}
+    t = rows["timestamp"]
+    for name, late in (("target", 0.0), ("actual", LATE)):
+        six = np.hstack([places(t - late), turned(t - late).as_rotvec()])
+        rows |= {f"{name}_TCP_pose_{k}": six[:, k] for k in range(6)}
+    write(tmp_path / "ur.csv", rows)
+    found = survey(tmp_path / "ur.csv")
+    run, config = written(found, tmp_path / "out")
+    assert tuple(config.arm.axes) == ("x", "y", "z", *TURNING)
+    assert run.command.orientation is not None
+    assert (Rotation.from_quat(run.command.orientation) * turned(t).inv()).magnitude().max() < 1e-6
+    assert np.abs(run.command.values["y"] - places(t)[:, 1]).max() < 1e-9
+    assert found.relations["actual", "rx"].lag == pytest.approx(LATE, abs=0.004)
+
+
+@pytest.mark.parametrize(
+    ("names", "letters", "prefix"),
+    [(("A", "B", "C"), "ZYX", "X Y Z"), (("W", "P", "R"), "xyz", "X Y Z"), (("roll", "pitch", "yaw"), "xyz", "x y z")],
+)
+def test_euler_angles_beside_a_place_are_an_orientation(
+    names: Sequence[str], letters: str, prefix: str, tmp_path: Path
+) -> None:
+    """Of KUKA, of FANUC, and roll, pitch, yaw, in degrees: the orientations that scipy makes of them; and asked."""
+    folder = tmp_path / "log"
+    folder.mkdir()
+    for name, late in (("goal", 0.0), ("tracker", LATE)):
+        columns, there = poses(late=late)
+        stamp, *place = columns.values()
+        angles = there.as_euler(letters, degrees=True)
+        three = dict(zip(prefix.split(), [1e3 * one for one in place], strict=True))
+        write(folder / f"{name}.csv", {"t_s": stamp, **three, **dict(zip(names, angles.T, strict=True))})
+    found = survey(folder)
+    check_follows(found, tmp_path / "out")
+    assert any(f"are {', '.join(names)} " in one for one in asked(found))
+
+
+def test_angles_without_a_place_stay_axes(tmp_path: Path) -> None:
+    """Roll, pitch and yaw of a head are joints: there is no x, y, z beside them."""
+    t = 0.02 * np.arange(700)
+    for name, late in (("goal", 0.0), ("state", LATE)):
+        angles = 20.0 * np.sin(np.maximum(t - late, 0.0)[:, None] * np.array([0.7, 1.1, 1.6]))
+        write(tmp_path / f"{name}.csv", {"t_s": t, **dict(zip(("roll", "pitch", "yaw"), angles.T, strict=True))})
+    assert survey(tmp_path).run.axes == ("roll", "pitch", "yaw")
+
+
+@pytest.mark.parametrize("has", ["commands", "sensor"])
+def test_an_orientation_that_only_one_has_is_kept_and_is_no_axis(has: str, tmp_path: Path) -> None:
+    """It is in run.toml, as a marker needs it; an arm has no axes that nobody commands, or measures."""
+    told, seen = both()
+    columns = [quaternion(told), None] if has == "commands" else [None, quaternion(seen)]
+    run, config = written(survey(log(tmp_path / "log", *columns)), tmp_path / "out")
+    assert tuple(config.arm.axes) == ("x", "y", "z") and config.tool is None
+    assert (run.command if has == "commands" else run.sensors["tracker"]).orientation is not None
+    assert pf.fuse(run, config).measurements.counts()["fused"] == 3 * 700
+
+
+def test_an_orientation_that_does_not_follow_is_not_fused(tmp_path: Path) -> None:
+    """Of a marker that is turned on the tool by 100°: its axes are not the tool's, its place is."""
+    told, seen = both()
+    marked = seen * Rotation.from_euler("xyz", [100.0, 20.0, -60.0], degrees=True)
+    found = survey(log(tmp_path / "log", quaternion(told), quaternion(marked)))
+    assert found.run.axes == ("x", "y", "z")
+
+
+@pytest.mark.parametrize("angles", [(50.0, 20.0, -70.0), (180.0, 0.0, 30.0), (0.0, 0.0, 90.0)])
+def test_a_sensor_in_a_frame_of_its_own_is_named_and_not_paired(angles: Sequence[float], tmp_path: Path) -> None:
+    """Its speeds follow, its axes do not: said with the angle and what to do; nothing is fused by it alone."""
+    told, seen = both()
+    frame = Rotation.from_euler("xyz", angles, degrees=True)
+    folder = log(tmp_path / "log", quaternion(told), quaternion(frame.inv() * seen), frame)
+    found = survey(folder)
+    assert tuple(found.own_frames) == ("tracker",) and not found.run.sensors and not found.relations
+    one = found.own_frames["tracker"]
+    assert one.angle == pytest.approx(frame.magnitude(), abs=np.radians(3.0))
+    assert one.speeds.correlation > 0.9 and one.speeds.lag == pytest.approx(LATE, abs=0.02)
+    assert any("frame of its own" in one and "pumafuse register" in one for one in asked(found))
+    run, config = written(found, tmp_path / "out")
+    assert tuple(run.sensors) == ("tracker",) and not config.sensors and set(TURNING) <= set(config.arm.axes)
+    with pytest.raises(RunError, match="frame of its own"):
+        from_log.run(folder, tmp_path / "fused", None, None, "filter", False, False, "core", False, (None, None))
+
+
+def test_axes_that_are_exchanged_or_dead_are_no_frame(tmp_path: Path) -> None:
+    """Two columns that are exchanged, or one of noise: what is said of these stays."""
+    for change in ("exchanged", "dead"):
+        folder = tmp_path / change
+        folder.mkdir()
+        write(folder / "commands.csv", poses()[0])
+        columns, _ = poses(late=LATE)
+        if change == "exchanged":
+            columns["x_m"], columns["y_m"] = columns["y_m"], columns["x_m"]
+        else:
+            columns["z_m"] = np.random.default_rng(1).normal(scale=1e-3, size=700)
+        write(folder / "tracker.csv", columns)
+        assert not survey(folder).own_frames, change
+
+
+POSES = {
+    "PoseStamped": ("pose", "position", "orientation"),
+    "TransformStamped": ("transform", "translation", "rotation"),
+}
+
+
+@pytest.mark.parametrize("kind", POSES)
+def test_messages_of_poses_are_poses(kind: str, tmp_path: Path) -> None:
+    """Position and orientation of a message at once: `pose` in run.toml."""
+    from mcap_ros2.writer import Writer
+
+    inside, place, turning = POSES[kind]
+    with (tmp_path / "bag.mcap").open("wb") as file:
+        writer, name = Writer(file), f"geometry_msgs/msg/{kind}"
+        schema = writer.register_msgdef(name, bag_files.definition_of(name))
+        for topic, late in (("/command", 0.0), ("/tracker", LATE)):
+            columns, there = poses(late=late)
+            ns = 1_790_000_000_000_000_000 + np.rint(columns["t_s"] * 1e9).astype(np.int64)
+            at = np.column_stack([columns[f"{axis}_m"] for axis in "xyz"])
+            for stamp, point, turn in zip(ns.tolist(), at.tolist(), there.as_quat().tolist(), strict=True):
+                header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "base"}
+                pose = {place: dict(zip("xyz", point, strict=True)), turning: dict(zip("xyzw", turn, strict=True))}
+                message = {"header": header, inside: pose, "child_frame_id": "tool0"}
+                message = message if kind == "TransformStamped" else {"header": header, inside: pose}
+                writer.write_message(topic, schema, message, log_time=stamp, publish_time=stamp)
+        writer.finish()
+    check_follows(survey(tmp_path / "bag.mcap"), tmp_path / "out")
+    assert (tmp_path / "out" / "run.toml").read_text().count(f'pose = "{inside}"') == 2
