@@ -12,7 +12,6 @@ import typer
 from ..discovery.drafts import drafts
 from ..discovery.guesses import guess
 from ..discovery.survey import survey
-from ..errors import RunError
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Mode
@@ -51,18 +50,13 @@ def run(
     """
     results.check_writable(output, force, with_run=True)
     found = survey(log)
-    if not found.run.sensors:
-        name, one = next(iter(found.own_frames.items()))
-        raise RunError(
-            f"{log}: nothing measures along the commands' axes: {name} {one.words}; `pumafuse init {log} -o DIR`, then"
-            " `pumafuse register DIR`"
-        )
     arm, begins = guess(found)
     texts, here = drafts(found, arm, begins, output), Path()
-    begun = FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
-    begun.sensor_names(sensors)  # before anything is fitted
     recorded = described(drafts(found, arm, begins, here)["run.toml"], here).between(*part)
     init.show(found, begins)
+    begun = init.registered(found, recorded) if found.own_frames else None
+    begun = begun or FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
+    begun.sensor_names(sensors)  # before anything is fitted
     with fitting() as progress:
         fitted = tune(recorded, begun, fit=_FITTED, progress=progress)
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)

@@ -16,8 +16,10 @@ from ..discovery.guesses import SensorGuess, guess
 from ..discovery.questions import decisions, questions
 from ..discovery.roles import Stream
 from ..discovery.survey import Survey, survey
-from ..errors import ConfigError, counted, printable
+from ..errors import ConfigError, RunError, counted, printable
 from ..folders import write_file
+from ..fusion.config import FusionConfig
+from ..logs.run import Run, described
 from ..units import DEG, MS, SCREEN
 from .tables import print_tables, table
 
@@ -42,19 +44,43 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     if there and not force:
         raise ConfigError(f"{folder}: has {there[0]} already; --force replaces it, or choose another folder")
     arm, sensors = guess(found)
-    for name, text in drafts(found, arm, sensors, folder).items():
-        write_file(folder / name, text, replace=force)
+    texts = drafts(found, arm, sensors, folder)
     show(found, sensors)
+    if found.own_frames:
+        config = registered(found, described(drafts(found, arm, sensors, Path())["run.toml"], Path()))
+        if config is not None:
+            texts |= {"fusion.toml": config.to_toml(), "arm.toml": config.arm.to_toml()}
+    for name, text in texts.items():
+        write_file(folder / name, text, replace=force)
     place = shlex.quote(str(folder))
     typer.echo(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
     tuned, fused = f"{place}/tuned", f"{place}/fused"
-    if found.own_frames:
-        typer.echo(f"  pumafuse register {place} -o {place}/registered")
-    if not found.run.sensors:
-        return
     typer.echo(f"  pumafuse latency {place}")
     typer.echo(f"  pumafuse tune {place} -c {place}/fusion.toml -o {tuned} --fit noise,delay,plant")
     typer.echo(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
+
+
+def registered(found: Survey, recorded: Run) -> FusionConfig | None:
+    """The configuration with the sensors registered that stand in frames of their own, which is printed.
+
+    Returns:
+        None where none of them can be registered, and others measure along the base's axes.
+
+    Raises:
+        PumafuseError: None can be, and no other sensor measures anything.
+    """
+    from ..registration.runs import register  # scipy takes its time, and most logs need none of it
+    from . import register as shown
+
+    try:
+        done = register(recorded, along_base=list(found.run.sensors))
+    except RunError as error:
+        if not found.run.sensors:
+            raise
+        typer.echo(f"not registered: {error}")
+        return None
+    shown.show(done.details)
+    return done.config
 
 
 def show(found: Survey, sensors: Mapping[str, SensorGuess]) -> None:

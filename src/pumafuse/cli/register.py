@@ -13,7 +13,7 @@ from .. import folders
 from ..fusion.config import FusionConfig
 from ..logs.run import Run
 from ..registration.register import Registered
-from ..registration.runs import RegisteredSensor, register
+from ..registration.runs import RegisteredSensor, RegistrationSummary, register
 from ..toml import Interval
 from ..units import DEG, MM, MS
 from .tables import print_tables, table
@@ -52,13 +52,18 @@ def run(
     if json:
         typer.echo(found.to_json(), nl=False)
     else:
-        for name, one in found.details.sensors.items():
-            _show(name, one)
+        show(found.details)
         if output is not None:
             folder = shlex.quote(str(output))
             typer.echo(f"written to {output}\nnext: pumafuse fuse RUN -c {folder}/fusion.toml -o DIR")
     if any(one.frame is None for one in found.details.sensors.values()):
         raise typer.Exit(_NOT_ALL)
+
+
+def show(found: RegistrationSummary) -> None:
+    """Print what was found of each sensor on stdout."""
+    for name, one in found.sensors.items():
+        _show(name, one)
 
 
 def _show(name: str, one: RegisteredSensor) -> None:

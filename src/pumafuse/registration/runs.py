@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -109,6 +109,7 @@ def register(
     *,
     sensor: str | None = None,
     fix: Iterable[str] = (),
+    along_base: Collection[str] = (),
 ) -> Registrations:
     """Find where sensors stand, what they see on the tool, and how late they are, from any motion.
 
@@ -118,6 +119,7 @@ def register(
             found, too, and the earliest sensor is taken to have no latency.
         sensor: The one to register; None: each that gives x, y and z.
         fix: ``marker``: it stays as configured.
+        along_base: Sensors that measure along the base's axes, and are only compared.
 
     Returns:
         The configuration with frames, markers and latencies, and their 95 % intervals.
@@ -135,6 +137,7 @@ def register(
     lag = None if config is None else float(np.mean([config.arm.lag_of(axis) for axis in CARTESIAN]))
     found = {name: _registered(every, name, config, lag, fixed=bool(list(fix))) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
+    placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
     said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
     if not placed:
         raise RunError("; ".join(note for notes in said.values() for note in notes))
@@ -223,6 +226,11 @@ def _shifted(one: Quantity, by: float) -> Quantity:
     return Quantity(one.value + by, (one.ci95[0] + by, one.ci95[1] + by))
 
 
+def _without_place(one: Registration) -> Registration:
+    """The same of a sensor that stands where the robot does."""
+    return msgspec.structs.replace(one, frame=None, marker=None)
+
+
 def _details(one: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:
     """What was found of one sensor."""
     names = [found.finding.value for found in one.findings]
@@ -305,6 +313,7 @@ def _configuration(
         for name, one in config.sensors.items()
         if name in guessed.sensors
     }
+    sensors = {**guessed.sensors, **sensors}
     known = {axis: one for axis, one in begun.arm.axes.items() if axis in guessed.arm.axes}
     arm = msgspec.structs.replace(guessed.arm, delay=begun.arm.delay, axes={**guessed.arm.axes, **known})
     return msgspec.structs.replace(guessed, arm=arm, tool=config.tool, sensors=sensors)
