@@ -55,7 +55,8 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     place = shlex.quote(str(folder))
     typer.echo(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
     tuned, fused = f"{place}/tuned", f"{place}/fused"
-    typer.echo(f"  pumafuse latency {place}")
+    if not found.own_frames:
+        typer.echo(f"  pumafuse latency {place}")
     typer.echo(f"  pumafuse tune {place} -c {place}/fusion.toml -o {tuned} --fit noise,delay,plant")
     typer.echo(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
 

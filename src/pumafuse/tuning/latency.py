@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray
 from ..discovery.guesses import ArmGuess, AxisGuess, SensorGuess, guess
+from ..discovery.own_frames import own_frames
 from ..discovery.roles import relations
 from ..discovery.sensors import REFERENCE, Alignment, aligned
 from ..discovery.survey import SOONER, Survey, interpolation, soonest
@@ -242,6 +243,11 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     every = [_with_reference(run) for run in ([runs] if isinstance(runs, Run) else runs)]
     if not every:
         raise TuneError("no run to look at")
+    aside = {name: one.words for run in every for name, one in own_frames(run).items()}
+    every = [_without(run, aside) for run in every]
+    turned = [f"sensor '{name}' {words}: `pumafuse register` finds it; it is not used" for name, words in aside.items()]
+    if turned and not any(run.sensors for run in every):
+        raise TuneError("; ".join(turned))
     surveys = [Survey(Path(run.name), run, relations(run)) for run in sorted(every, key=_motion, reverse=True)]
     config = first_guess(surveys)
     trusted = _trusted(config, every, sensor)
@@ -257,7 +263,12 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     best, sensors, said = _sensors(every, config, trusted)
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving]
-    notes = [*likelihood.notes, *said, *(f"{axis}: does not move, or {trusted} does not measure it" for axis in still)]
+    notes = [
+        *turned,
+        *likelihood.notes,
+        *said,
+        *(f"{axis}: does not move, or {trusted} does not measure it" for axis in still),
+    ]
     notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
     notes += [_SAMPLED.format(one.run.name, step * MS) for one in surveys if (step := interpolation(one))]
     notes += [_AHEAD_OF.format(one.run.name, -lag * MS) for one in surveys if (lag := soonest(one)) < -SOONER]
@@ -286,6 +297,12 @@ def _with_reference(run: Run) -> Run:
     if run.reference is None:
         return run
     return replace(run, sensors={REFERENCE: run.reference, **run.sensors}, reference=None)
+
+
+def _without(run: Run, names: Collection[str]) -> Run:
+    """A run without some sensors."""
+    kept = {name: source for name, source in run.sensors.items() if name not in names}
+    return run if len(kept) == len(run.sensors) else replace(run, sensors=kept)
 
 
 def first_guess(surveys: Sequence[Survey]) -> FusionConfig:
