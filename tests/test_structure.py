@@ -23,6 +23,7 @@ ROOMS = [
     "pieces",
     "simulation",
     "tuning",
+    "registration",
     "identification",
     "live",
     "views",

@@ -67,18 +67,24 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
         size, axis = self.size or 0.0, ", ".join(f"{one:.3f}" for one in self.axis or ())
         match self.finding:
             case Finding.SHORT:
-                what = f"has {size:.1f} s of measurements beside commands: too little to register it; record 10 s or more"
+                what = (
+                    f"has {size:.1f} s of measurements beside commands: too little to register it; record 10 s or more"
+                )
             case Finding.UNRELATED:
                 what = f"does not move with the tool (correlation of speeds {size:+.2f}): is it of this run and clock?"
             case Finding.MIRRORED:
-                what = "has left-handed axes beside the commands': is a sign wrong, or are two axes exchanged (run.toml)?"
+                what = (
+                    "has left-handed axes beside the commands': is a sign wrong, or are two axes exchanged (run.toml)?"
+                )
             case Finding.LINE:
                 what = f"saw motion along ({axis}) of the base only: how it is turned about that is not known"
             case Finding.PLANE:
                 what = "saw motion in a plane only: its axes are taken to be right-handed, which nothing tells"
             case Finding.SCALE:
                 unit = f", as if it were {self.unit}" if self.unit else ""
-                what = f"measures lengths that are to be multiplied by {size:.4g}{unit}: mend its unit or scale (run.toml)"
+                what = (
+                    f"measures lengths that are to be multiplied by {size:.4g}{unit}: mend its unit or scale (run.toml)"
+                )
             case Finding.STILL:
                 what = "saw a tool that does not turn: its marker stays as given, and the frame's place makes up for it"
             case Finding.ONE_AXIS:
