@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from ..arrays import FloatArray
 
@@ -35,8 +34,8 @@ def half_widths(influence: FloatArray, lengths: Sequence[int]) -> FloatArray:
 
 def _autocovariance(influence: FloatArray, most: int) -> FloatArray:
     """Sums of products of rows that are 0, 1, ... apart, (most + 1, q)."""
-    size = next_fast_len(len(influence) + most + 1)
-    return irfft(np.abs(rfft(influence, size, axis=0)) ** 2, size, axis=0)[: most + 1]
+    size = 2 ** (len(influence) + most).bit_length()
+    return np.fft.irfft(np.abs(np.fft.rfft(influence, size, axis=0)) ** 2, size, axis=0)[: most + 1]
 
 
 def _half_width(covariance: FloatArray, count: int) -> float:
@@ -47,4 +46,4 @@ def _half_width(covariance: FloatArray, count: int) -> float:
     enough = np.flatnonzero(np.arange(len(time)) >= _WINDOW * np.maximum(time, 1.0))
     window = int(enough[0]) if len(enough) else len(time) - 1
     free = count / (2.0 * window + 1.0)
-    return float(np.sqrt(covariance[0] * max(time[window], 0.5)) * student.ppf(_LEVEL, max(free, 1.0)))
+    return float(np.sqrt(covariance[0] * max(time[window], 0.5)) * stdtrit(max(free, 1.0), _LEVEL))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..filter.response import response
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
@@ -88,7 +88,7 @@ class Answer:
         self.turns = all(one.quaternion is not None for one in command)
         self._time = time
         self._start = [float(one.time[0]) for one in command]
-        self._given = [np.round((one.time - one.time[0]) * _NS).astype(np.int64) for one in command]
+        self._given: list[TimeArray] = [np.round((one.time - one.time[0]) * _NS).astype(np.int64) for one in command]
         self._position = [one.position for one in command]
         rotations = [Rotation.from_quat(one.quaternion) for one in command if one.quaternion is not None]
         if self.turns:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -15,22 +16,7 @@ from ..toml import Interval
 from .findings import Finding, Found, Reading, Vector
 from .intervals import half_widths
 from .motion import Answer, Motion, Plant
-from .solve import (
-    ANGLE,
-    CENTRE,
-    MARKER,
-    POSITION,
-    ROTATION,
-    SCALE,
-    SIZE,
-    TURN,
-    Fit,
-    Rows,
-    State,
-    crossed,
-    fitted,
-    influence,
-)
+from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, crossed, fitted
 from .start import Rough, aligned_turns, despiked, kabsch, read, rough, unit
 
 _SETTLED = 6.0  # rough lags after the first command: how the arm moved before is forgotten
@@ -39,16 +25,21 @@ _ROWS, _COARSE = 8000, 1000  # that are looked at, evenly, in the end and to beg
 _DEAD = 0.6  # of the lag, to begin with
 _FOLLOWS = 0.3  # correlation of speeds
 _LEFT = 0.5  # of what a sensor saw, which no frame explains: it does not move with the tool
+_WELL = 0.1  # likewise: a frame explains it
+_AS_IT_IS = np.eye(3)
+_AROUND = Rotation.create_group("T").as_matrix()  # all around, 60 degrees apart at most from the next
 _TURNS = np.radians(0.5)  # of the tool, root mean square: arms err by as much in orientation
+_NOTABLE = np.radians(2.0)  # root mean square of turns that are compared
 _BESIDE = 2e-3  # m beside a line, root mean square: arms err by a quarter of that
 _MIRROR, _EITHER = 0.5, 1.5  # times the noise that a mirrored sensor leaves: it is one, or may be one
 _ALIKE = 0.3  # of two sets of directions that a rotation leaves: 17 degrees
+_OTHERWISE = 0.05  # rad, about, between the frames of both, root mean square: 3 degrees
+_HARDLY = 0.01  # weight of positions where orientations alone do not tell a rotation
 _CLEARER = 0.5  # times as much is left by the right reading
 _SURELY = 0.1  # likewise, of orientations that follow as they are
 _LEVER = 0.15  # m: arms err by 0.5 mm and 0.2 degrees
 _TILT = 0.05  # of a number per step in a direction that nothing tells: less is told
 _UNIT = 0.05  # tolerance of a factor between units
-_OTHER_UNIT = 0.25  # logarithm of a scale from which it is one of a unit
 _OTHER = 0.02  # from which a scale is named: arms' own kinematics are wrong by a tenth of that
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "m": 1.0}  # in m
 
@@ -202,27 +193,47 @@ def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Pl
     """Unit, handedness and reading of orientations, from positions alone at first."""
     few, found = _thinned(sensor, _COARSE), list[Found]()
     mean = np.concatenate([despiked(one.position) for one in few]).mean(axis=0)
-    proper, mirrored = (_coarse(command, few, mean, about, marker, fix_marker, sign) for sign in (1.0, -1.0))
-    spread = float(
-        np.sqrt(np.mean((proper.state.scale * (np.concatenate([despiked(b.position) for b in few]) - mean)) ** 2))
-    )
-    left, other = float(proper.off.noise()[0]), float(mirrored.off.noise()[0])
+    seen = np.concatenate([despiked(one.position) for one in few]) - mean
+    spread = float(np.std(seen))
+    begin = partial(_coarse, sensor=few, mean=mean, about=about, marker=marker, fix_marker=fix_marker)
+    command, proper, otherwise = _told_as(command, begin, spread)
+    found += otherwise
+    mirrored = begin(command, sign=-1.0)
+    spread, left, other = spread * proper.state.scale, proper.left(), mirrored.left()
     state = proper.state
-    begin = _Begin(command, sensor, mean, False, other < _EITHER * left, state, found)
+    none = _Begin(command, sensor, mean, False, other < _EITHER * left, state, found)
     if min(left, other) > _LEFT * spread:
         found.append(Found(finding=Finding.UNRELATED, size=about.correlation))
     elif other < _MIRROR * left:
         found.append(Found(finding=Finding.MIRRORED))
-    if found:
-        return begin
+    if any(one.prevents for one in found):
+        return none
     factor, unit_found = _unit_of(proper, [len(one.time) for one in few])
     found += unit_found
     sensor = [one._replace(position=factor * one.position) for one in sensor]
     state = state._replace(scale=1.0)
-    begin = begin._replace(sensor=sensor, mean=factor * mean, state=state)
+    whole = none._replace(sensor=sensor, mean=factor * mean, state=state)
     if sensor[0].quaternion is None or not Answer(command, []).turns:
-        return begin
-    return _with_attitude(begin, about, marker, fix_marker)
+        return whole
+    return _with_attitude(whole, about, marker, fix_marker)
+
+
+def _told_as(command: list[Motion], begin: Callable[..., Fit], spread: float) -> tuple[list[Motion], Fit, list[Found]]:
+    """The commands as their orientations are to be read, and a first fit.
+
+    Where the path alone does not tell how the sensor is turned, its marker may: then it begins from turns all around.
+    """
+    fit = begin(command)
+    if fit.left() < _WELL * spread * fit.state.scale:
+        return command, fit, []
+    if command[0].quaternion is not None:
+        for reading in (Reading.INVERSE, Reading.W_FIRST, Reading.W_LAST):
+            other, _ = _read_as(command, [], "command", reading)
+            then = begin(other)
+            if then.left() < _WELL * spread * then.state.scale:
+                return other, then, [Found(finding=Finding.READING, source="command", reading=reading)]
+    fits = [fit, *(begin(command, first=turn) for turn in _AROUND)]
+    return command, min(fits, key=lambda one: one.left() / one.state.scale), []
 
 
 def _coarse(
@@ -232,9 +243,21 @@ def _coarse(
     about: Rough,
     marker: Place,
     fix_marker: bool,
-    sign: float,
+    sign: float = 1.0,
+    first: FloatArray = _AS_IT_IS,
 ) -> Fit:
-    """A fit to the positions of a few rows, scale free; of a mirrored sensor where the sign is −1."""
+    """A fit to the positions of a few rows, scale free.
+
+    Args:
+        command: Of all runs.
+        sensor: Likewise.
+        mean: A point in the middle of what the sensor measures [m].
+        about: How it follows by its speeds.
+        marker: As far as it is known.
+        fix_marker: Whether it stays.
+        sign: −1: the sensor is mirrored.
+        first: By which to turn the rotation that fits the path, to begin elsewhere.
+    """
     plant = Plant(_DEAD * about.lag, max((1.0 - _DEAD) * about.lag, 1e-3))
     rows = _rows(command, sensor, mean, attitude=False)
     poses, rows = rows.answer.poses(plant, plant), rows._replace(centred=rows.centred * [1.0, 1.0, sign])
@@ -244,10 +267,10 @@ def _coarse(
     scale = about.scale if np.isfinite(about.scale) else 1.0
     rotation = kabsch(unit(path), unit(seen * [1.0, 1.0, sign]))[0]
     turn = Rotation.from_rotvec(marker.rotation).as_matrix()
-    state = State(rotation, path.mean(axis=0), known, turn, scale, plant, plant)
-    told = _turned(poses.rotation)[1]
-    markers = np.zeros((3, 0)) if fix_marker else told
-    return fitted(rows, state, _free(np.eye(3), markers, turn=False, scale=True, own=False))
+    markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
+    moves = bool(np.std(path, axis=0).max() > _BESIDE)  # else a scale is one of the marker
+    free = _free(np.eye(3), markers, turn=False, scale=moves, own=False)
+    return fitted(rows, State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant), free)
 
 
 def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -287,10 +310,10 @@ def _unit_of(fit: Fit, lengths: Sequence[int]) -> tuple[float, list[Found]]:
     """By what to multiply a sensor's lengths, and that they need it."""
     scale = fit.state.scale
     wide = float(half_widths(fit.influence[:, SCALE], lengths)[0])
-    if abs(np.log(scale)) < max(_OTHER_UNIT, wide):
+    if abs(np.log(scale)) < max(_OTHER, wide):
         return 1.0, []
     for (name, one), (read_as, other) in product(_UNITS.items(), _UNITS.items()):
-        if abs(np.log(scale * other / one)) < _UNIT:
+        if name != read_as and abs(np.log(scale * other / one)) < _UNIT:
             unit = f"in {name}, read as {read_as}"
             return one / other, [Found(finding=Finding.SCALE, size=one / other, unit=unit)]
     return scale, [Found(finding=Finding.SCALE, size=scale)]
@@ -299,28 +322,25 @@ def _unit_of(fit: Fit, lengths: Sequence[int]) -> tuple[float, list[Found]]:
 def _with_attitude(begin: _Begin, about: Rough, marker: Place, fix_marker: bool) -> _Begin:
     """With the sensor's orientations, where they follow; read otherwise where they follow then."""
     few = _thinned(begin.sensor, _COARSE)
-    left = {
-        (source, reading): _apart(begin, few, source, reading)[0]
-        for source, reading in product(("sensor", "command"), Reading)
-        if source == "sensor" or reading is not Reading.AS_TOLD
-    }
-    best = min(left, key=lambda one: left[one])
     told = ("sensor", Reading.AS_TOLD)
-    if left[told] <= max(left[best] / _CLEARER, _SURELY):
+    ways = [told, *product(("sensor", "command"), tuple(Reading)[1:])]
+    aligned = {way: _aligned(begin, few, *way) for way in ways}
+    best = min(ways, key=lambda way: aligned[way].left)
+    if aligned[told].left <= max(aligned[best].left / _CLEARER, _SURELY):
         best = told
-    least, frame, alone = _apart(begin, few, *best)
-    if least > _ALIKE:
-        _, frame, alone = _apart(begin, few, *told)
-        angle = float(Rotation.from_matrix(alone[0] @ begin.state.rotation.T).magnitude())
-        kind = Finding.ATTITUDE if alone[1] < _ALIKE else Finding.ATTITUDE_UNRELATED
+    if aligned[best].left > _ALIKE or aligned[best].excess > _OTHERWISE:
+        frame, left = aligned[told].attitude
+        angle = float(Rotation.from_matrix(frame @ begin.state.rotation.T).magnitude())
+        kind = Finding.ATTITUDE if left < _ALIKE else Finding.ATTITUDE_UNRELATED
         return begin._replace(findings=[*begin.findings, Found(finding=kind, size=angle)])
+    frame = aligned[best].frame
     command, sensor = _read_as(begin.command, begin.sensor, *best)
     state, found = begin.state, list(begin.findings)
     if best != told:
         found.append(Found(finding=Finding.READING, source=best[0], reading=best[1]))
     few = _thinned(sensor, _COARSE)
     if best[0] == "command":
-        state = _coarse(command, few, begin.mean, about, marker, fix_marker, 1.0).state._replace(scale=1.0)
+        state = _coarse(command, few, begin.mean, about, marker, fix_marker).state._replace(scale=1.0)
     rows = _rows(command, few, begin.mean, attitude=True)
     assert rows.turned is not None
     if not fix_marker:
@@ -343,20 +363,39 @@ def _read_as(
     return (otherwise(command), sensor) if source == "command" else (command, otherwise(sensor))
 
 
-def _apart(
-    begin: _Begin, few: list[Motion], source: str, reading: Reading
-) -> tuple[float, FloatArray, tuple[FloatArray, float]]:
-    """What one frame leaves of positions and orientations, that frame, and both of orientations alone."""
+class _Aligned(NamedTuple):
+    """One rotation for positions and orientations.
+
+    Attributes:
+        frame: Base from sensor, (3, 3).
+        left: What it leaves, of 1.
+        excess: What it leaves beyond what two rotations would, one of each: 1 is a radian.
+        attitude: That of orientations, and what it leaves of them.
+    """
+
+    frame: FloatArray
+    left: float
+    excess: float
+    attitude: tuple[FloatArray, float]
+
+
+def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) -> _Aligned:
+    """One frame for both, orientations of a source read in some way."""
     command, sensor = _read_as(begin.command, few, source, reading)
     rows, state = _rows(command, sensor, begin.mean, attitude=True), begin.state
+    assert rows.turned is not None
     poses = rows.answer.poses(state.position, state.angle)
     path, seen = unit(poses.position + poses.rotation @ state.marker), unit(rows.centred)
-    assert rows.turned is not None
     turns = aligned_turns(Rotation.from_matrix(poses.rotation), Rotation.from_matrix(rows.turned))
-    size = max(float(np.sqrt(np.mean(np.sum(turns[0] ** 2, axis=1)))), _TURNS) * np.sqrt(len(turns[0]) / len(path))
+    size = max(float(np.linalg.norm(turns[0])) / np.sqrt(len(turns[0])), _NOTABLE) * np.sqrt(len(turns[0]) / len(path))
     told, measured = (one / size for one in turns)
-    left, frame = kabsch(np.vstack([path, told]), np.vstack([seen, measured]))[::-1]
-    return left, frame, kabsch(told, measured)
+    frame, left = kabsch(np.vstack([path, told]), np.vstack([seen, measured]))
+    rotation = kabsch(np.vstack([_HARDLY * path, told]), np.vstack([_HARDLY * seen, measured]))[0]
+    of_path, alone = kabsch(path, seen)[1], kabsch(told, measured)[1]
+    half = float(len(path))  # the sum of squares of each
+    beyond = max(left - of_path - alone, 0.0)
+    share, excess = np.sqrt([0.5 * left / half, 0.5 * beyond / half]).tolist()
+    return _Aligned(frame, share, excess, (rotation, float(np.sqrt(alone / half))))
 
 
 def _fitted(begin: _Begin, fix_marker: bool, arm_lag: float | None) -> Registration:
@@ -383,10 +422,6 @@ def _fitted(begin: _Begin, fix_marker: bool, arm_lag: float | None) -> Registrat
     turn = begin.attitude and not fix_marker
     fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
     lengths = [len(one.time) for one in sensor]
-    step = influence(rows, fit.state, fit.off, _free(held, told, turn=turn, scale=True, own=own))[:, SCALE]
-    scale, wide = float(np.exp(step.sum())), float(half_widths(step, lengths)[0])
-    if abs(np.log(scale)) > max(_OTHER, wide) and not any(one.finding is Finding.SCALE for one in found):
-        found.append(Found(finding=Finding.SCALE, size=scale))
     return _told(fit, begin, lengths, loose, blind, own, arm_lag)
 
 

@@ -25,10 +25,10 @@ _MEDIAN = 1.5382  # of the length of three standard normal deviates
 _LEAST = 1e-9  # m or rad: rounding
 _STEPS = 50  # at most
 _HALVED = 6  # times that a step which leads up is halved
-_ENOUGH = 1e-12  # of the sum per row: a step that gains less is the last
+_ENOUGH = 1e-8  # of the sum per row: a step that gains less is the last
 _SINGULAR = 1e-11  # of the largest eigenvalue: what is smaller is not told by the rows
 _SHORTEST, _LONGEST = 1e-3, 2.0  # s, of a time constant
-_FASTEST = 0.3  # s, by which a dead time changes in a step, and logarithm by which τ does
+_FASTEST = 0.3  # s, by which a dead time changes in a step at most; τ and scale change by a factor of e
 
 
 class State(NamedTuple):
@@ -66,7 +66,7 @@ class State(NamedTuple):
             self.centre + step[CENTRE],
             self.marker + step[MARKER],
             Rotation.from_rotvec(step[TURN]).as_matrix() @ self.turn,
-            self.scale * float(np.exp(step[SCALE][0])),
+            self.scale * float(np.exp(np.clip(step[SCALE][0], -1.0, 1.0))),
             *plants,
         )
 
@@ -124,6 +124,10 @@ class Fit(NamedTuple):
     state: State
     off: Off
     influence: FloatArray
+
+    def left(self) -> float:
+        """The standard deviation of positions [m]."""
+        return float(self.off.noise()[0])
 
 
 def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import medfilt
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, median
 from .findings import Reading
 from .motion import Motion
 
@@ -19,6 +19,8 @@ _WINDOWS = (0.15, 0.6)  # s, over which speeds are taken: the longer one where a
 _MOST = 30_000  # ticks of a run that are looked at
 _FEWEST = 100  # ticks that are compared
 _QUIET = 0.99  # quantile at which speeds are cut off: a jump must not decide
+_FAST = 0.8  # quantile of speeds
+_STANDS = 1e-9  # m
 _OUTLIER = 5  # rows of a running median
 _APART = (0.09, 0.21, 0.37)  # of all rows: between orientations that are compared
 _HALF_TURN = 2.6  # rad, beyond which the axis of a rotation may point either way
@@ -43,45 +45,60 @@ def rough(command: Sequence[Motion], sensor: Sequence[Motion]) -> Rough:
     best = Rough(0.0, np.nan, 0.0)
     for window in _WINDOWS:
         steps = round(window / _TICK)
-        told = [_speeds(one, steps) for one in command]
-        seen = [_speeds(one, steps) for one in sensor]
+        told = [_speeds(one, steps, held=True) for one in command]
+        seen = [_speeds(one, steps, held=False) for one in sensor]
         starts = [round((b.time[0] - a.time[0]) / _TICK) for a, b in zip(command, sensor, strict=True)]
         for by, of in ((0, 0), (1, 1), (1, 0)):
-            if all(len(one) > max(by, of) for one in told + seen):
+            if all(len(one) > by for one in told) and all(len(one) > of for one in seen):
                 pairs = [(a[by], b[of], at) for a, b, at in zip(told, seen, starts, strict=True)]
                 for lag in _LAGS:
-                    left, right = (np.concatenate(one) for one in zip(*_shifted(pairs, lag), strict=True))
+                    left, right = _beside(pairs, lag)
                     alike = _correlation(left, right)
                     if alike > best.correlation:
-                        scale = (
-                            np.median(left[_upper(left)]) / np.median(right[_upper(left)]) if by == of == 0 else np.nan
-                        )
-                        best = Rough(lag * _TICK, float(scale), alike)
+                        scale = _ratio(left, right) if by == of == 0 else np.nan
+                        best = Rough(lag * _TICK, scale, alike)
     return best
 
 
-def _speeds(motion: Motion, steps: int) -> list[FloatArray]:
-    """How far it goes [m], and turns [rad] where it is told, within so many ticks; by ticks from its first row."""
+def _speeds(motion: Motion, steps: int, *, held: bool) -> list[FloatArray]:
+    """How far it goes [m], and turns [rad] where it is told, within so many ticks; by ticks from its first row.
+
+    Commands are held, measurements are samples of a path.
+    """
     grid = np.arange(motion.time[0], min(motion.time[-1], motion.time[0] + _MOST * _TICK), _TICK)
-    place = np.stack([np.interp(grid, motion.time, one) for one in despiked(motion.position).T], axis=-1)
-    found = [np.linalg.norm(place[steps:] - place[:-steps], axis=1)]
+    last = np.searchsorted(motion.time, grid, side="right") - 1
+    path: FloatArray = motion.position[last]
+    if not held:
+        smooth = despiked(motion.position)
+        for axis in range(3):
+            path[:, axis] = np.interp(grid, motion.time, smooth[:, axis])
+    found = [np.linalg.norm(path[steps:] - path[:-steps], axis=1)]
     if motion.quaternion is not None:
-        turned = Slerp(motion.time, Rotation.from_quat(motion.quaternion))(grid)
+        turned = Rotation.from_quat(motion.quaternion[last])
         found.append((turned[steps:] * turned[:-steps].inv()).magnitude())
     return [np.minimum(one, np.quantile(one, _QUIET)) for one in found if len(one)]
 
 
 def despiked(position: FloatArray) -> FloatArray:
     """Positions without single outliers."""
-    return medfilt(position, (_OUTLIER, 1)) if len(position) > _OUTLIER else position
+    return median_filter(position, size=(_OUTLIER, 1), mode="nearest")
 
 
-def _shifted(pairs: Sequence[tuple[FloatArray, FloatArray, int]], lag: int) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """What was told so many ticks before what was seen, where there are both."""
+def _beside(pairs: Sequence[tuple[FloatArray, FloatArray, int]], lag: int) -> tuple[FloatArray, FloatArray]:
+    """What was told so many ticks before what was seen, where there are both, of all runs."""
+    left, right = list[FloatArray](), list[FloatArray]()
     for told, seen, start in pairs:
         first = max(0, lag - start)
         count = max(min(len(seen) - first, len(told) - (first + start - lag)), 0)
-        yield told[first + start - lag :][:count], seen[first:][:count]
+        left.append(told[first + start - lag :][:count])
+        right.append(seen[first:][:count])
+    return np.concatenate(left), np.concatenate(right)
+
+
+def _ratio(told: FloatArray, seen: FloatArray) -> float:
+    """Of two speeds where the tool is fast."""
+    fast = told >= np.quantile(told, _FAST)
+    return median(told[fast]) / max(median(seen[fast]), _STANDS)
 
 
 def _correlation(one: FloatArray, other: FloatArray) -> float:
@@ -93,25 +110,21 @@ def _correlation(one: FloatArray, other: FloatArray) -> float:
     return float(a @ b) / size if size > 1e-12 * len(a) * float(one.max() * other.max()) else 0.0
 
 
-def _upper(speed: FloatArray) -> FloatArray:
-    return speed >= np.quantile(speed, 0.5)
-
-
 def kabsch(to: FloatArray, of: FloatArray) -> tuple[FloatArray, float]:
-    """The rotation that takes one set of vectors nearest to another, and the share of them that it leaves, of 1.
+    """The rotation that takes one set of vectors nearest to another, and the sum of squares that it leaves.
 
     scipy's warns where the answer is one of several; here that one does.
     """
     left, _, right = np.linalg.svd(to.T @ of)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
     rotation = left @ flip @ right
-    return rotation, float(np.sqrt(np.mean((to - of @ rotation.T) ** 2) / max(float(np.mean(to**2)), 1e-300)))
+    return rotation, float(np.sum((to - of @ rotation.T) ** 2))
 
 
 def unit(vectors: FloatArray) -> FloatArray:
     """Vectors about their mean, of mean square 1."""
     about = vectors - vectors.mean(axis=0)
-    return about / max(float(np.sqrt(np.mean(about**2) * 3.0)), 1e-300)
+    return about / max(float(np.linalg.norm(about)) / np.sqrt(len(about)), 1e-300)
 
 
 def between(turned: Rotation) -> FloatArray:
