@@ -14,9 +14,7 @@ import bag_files
 import pumafuse as pf
 from discovery.test_survey import asked, write, written
 from pumafuse.arrays import FloatArray
-from pumafuse.cli import from_log
 from pumafuse.discovery.survey import Survey, survey
-from pumafuse.errors import RunError
 from pumafuse.logs.axes import in_axes
 from pumafuse.space.rotations import TURNING
 
