@@ -1,6 +1,6 @@
 """Sensors that stand in frames of their own: they are as fast as the commands, and their axes do not follow.
 
-How fast a point moves is the same in every frame.
+How fast a point moves, and how fast a tool turns, is the same in every frame.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from ..space import rotations
 from ..units import DEG
 from .following import Following, following
 
-FOLLOWS = 0.8  # correlation from which speeds follow, and below which an axis does not
+FOLLOWS = 0.8  # correlation below which an axis does not follow
+_AS_FAST = 0.6  # from which speeds do: a marker beside a tool that turns has some of its own
 _WINDOW_NS = 150_000_000  # over which speeds are: long beside noise, short beside a motion
 _EXPLAINS = 0.25  # of what the axes leave of the motion: a frame that is turned leaves less
 _EXCHANGED = 0.9  # correlation from which an axis is another one: then columns are exchanged
@@ -57,12 +58,20 @@ def own_frames(run: Run) -> dict[str, OwnFrame]:
 
 
 def speeds_follow(command: Source, source: Source) -> Following | None:
-    """How the speed of a sensor follows the commanded one; None where one of them is in other axes, or stands still."""
+    """How the speed of a sensor follows the commanded one, of its place or of its turning, whichever does so better.
+
+    None where one of them is in other axes, or stands still.
+    """
     axes = _axes(command, source)
     (t, told), (s, seen) = _rows(command, axes), _rows(source, axes)
     if len(axes) < 2 or min(len(t), len(s)) < _FEWEST:
         return None
-    return following((t, _speed(t, told)), (s, _speed(s, seen)))
+    linear = following((t, _speed(t, told)), (s, _speed(s, seen)))
+    if command.orientation is None or source.orientation is None:
+        return linear
+    (t, told), (s, seen) = _turning(command), _turning(source)
+    turning = following((t, _speed(t, told)), (s, _speed(s, seen))) if min(len(t), len(s)) >= _FEWEST else None
+    return max((one for one in (linear, turning) if one), key=lambda one: one.correlation, default=None)
 
 
 def _axes(command: Source, source: Source) -> list[str]:
@@ -73,7 +82,7 @@ def _axes(command: Source, source: Source) -> list[str]:
 def _own_frame(command: Source, source: Source) -> OwnFrame | None:
     axes = _axes(command, source)
     speeds = speeds_follow(command, source)
-    if speeds is None or speeds.correlation < FOLLOWS:
+    if speeds is None or speeds.correlation < _AS_FAST:
         return None
     (t, told), (s, seen) = _rows(command, axes), _rows(source, axes)
     late = s - round(speeds.lag * 1e9)
@@ -124,8 +133,20 @@ def _rows(source: Source, axes: Sequence[str]) -> tuple[TimeArray, FloatArray]:
     return stamp, value[known][order]
 
 
+def _turning(source: Source) -> tuple[TimeArray, FloatArray]:
+    """Stamps and orientations, relative to their mean [rad], (n, 3), in the order of time.
+
+    Another frame and a marker that is turned on the tool only turn these vectors, all alike.
+    """
+    assert source.orientation is not None
+    known = np.flatnonzero(np.isfinite(source.orientation[:, 0]) & (source.stamp != NO_STAMP))
+    stamp, order = np.unique(source.stamp[known], return_index=True)
+    told = source.orientation[known][order]
+    return stamp, rotations.vectors(told, rotations.mean(told)) if len(told) else np.empty((0, 3))
+
+
 def _speed(stamp: TimeArray, position: FloatArray) -> FloatArray:
-    """How far a point moves in the 0.15 s around each stamp [m], (n,)."""
+    """How far a point, or a rotation vector, moves in the 0.15 s around each stamp [m or rad], (n,)."""
     half = _WINDOW_NS // 2
     moved = _path(stamp, position, stamp + half) - _path(stamp, position, stamp - half)
     return np.sqrt(np.sum(moved**2, axis=1))
