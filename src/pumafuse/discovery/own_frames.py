@@ -87,16 +87,20 @@ def _own_frame(command: Source, source: Source) -> OwnFrame | None:
     (t, told), (s, seen) = _rows(command, axes), _rows(source, axes)
     late = s - round(speeds.lag * 1e9)
     inside = (late >= t[0]) & (late <= t[-1])
+    if np.count_nonzero(inside) < _FEWEST:
+        return None
     led = _path(t, told, late[inside])
     led, seen = led - led.mean(axis=0), seen[inside] - np.median(seen[inside], axis=0)
-    near = np.abs(seen).max(axis=1) <= 2.0 * np.sqrt(np.sum(led**2, axis=1).max())  # no outlier
+    near = np.abs(seen).max(axis=1) <= 2.0 * np.sqrt(np.sum(led**2, axis=1).max(initial=0.0))  # no outlier
+    if np.count_nonzero(near) < _FEWEST or not led[near].any():
+        return None
     led, seen = led[near] - led[near].mean(axis=0), seen[near] - seen[near].mean(axis=0)
     crossed = _correlations(seen, led)
     moves = [place for place in range(len(axes)) if np.ptp(led[:, place]) > 0.0]
     least = min((float(crossed[place, place]) for place in moves), default=1.0)
     if least >= FOLLOWS:
         return None
-    as_it_is = float(np.sum(seen * led)) / math.sqrt(float(np.sum(seen**2)) * float(np.sum(led**2)))
+    as_it_is = float(np.sum(seen * led)) / max(math.sqrt(float(np.sum(seen**2) * np.sum(led**2))), 1e-30)
     rotation, turned = rotations.aligning(seen, led)
     _, mirrored = rotations.aligning(seen * np.where(np.arange(len(axes)) == 0, -1.0, 1.0), led)
     is_mirrored = 1.0 - mirrored**2 < _EXPLAINS * (1.0 - turned**2)

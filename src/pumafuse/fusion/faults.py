@@ -528,7 +528,7 @@ def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatAr
     def misfit(rotated: FloatArray) -> float:
         left = value - rotated
         late = np.asarray(np.linalg.lstsq(step, left)[0], dtype=np.float64)
-        return float(np.sqrt(np.mean(np.sum((left - step @ late) ** 2, axis=1))))
+        return math.sqrt(float(np.sum((left - step @ late) ** 2)) / len(left))
 
     return turn, misfit(led), misfit(led @ turn.T)
 
