@@ -262,3 +262,27 @@ def test_messages_of_poses_are_poses(kind: str, tmp_path: Path) -> None:
         writer.finish()
     check_follows(survey(tmp_path / "bag.mcap"), tmp_path / "out")
     assert (tmp_path / "out" / "run.toml").read_text().count(f'pose = "{inside}"') == 2
+
+
+def test_a_marker_beside_a_tool_that_turns_is_seen_by_how_it_turns(tmp_path: Path) -> None:
+    """150 mm beside the tool it moves half as far again as the tool; it turns as fast, in whatever frame."""
+    told, seen = both()
+    frame = Rotation.from_euler("xyz", [140.0, -30.0, 65.0], degrees=True)
+    folder = log(tmp_path / "log", quaternion(told), None)
+    columns, _ = poses(late=LATE)
+    t = columns["t_s"]
+    at = frame.inv().apply(places(t - LATE) + turned(t - LATE).apply([0.09, -0.05, 0.11]))
+    marked = frame.inv() * seen * Rotation.from_rotvec([0.4, -1.1, 0.7])
+    places_ = dict(zip(("x_m", "y_m", "z_m"), at.T, strict=True))
+    write(folder / "tracker.csv", {"t_s": t, **places_, **quaternion(marked)})
+    one = survey(folder).own_frames["tracker"]
+    assert one.speeds.correlation > 0.95 and one.speeds.lag == pytest.approx(LATE, abs=0.02)
+
+
+def test_rows_of_a_sensor_that_is_lost_have_no_orientation(tmp_path: Path) -> None:
+    """Zeros are none, and do not make a quaternion something else."""
+    told, seen = both()
+    lost = {name: np.where(np.arange(700) % 100 < 5, 0.0, value) for name, value in quaternion(seen).items()}
+    run, _ = check_follows(survey(log(tmp_path / "log", quaternion(told), lost)), tmp_path / "out")
+    orientation = run.sensors["tracker"].orientation
+    assert orientation is not None and np.isnan(orientation[:, 0]).sum() == 35

@@ -1,6 +1,6 @@
 """Sensors that stand in frames of their own: they are as fast as the commands, and their axes do not follow.
 
-How fast a point moves is the same in every frame.
+How fast a point moves, and how fast a tool turns, is the same in every frame.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from ..space import rotations
 from ..units import DEG
 from .following import Following, following
 
-FOLLOWS = 0.8  # correlation from which speeds follow, and below which an axis does not
+FOLLOWS = 0.8  # correlation below which an axis does not follow
+_AS_FAST = 0.6  # from which speeds do: a marker beside a tool that turns has some of its own
 _WINDOW_NS = 150_000_000  # over which speeds are: long beside noise, short beside a motion
 _EXPLAINS = 0.25  # of what the axes leave of the motion: a frame that is turned leaves less
 _EXCHANGED = 0.9  # correlation from which an axis is another one: then columns are exchanged
@@ -57,12 +58,20 @@ def own_frames(run: Run) -> dict[str, OwnFrame]:
 
 
 def speeds_follow(command: Source, source: Source) -> Following | None:
-    """How the speed of a sensor follows the commanded one; None where one of them is in other axes, or stands still."""
+    """How the speed of a sensor follows the commanded one, of its place or of its turning, whichever does so better.
+
+    None where one of them is in other axes, or stands still.
+    """
     axes = _axes(command, source)
     (t, told), (s, seen) = _rows(command, axes), _rows(source, axes)
     if len(axes) < 2 or min(len(t), len(s)) < _FEWEST:
         return None
-    return following((t, _speed(t, told)), (s, _speed(s, seen)))
+    linear = following((t, _speed(t, told)), (s, _speed(s, seen)))
+    if command.orientation is None or source.orientation is None:
+        return linear
+    (t, told), (s, seen) = _turning(command), _turning(source)
+    turning = following((t, _speed(t, told)), (s, _speed(s, seen))) if min(len(t), len(s)) >= _FEWEST else None
+    return max((one for one in (linear, turning) if one), key=lambda one: one.correlation, default=None)
 
 
 def _axes(command: Source, source: Source) -> list[str]:
@@ -73,21 +82,25 @@ def _axes(command: Source, source: Source) -> list[str]:
 def _own_frame(command: Source, source: Source) -> OwnFrame | None:
     axes = _axes(command, source)
     speeds = speeds_follow(command, source)
-    if speeds is None or speeds.correlation < FOLLOWS:
+    if speeds is None or speeds.correlation < _AS_FAST:
         return None
     (t, told), (s, seen) = _rows(command, axes), _rows(source, axes)
     late = s - round(speeds.lag * 1e9)
     inside = (late >= t[0]) & (late <= t[-1])
+    if np.count_nonzero(inside) < _FEWEST:
+        return None
     led = _path(t, told, late[inside])
     led, seen = led - led.mean(axis=0), seen[inside] - np.median(seen[inside], axis=0)
-    near = np.abs(seen).max(axis=1) <= 2.0 * np.sqrt(np.sum(led**2, axis=1).max())  # no outlier
+    near = np.abs(seen).max(axis=1) <= 2.0 * np.sqrt(np.sum(led**2, axis=1).max(initial=0.0))  # no outlier
+    if np.count_nonzero(near) < _FEWEST or not led[near].any():
+        return None
     led, seen = led[near] - led[near].mean(axis=0), seen[near] - seen[near].mean(axis=0)
     crossed = _correlations(seen, led)
     moves = [place for place in range(len(axes)) if np.ptp(led[:, place]) > 0.0]
     least = min((float(crossed[place, place]) for place in moves), default=1.0)
     if least >= FOLLOWS:
         return None
-    as_it_is = float(np.sum(seen * led)) / math.sqrt(float(np.sum(seen**2)) * float(np.sum(led**2)))
+    as_it_is = float(np.sum(seen * led)) / max(math.sqrt(float(np.sum(seen**2) * np.sum(led**2))), 1e-30)
     rotation, turned = rotations.aligning(seen, led)
     _, mirrored = rotations.aligning(seen * np.where(np.arange(len(axes)) == 0, -1.0, 1.0), led)
     is_mirrored = 1.0 - mirrored**2 < _EXPLAINS * (1.0 - turned**2)
@@ -124,8 +137,20 @@ def _rows(source: Source, axes: Sequence[str]) -> tuple[TimeArray, FloatArray]:
     return stamp, value[known][order]
 
 
+def _turning(source: Source) -> tuple[TimeArray, FloatArray]:
+    """Stamps and orientations, relative to their mean [rad], (n, 3), in the order of time.
+
+    Another frame and a marker that is turned on the tool only turn these vectors, all alike.
+    """
+    assert source.orientation is not None
+    known = np.flatnonzero(np.isfinite(source.orientation[:, 0]) & (source.stamp != NO_STAMP))
+    stamp, order = np.unique(source.stamp[known], return_index=True)
+    told = source.orientation[known][order]
+    return stamp, rotations.vectors(told, rotations.mean(told)) if len(told) else np.empty((0, 3))
+
+
 def _speed(stamp: TimeArray, position: FloatArray) -> FloatArray:
-    """How far a point moves in the 0.15 s around each stamp [m], (n,)."""
+    """How far a point, or a rotation vector, moves in the 0.15 s around each stamp [m or rad], (n,)."""
     half = _WINDOW_NS // 2
     moved = _path(stamp, position, stamp + half) - _path(stamp, position, stamp - half)
     return np.sqrt(np.sum(moved**2, axis=1))

@@ -519,16 +519,16 @@ def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatAr
 
     Where a response does not go, nothing tells of a turn: there it is none.
     """
-    value, led, step = (one - one.mean(axis=0) for one in (value, led, step))
+    value, led, step = (np.asarray(one - one.mean(axis=0), dtype=np.float64) for one in (value, led, step))
     known = np.hstack([led, step])
-    seen = np.linalg.lstsq(known, value)[0][: led.shape[1]]  # value ≈ led · seen + …
+    seen = np.asarray(np.linalg.lstsq(known, value)[0], dtype=np.float64)[: led.shape[1]]  # value ≈ led · seen + …
     moved = led.T @ led
     turn = nearest(seen.T @ moved + _HARDLY * float(np.linalg.norm(moved, 2)) * np.eye(len(moved)))
 
     def misfit(rotated: FloatArray) -> float:
         left = value - rotated
-        left = np.asarray(left - step @ np.linalg.lstsq(step, left)[0], dtype=np.float64)
-        return float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+        late = np.asarray(np.linalg.lstsq(step, left)[0], dtype=np.float64)
+        return math.sqrt(float(np.sum((left - step @ late) ** 2)) / len(left))
 
     return turn, misfit(led), misfit(led @ turn.T)
 
