@@ -42,6 +42,7 @@ _CONVERTED = {
 _TEXTS = (".txt", ".dat", ".lvm")  # tables, too; in a folder they may be anything
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
+_MOST_READ = 2_000  # columns of one of them
 _FEWEST_ROWS = 10
 _UNIT = 1e-3  # from 1, of the length of a quaternion in a text
 _GAP = 5.0  # times the typical interval
@@ -228,7 +229,9 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
     """A part with its clock and its columns, from its table."""
     signals, left_out, joints, times = list[Signal](), dict[str, str](), _joints(table), list[str]()
     counts = {name for name in table.columns if _counts(table, name) is not None}
-    for path, where in product(_numeric_paths(table), _axes_in_rows(table)):
+    paths = list(_numeric_paths(table))
+    paths = paths if len(paths) <= _MOST_COLUMNS else names.likeliest_first(paths)
+    for path, where in product(paths, _axes_in_rows(table)):
         name, listed = _called(path, where), labels.get(leaf(path), [])
         if path in where:
             continue
@@ -257,8 +260,21 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
         clock=clock,
         signals=_with_units([one for one in signals if one.column not in used]),
         left_out={path: why for path, why in left_out.items() if path not in mine},
-        notes=(*notes, *(() if clock is None else clock.notes), *place.notes, *table.notes),
+        notes=(*notes, *(() if clock is None else clock.notes), *place.notes, *table.notes, *_of_many(table)),
     )
+
+
+def _likeliest(columns: Sequence[str]) -> list[str]:
+    """Those of many columns that are read."""
+    return list(columns) if len(columns) <= _MOST_READ else names.likeliest_first(columns)[:_MOST_READ]
+
+
+def _of_many(table: Table) -> list[str]:
+    """What to say of a table of which only some columns are read."""
+    if len(table.names) <= _MOST_READ:
+        return []
+    read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
+    return [f"{table.path.name}: of {len(table.names)} columns {read}"]
 
 
 def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
@@ -611,16 +627,16 @@ def _each_table(path: Path, rate: float) -> Iterator[Part]:
 
 def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
     """A table; of several runs in it the first, of a sensor's rows those that it calls valid; of tf each frame."""
-    fields = _fields(path) if path.suffix == ".parquet" else None
     read = partial(tables.read, path, growing=True, topic=topic)
-    if fields is None:
-        table = read()
-        where = _first_run(table)
-        table = read(where=where) if where else table
-    else:
+    if path.suffix == ".parquet":
+        fields = _fields(path)
         some = [name for name in _EPISODES if name in fields]
         where = _first_run(read(fields=some)) if some else {}
         table = read(fields=fields, where=where)
+    else:
+        fields, table = _likeliest, read(fields=_likeliest)
+        where = _first_run(table)
+        table = read(fields=fields, where=where) if where else table
     notes = [f"has several runs: only {key} = {value!r} is used" for key, value in where.items()]
     if valid := _validity(table) if names.role_of(path.name.split(".")[0]) in ("sensor", "reference") else {}:
         where, rows = {**where, **valid}, table.rows
@@ -693,7 +709,7 @@ def _fields(path: Path) -> list[str]:
         schema = papq.read_schema(path)
     except (ValueError, OSError) as error:
         raise RunError(f"{path}: not a table that can be read: {str(error).splitlines()[0]}") from None
-    return [one.name for one in schema if "binary" not in str(one.type)]
+    return _likeliest([one.name for one in schema if "binary" not in str(one.type)])
 
 
 def _first_run(table: Table) -> dict[str, Any]:
@@ -774,7 +790,7 @@ def _wanted(topic: Topic) -> list[str]:
     streamed = not several and times[1] - times[0] < _STREAM_NS * (topic.count - 1)
     if PATH_TIME in topic.fields and not streamed:
         return [PATH]
-    wanted = [name for name in topic.fields if not names.no_position(name)]
+    wanted = [name for name in _likeliest(topic.fields) if not names.no_position(name)]
     return prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
 
 
