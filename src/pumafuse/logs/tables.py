@@ -202,10 +202,7 @@ def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None
     _asked(path, found.names, fields=asked or (), where={})
     if not where:
         return found
-    whole = pa.table(dict(found.columns))
-    table = _chosen(path, whole, _conditions(path, whole, where))
-    if not table.num_rows:
-        raise _no_row(path, [whole], where)
+    table = _only(path, pa.table(dict(found.columns)), where)
     return replace(found, columns=_named(table), rows=table.num_rows)
 
 
