@@ -48,8 +48,6 @@ _UNIT = 1e-3  # from 1, of the length of a quaternion in a text
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
 _MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
-_EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
-_VALID = names.words_in("valid tracked visible detected")  # columns that say whether a row of a sensor means anything
 _OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
@@ -227,9 +225,8 @@ def _files(log: Path) -> list[Path]:
 
 def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
     """A part with its clock and its columns, from its table."""
-    signals, left_out, joints, times = list[Signal](), dict[str, str](), _joints(table), list[str]()
-    counts = {name for name in table.columns if _counts(table, name) is not None}
-    paths = list(_numeric_paths(table))
+    signals, left_out, times, paths = list[Signal](), dict[str, str](), list[str](), list(_numeric_paths(table))
+    joints, counts = _joints(table, paths), {name for name in table.columns if _counts(table, name) is not None}
     paths = paths if len(paths) <= _MOST_COLUMNS else names.likeliest_first(paths)
     for path, where in product(paths, _axes_in_rows(table)):
         name, listed = _called(path, where), labels.get(leaf(path), [])
@@ -290,16 +287,18 @@ def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) ->
     return [one for one in signals if one.name not in left_out]
 
 
-def _joints(table: Table) -> dict[str, str]:
+def _joints(table: Table, paths: Sequence[str]) -> dict[str, str]:
     """What joints are called, by the column of their position, where columns beside say it.
 
     These are ``joint_names`` of a trajectory or its controller, and ``name0`` as ``rostopic echo -p`` writes it.
     """
-    names_of = _joint_names(table)
+    column = table.columns.get("joint_names")
+    listed: Any = None if column is None or not len(column) else column[0].as_py()
+    joints = cast(list[Any], listed if isinstance(listed, list) else [])
     found = {
-        path: names.plain(names_of[int(match[1])])
-        for path in _numeric_paths(table)
-        if (match := _OF_JOINT.search(path)) and int(match[1]) < len(names_of)
+        path: names.plain(str(joints[int(match[1])]))
+        for path in paths
+        if (match := _OF_JOINT.search(path)) and int(match[1]) < len(joints)
     }
     for name, column in table.columns.items():
         if (match := _NAMED.fullmatch(name)) and pa.types.is_string(column.type) and column.null_count < len(column):
@@ -630,7 +629,7 @@ def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
     read = partial(tables.read, path, growing=True, topic=topic)
     if path.suffix == ".parquet":
         fields = _fields(path)
-        some = [name for name in _EPISODES if name in fields]
+        some = [name for name in names.EPISODES if name in fields]
         where = _first_run(read(fields=some)) if some else {}
         table = read(fields=fields, where=where)
     else:
@@ -693,7 +692,7 @@ def _perhaps(path: Path, rate: float) -> Iterator[Part]:
 def _validity(table: Table) -> dict[str, Any]:
     """Which rows are valid, where a column of 0 and 1, or of false and true, says it."""
     for name, column in table.columns.items():
-        if _VALID.isdisjoint(names.words(name)) or not (
+        if names.VALID.isdisjoint(names.words(name)) or not (
             pa.types.is_boolean(column.type) or pa.types.is_integer(column.type)
         ):
             continue
@@ -714,7 +713,7 @@ def _fields(path: Path) -> list[str]:
 
 def _first_run(table: Table) -> dict[str, Any]:
     """Which rows are the first run, where a column tells several apart."""
-    for name in _EPISODES:
+    for name in names.EPISODES:
         if name not in table.columns:
             continue
         values = pc.unique(table.columns[name].drop_null())
@@ -808,13 +807,6 @@ def no_commands(parts: Iterable[Part]) -> str:
             )
         found += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
     return "; ".join(printable(one, 300) for one in found)
-
-
-def _joint_names(table: Table) -> list[str]:
-    """The joints of a trajectory."""
-    column = table.columns.get("joint_names")
-    listed: Any = None if column is None or not len(column) else column[0].as_py()
-    return [str(name) for name in cast(list[Any], listed)] if isinstance(listed, list) else []
 
 
 def period_of(command: Source) -> float:

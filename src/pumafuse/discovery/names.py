@@ -70,7 +70,9 @@ _TIMES = frozenset(one for one in _TIME_UNITS if len(one) > 2) | words_in(
 )
 _COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
 _WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")
-_TELLING = _TIMES | _COUNTERS | _WHOSE | words_in("episode run trial valid tracked visible detected")
+EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
+VALID = words_in("valid tracked visible detected")  # of columns that say whether a row of a sensor means anything
+_TELLING = _TIMES | _COUNTERS | _WHOSE | VALID | words_in("episode run trial")
 _DIGITS = "0123456789"
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
