@@ -93,6 +93,23 @@ def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")
     return found
 
 
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_among_thousands_of_columns_names_tell_who_is_who(tmp_path: Path, kind: str) -> None:
+    """What is found is what is found in a file of the three columns that are called so."""
+    t, u, z = recorded_at_once()
+    told = {"cmd_x": u[:, 0], "meas_x": z[:, 0], "time": t}
+    others = {f"c{n}": np.full(len(t), n % 7) + t for n in range(2_100)}
+    found = list[Survey]()
+    for name, columns in (("few", told), ("many", {**others, **told})):
+        file = tmp_path / f"{name}.{kind}"
+        write(file, columns) if kind == "csv" else papq.write_table(pa.table(columns), file)
+        found.append(survey(file))
+    few, many = found
+    assert many.relations == few.relations
+    assert (many.run.command.values["x"] == few.run.command.values["x"]).all()
+    assert "of 2103 columns the 2000 are read whose names tell most" in many.parts[0].notes[-1]
+
+
 @pytest.mark.parametrize(
     ("name", "stamps", "unit"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import random
 from collections.abc import Callable
 from decimal import Decimal
@@ -330,6 +331,24 @@ def test_a_header_may_be_longer_than_what_is_looked_at(tmp_path: Path) -> None:
     names = [f"sensor{n}.position_mm" for n in range(10_000)]
     text = f"{';'.join(names)}\n" + f"{';'.join(['0,5'] * len(names))}\n" * 3
     assert list(csv(tmp_path, text).columns) == names
+
+
+@pytest.mark.parametrize("ending", ["csv", "jsonl"])
+def test_of_a_wide_text_what_is_asked_for_is_read(tmp_path: Path, ending: str) -> None:
+    """Its columns are those of a reading of all, also the second of a name; and an absent one is told among all."""
+    file, names = tmp_path / f"log.{ending}", [f"c{n}" for n in range(2_500)] + ["x", "x", ""]
+    if ending == "csv":
+        file.write_text("\n".join(",".join(row) for row in (names, *(["1.5"] * 2_502 + ["7"],) * 3)) + "\n")
+    else:
+        file.write_text((json.dumps(dict.fromkeys([*names[:-3], "x", "x.1", "column 2503"], 1.5)) + "\n") * 3)
+    whole = tables.read(file)
+    for fields in (["x.1", "c7", "column 2503"], lambda known: [known[-1], "c7", "x.1"]):
+        some = tables.read(file, fields=fields, where={"c1": 1.5})
+        assert set(some.columns) == {"c1", "c7", "x.1", "column 2503"}
+        assert (some.names, some.rows, some.notes) == (whole.names, 3, whole.notes)
+        assert all(some.columns[name].equals(whole.columns[name]) for name in some.columns)
+    with pytest.raises(UnknownNameError, match="did you mean 'c17'"):
+        tables.read(file, fields=["c17_"])
 
 
 def test_lines_are_counted_from_the_top_of_the_file(tmp_path: Path) -> None:

@@ -44,13 +44,12 @@ _CONVERTED = {
 _TEXTS = (".txt", ".dat", ".lvm")  # tables, too; in a folder they may be anything
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
+_MOST_READ = 2_000  # columns of one of them
 _FEWEST_ROWS = 10
 _UNIT = 1e-3  # from 1, of the length of a quaternion in a text
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
 _MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
-_EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
-_VALID = names.words_in("valid tracked visible detected")  # columns that say whether a row of a sensor means anything
 _OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
@@ -230,12 +229,13 @@ def _files(log: Path) -> list[Path]:
 
 def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
     """A part with its clock and its columns, from its table."""
-    signals, left_out, joints, times = list[Signal](), dict[str, str](), _joints(table), list[str]()
-    counts = {name for name in table.columns if _counts(table, name) is not None}
-    paths, rows = list(_numeric_paths(table)), _axes_in_rows(table)
+    signals, left_out, times, paths = list[Signal](), dict[str, str](), list[str](), list(_numeric_paths(table))
+    joints, counts = _joints(table, paths), {name for name in table.columns if _counts(table, name) is not None}
+    rows = _axes_in_rows(table)
     told = attitudes_in(table, paths) if rows == [{}] else []
     attitudes = [one for one in told if one.turns]
     turning = {path for one in attitudes for path in one.columns.columns}
+    paths = paths if len(paths) <= _MOST_COLUMNS else names.likeliest_first(paths)
     for path, where in product(paths, rows):
         name, listed = _called(path, where), labels.get(leaf(path), [])
         if path in where or path in turning:
@@ -267,7 +267,7 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
         clock=clock,
         signals=_with_units([one for one in signals if one.column not in used]),
         left_out={path: why for path, why in left_out.items() if path not in mine},
-        notes=(*notes, *(() if clock is None else clock.notes), *place.notes, *table.notes),
+        notes=(*notes, *(() if clock is None else clock.notes), *place.notes, *table.notes, *_of_many(table)),
         attitudes=tuple(one for one in attitudes if one.role_words in beside),
     )
 
@@ -279,6 +279,19 @@ def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
             known = {"unit": one.place_unit, "basis": "name"} if one.place_unit else {}
             return replace(signal, axis=axis, **known)
     return signal
+
+
+def _likeliest(columns: Sequence[str]) -> list[str]:
+    """Those of many columns that are read."""
+    return list(columns) if len(columns) <= _MOST_READ else names.likeliest_first(columns)[:_MOST_READ]
+
+
+def _of_many(table: Table) -> list[str]:
+    """What to say of a table of which only some columns are read."""
+    if len(table.names) <= _MOST_READ:
+        return []
+    read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
+    return [f"{table.path.name}: of {len(table.names)} columns {read}"]
 
 
 def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
@@ -294,16 +307,18 @@ def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) ->
     return [one for one in signals if one.name not in left_out]
 
 
-def _joints(table: Table) -> dict[str, str]:
+def _joints(table: Table, paths: Sequence[str]) -> dict[str, str]:
     """What joints are called, by the column of their position, where columns beside say it.
 
     These are ``joint_names`` of a trajectory or its controller, and ``name0`` as ``rostopic echo -p`` writes it.
     """
-    names_of = _joint_names(table)
+    column = table.columns.get("joint_names")
+    listed: Any = None if column is None or not len(column) else column[0].as_py()
+    joints = cast(list[Any], listed if isinstance(listed, list) else [])
     found = {
-        path: names.plain(names_of[int(match[1])])
-        for path in _numeric_paths(table)
-        if (match := _OF_JOINT.search(path)) and int(match[1]) < len(names_of)
+        path: names.plain(str(joints[int(match[1])]))
+        for path in paths
+        if (match := _OF_JOINT.search(path)) and int(match[1]) < len(joints)
     }
     for name, column in table.columns.items():
         if (match := _NAMED.fullmatch(name)) and pa.types.is_string(column.type) and column.null_count < len(column):
@@ -631,16 +646,16 @@ def _each_table(path: Path, rate: float) -> Iterator[Part]:
 
 def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
     """A table; of several runs in it the first, of a sensor's rows those that it calls valid; of tf each frame."""
-    fields = _fields(path) if path.suffix == ".parquet" else None
     read = partial(tables.read, path, growing=True, topic=topic)
-    if fields is None:
-        table = read()
-        where = _first_run(table)
-        table = read(where=where) if where else table
-    else:
-        some = [name for name in _EPISODES if name in fields]
+    if path.suffix == ".parquet":
+        fields = _fields(path)
+        some = [name for name in names.EPISODES if name in fields]
         where = _first_run(read(fields=some)) if some else {}
         table = read(fields=fields, where=where)
+    else:
+        fields, table = _likeliest, read(fields=_likeliest)
+        where = _first_run(table)
+        table = read(fields=fields, where=where) if where else table
     notes = [f"has several runs: only {key} = {value!r} is used" for key, value in where.items()]
     if valid := _validity(table) if names.role_of(path.name.split(".")[0]) in ("sensor", "reference") else {}:
         where, rows = {**where, **valid}, table.rows
@@ -697,7 +712,7 @@ def _perhaps(path: Path, rate: float) -> Iterator[Part]:
 def _validity(table: Table) -> dict[str, Any]:
     """Which rows are valid, where a column of 0 and 1, or of false and true, says it."""
     for name, column in table.columns.items():
-        if _VALID.isdisjoint(names.words(name)) or not (
+        if names.VALID.isdisjoint(names.words(name)) or not (
             pa.types.is_boolean(column.type) or pa.types.is_integer(column.type)
         ):
             continue
@@ -713,12 +728,12 @@ def _fields(path: Path) -> list[str]:
         schema = papq.read_schema(path)
     except (ValueError, OSError) as error:
         raise RunError(f"{path}: not a table that can be read: {str(error).splitlines()[0]}") from None
-    return [one.name for one in schema if "binary" not in str(one.type)]
+    return _likeliest([one.name for one in schema if "binary" not in str(one.type)])
 
 
 def _first_run(table: Table) -> dict[str, Any]:
     """Which rows are the first run, where a column tells several apart."""
-    for name in _EPISODES:
+    for name in names.EPISODES:
         if name not in table.columns:
             continue
         values = pc.unique(table.columns[name].drop_null())
@@ -794,7 +809,7 @@ def _wanted(topic: Topic) -> list[str]:
     streamed = not several and times[1] - times[0] < _STREAM_NS * (topic.count - 1)
     if PATH_TIME in topic.fields and not streamed:
         return [PATH]
-    wanted = [name for name in topic.fields if may_be_part(name) or not names.no_position(name)]
+    wanted = [name for name in _likeliest(topic.fields) if may_be_part(name) or not names.no_position(name)]
     return prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
 
 
@@ -812,13 +827,6 @@ def no_commands(parts: Iterable[Part]) -> str:
             )
         found += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
     return "; ".join(printable(one, 300) for one in found)
-
-
-def _joint_names(table: Table) -> list[str]:
-    """The joints of a trajectory."""
-    column = table.columns.get("joint_names")
-    listed: Any = None if column is None or not len(column) else column[0].as_py()
-    return [str(name) for name in cast(list[Any], listed)] if isinstance(listed, list) else []
 
 
 def period_of(command: Source) -> float:

@@ -219,14 +219,13 @@ def _start(found: Survey, axis: str, name: str, one: Following, misfit: float, t
     command, sensors = found.run.command, {REFERENCE: found.run.reference, **found.run.sensors}
     source = sensors[name]
     assert source is not None
-    told, seen = np.isfinite(command.values[axis]), np.isfinite(source.values[axis])
-    given, stamp = command.stamp[told], source.stamp[seen]
+    (given, told), (stamp, seen) = command.series(axis), source.series(axis)
     near = int(np.argmin(np.abs(stamp - given[0])))
     if stamp[near] - given[0] > _SOON * max(one.lag, 0.0) * 1e9:
         return None
-    level = math.copysign(1.0, one.slope) * (float(source.values[axis][seen][near]) - one.offset)
+    level = math.copysign(1.0, one.slope) * (float(seen[near]) - one.offset)
     unsure = _AWAY * (misfit + one.scatter + one.resolution) + abs(abs(one.slope) - 1.0) * travel
-    return level if abs(level - float(command.values[axis][told][0])) > unsure else None
+    return level if abs(level - float(told[0])) > unsure else None
 
 
 def _gate(value: FloatArray) -> float:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import BoolArray, FloatArray, IntArray, TimeArray, median
 
 SMALL_SHIFT = 0.15  # s; a wrong delay, lag or latency may explain as much
 _FARTHEST, _SHARE = 30.0, 0.75  # shifts that are looked for: s, and share of the run
@@ -199,11 +199,6 @@ def slope_of_pieces(measured: FloatArray, led: FloatArray) -> tuple[float, float
     return slope, math.inf if few else float(np.linalg.norm(along - slope * power)) / total
 
 
-def middle(values: FloatArray) -> float:
-    """The median, or of an even number the upper one of the two in the middle: numpy's takes five times as long."""
-    return float(np.partition(values, len(values) // 2)[len(values) // 2])
-
-
 def without_spikes(value: FloatArray) -> BoolArray:
     """Values that are no single or double outliers, far from the median of the five around them, (n,).
 
@@ -216,7 +211,7 @@ def without_spikes(value: FloatArray) -> BoolArray:
     low, high = np.maximum(np.minimum(a, b), np.minimum(c, d)), np.minimum(np.maximum(a, b), np.maximum(c, d))
     around = np.maximum(np.minimum(low, high), np.minimum(e, np.maximum(low, high)))  # the median of five
     far = np.abs(value - around)
-    spikes = far > _SPIKE * middle(far)
+    spikes = far > _SPIKE * median(far)
     return ~spikes if np.count_nonzero(spikes) < _MOST_SPIKES * len(value) else np.ones(len(value), dtype=np.bool_)
 
 

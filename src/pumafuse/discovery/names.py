@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container
+from collections import Counter
+from collections.abc import Container, Iterable
 from typing import Literal, TypeAlias
 
 from ..logs.columns import leaf
@@ -69,6 +70,9 @@ _TIMES = frozenset(one for one in _TIME_UNITS if len(one) > 2) | words_in(
 )
 _COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
 _WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")
+EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
+VALID = words_in("valid tracked visible detected")  # of columns that say whether a row of a sensor means anything
+_TELLING = _TIMES | _COUNTERS | _WHOSE | VALID | words_in("episode run trial")
 _DIGITS = "0123456789"
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
@@ -144,6 +148,19 @@ def is_counter(column: str) -> bool:
 def tells_apart(column: str) -> bool:
     """Whether a column of numbers is called as those are that say whose a row is."""
     return not _WHOSE.isdisjoint(words(leaf(column)))
+
+
+def likeliest_first(columns: Iterable[str]) -> list[str]:
+    """Columns in the order in which their names tell something: who, as many of each role, or when; then the others."""
+    count = Counter[str]()
+
+    def place(column: str) -> tuple[bool, int]:
+        found = words(leaf(column))
+        about = "when" if not _TELLING.isdisjoint(found) else _role(found, frozenset()) or ""
+        count[about] += 1
+        return not about, count[about]
+
+    return sorted(columns, key=place)
 
 
 def no_position(column: str) -> str | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from msgspec import structs
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import NO_STAMP
 from ..errors import RunError, printable
 from ..logs.axes import FARTHEST_TURN
 from ..logs.frames import CARTESIAN
@@ -252,7 +252,7 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
     one, other = command.part.clock, stream.part.clock
     if not axes or one is None or other is None or (one.time == other.time and command.part.file == stream.part.file):
         return stream
-    led, measured = ({axis: _rows(rows, axis) for axis in axes} for rows in (told, source))
+    led, measured = ({axis: rows.series(axis) for axis in axes} for rows in (told, source))
     if min(len(stamp) for stamp, _ in (*led.values(), *measured.values())) < _FEWEST:
         return stream
     if (late := far_shift(led, measured, _NEAR)) is None:
@@ -281,13 +281,6 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
         doubt=doubt,
     )
     return replace(stream, part=replace(stream.part, clock=shifted))
-
-
-def _rows(source: Source, axis: str) -> tuple[TimeArray, FloatArray]:
-    """Stamps, ascending, and values of the rows that have both."""
-    there = np.isfinite(source.values[axis]) & (source.stamp != NO_STAMP)
-    order = np.argsort(source.stamp[there], kind="stable")
-    return source.stamp[there][order], source.values[axis][there][order]
 
 
 def _streams(part: Part) -> list[Stream]:

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import FloatArray
-from .matching import middle, slope_of_pieces
+from ..arrays import FloatArray, median
+from .matching import slope_of_pieces
 
 FOLLOWS = 0.95  # correlation from which there is nothing to ask
 GAIN = 3.0  # factor on a motion up to which it may be a gain
@@ -50,8 +50,8 @@ class Tracking:
         At rest all is near: what is off by no more than the motion, as a wrong delay makes it, is no outlier.
         """
         distance = self.measured - self.led
-        distance = np.abs(distance - middle(distance))
-        near = distance <= max(10.0 * middle(distance), float(np.ptp(self.led))) + 1e-12
+        distance = np.abs(distance - median(distance))
+        near = distance <= max(10.0 * median(distance), float(np.ptp(self.led))) + 1e-12
         kept = slice(None) if near.all() else near
         return self.time[kept], self.measured[kept], self.led[kept], self.before[kept]
 

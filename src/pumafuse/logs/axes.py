@@ -154,7 +154,4 @@ def _commanded(command: Source, source: Source) -> FloatArray:
     """Commanded tangential position [m] at each row of a source, (rows,)."""
     if "tangential" not in command.values:
         raise RunError(f"{command.label}: {source.label} is in x and y, the commands are not; give them in x and y too")
-    tangential = command.values["tangential"]
-    usable = np.isfinite(tangential) & (command.stamp != NO_STAMP)
-    order = np.argsort(command.stamp[usable], kind="stable")
-    return np.interp(source.stamp, command.stamp[usable][order], tangential[usable][order])
+    return np.interp(source.stamp, *command.series("tangential"))

@@ -459,9 +459,9 @@ def prefixes(paths: Sequence[str]) -> list[str]:
     return list(found)
 
 
-def wanted(name: str, fields: Sequence[str] | None) -> bool:
-    """Whether a column is, or holds, one of the fields that are asked for."""
-    return fields is None or any(path == name or path.startswith((f"{name}.", f"{name}[")) for path in fields)
+def holders(fields: Iterable[str]) -> set[str]:
+    """The names of columns that are, or hold, one of the fields that are asked for."""
+    return {path[:end] for path in fields for end in (*_ends(path), len(path))}
 
 
 def numeric_paths(value: Any, path: str = "", names: Any = None) -> Iterator[str]:
@@ -501,8 +501,13 @@ def find(columns: Columns, path: str, where: str, *, part: bool = False) -> pa.C
 
 def longest(columns: Container[str], path: str) -> str | None:
     """The longest name that is the path, or that the path goes on from."""
-    ends = [len(path), *(place for place in range(len(path) - 1, -1, -1) if path[place] in ".[")]
+    ends = (len(path), *reversed(_ends(path)))
     return next((path[:end] for end in ends if path[:end] in columns), None)
+
+
+def _ends(path: str) -> list[int]:
+    """Where names of columns may end within a field path."""
+    return [place for place, letter in enumerate(path) if letter in ".["]
 
 
 def joined(tables: Iterable[pa.Table], what: str) -> pa.Table | None:

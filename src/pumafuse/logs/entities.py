@@ -27,7 +27,7 @@ import pyarrow.compute as pc
 
 from ..errors import RunError, one_line, unknown_part
 from ..units import TIMES
-from .columns import LOG_TIME, Table, Topic, joined, numeric_paths, wanted
+from .columns import LOG_TIME, Table, Topic, holders, joined, numeric_paths
 
 _LARGE_CELL = 4096  # bytes: images and the like hold no positions
 _ROW = "rerun.controls.RowId"  # in the order of logging
@@ -134,11 +134,12 @@ def _parts(
     chunks: Iterable[tuple[str, pa.Table]], place: str, fields: Sequence[str] | None, known: dict[str, set[str]]
 ) -> Iterator[pa.Table]:
     """The chunks of an entity, with the fields asked for; the components of all entities go into ``known``."""
+    asked = None if fields is None else holders(fields)
     for name, chunk in chunks:
         components = _components(chunk)
         known.setdefault(name, set()).update(components)
         if name == place:
-            unwanted = [one for one in components if not (wanted(one, fields) or wanted(_last(one), fields))]
+            unwanted = [one for one in components if asked is not None and asked.isdisjoint((one, _last(one)))]
             kept = chunk.drop_columns(unwanted)
             yield kept.take(pc.sort_indices(kept[_ROW]))  # a copy: what was dropped leaves the memory
 

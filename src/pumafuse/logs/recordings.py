@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import pyarrow.compute as pc
 from ..errors import one_line, reason, unknown_part
 from . import bags, entities, messages
 from .bags import Channel, Faults, Message, Record
-from .columns import LOG_TIME, Table, Topic, joined, numeric_paths, wanted
+from .columns import LOG_TIME, Table, Topic, holders, joined, numeric_paths
 
 _BATCH_ROWS, _BATCH_BYTES = 4096, 16 << 20  # of messages that are in memory as Python objects
 
@@ -94,9 +93,10 @@ def _rows(
     if first is None:
         return []
     found = chain([first], found)
-    if fields is not None and list(first[1]) == [messages.TRANSFORMS] and not wanted(messages.TRANSFORMS, fields):
+    asked = holders(fields or ())
+    if fields is not None and list(first[1]) == [messages.TRANSFORMS] and messages.TRANSFORMS not in asked:
         return messages.each_transform(found)
-    if fields is not None and messages.PATH not in first[1] and wanted(messages.PATH, fields):
+    if messages.PATH not in first[1] and messages.PATH in asked:
         return messages.each_place(found, faults)
     return found
 
@@ -105,15 +105,11 @@ def _batches(
     messages: Iterable[tuple[Record, Message]], fields: Sequence[str] | None, names: dict[str, None]
 ) -> Iterator[pa.Table]:
     """Tables of a few messages each, with the fields asked for; ``names`` gets those of all fields of the first."""
-
-    @lru_cache
-    def is_wanted(name: str) -> bool:
-        return wanted(name, fields)
-
+    asked = None if fields is None else holders(fields)
     rows, times, size = list[Message](), list[int | None](), 0
     for record, message in messages:
         names.update({} if names else dict.fromkeys(message))
-        rows.append({name: bags.plain(value) for name, value in message.items() if is_wanted(name)})
+        rows.append({name: bags.plain(value) for name, value in message.items() if asked is None or name in asked})
         times.append(record.time if 0 <= record.time < 2**63 else None)
         size += len(record.payload)
         if len(rows) == _BATCH_ROWS or size > _BATCH_BYTES:

@@ -94,6 +94,16 @@ class Source:
             known.append(~np.isnan(self.orientation[:, 0]))
         return np.any(known, axis=0)
 
+    def ordered(self, axis: str) -> IntArray:
+        """The rows that have a stamp and a value of an axis, by stamp, (n,)."""
+        known = np.flatnonzero(np.isfinite(self.values[axis]) & (self.stamp != NO_STAMP))
+        return known[np.argsort(self.stamp[known], kind="stable")]
+
+    def series(self, axis: str) -> tuple[TimeArray, FloatArray]:
+        """Stamps and values of these rows, (n,) each."""
+        rows = self.ordered(axis)
+        return self.stamp[rows], self.values[axis][rows]
+
     def beside(self, command: Source, turns: Mapping[str, float]) -> Source:
         """The source with angles that go on moved by whole turns to where they are commanded.
 
@@ -103,13 +113,10 @@ class Source:
         """
         values = dict(self.values)
         for axis in turns.keys() & values.keys() & command.values.keys():
-            turn = turns[axis]
-            told, mine = (np.isfinite(one.values[axis]) & (one.stamp != NO_STAMP) for one in (command, self))
-            if not (told.any() and mine.any()):
-                continue
-            order = np.argsort(command.stamp[told], kind="stable")
-            there = np.interp(self.stamp[mine], command.stamp[told][order], command.values[axis][told][order])
-            values[axis] = values[axis] - turn * np.round(np.median(values[axis][mine] - there) / turn)
+            turn, told, (stamp, mine) = turns[axis], command.series(axis), self.series(axis)
+            if len(told[0]) and len(stamp):
+                apart = np.median(mine - np.interp(stamp, *told))
+                values[axis] = values[axis] - turn * np.round(apart / turn)
         return replace(self, values=values)
 
     def pivoted(self) -> Source:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray, median
+from ..arrays import BoolArray, FloatArray, IntArray, TimeArray, median
 from ..units import TURN
 from .run import Source, note_rows
 
@@ -55,22 +55,15 @@ def without_stray_values(command: Source, sensors: Sequence[Source], notes: list
     """
     values, left_out = dict(command.values), np.zeros(len(command.stamp), dtype=np.bool_)
     for axis, value in command.values.items():
-        told = _in_order(command.stamp, value)
-        measured = [_in_order(one.stamp, one.values[axis])[1:] for one in sensors if axis in one.values]
+        told = command.ordered(axis)
+        measured = [one.series(axis) for one in sensors if axis in one.values]
         stray = np.zeros(len(value), dtype=np.bool_)
-        stray[told[0]] = _stray(*told[1:], measured)
+        stray[told] = _stray(command.stamp[told], value[told], measured)
         if stray.any():
             values[axis], left_out = np.where(stray, np.nan, value), left_out | stray
             what = f"a value of {axis} that leaps away from its neighbours and back, which nothing follows: stray"
             note_rows(notes, command.label, stray, f"{what}, not used")
     return replace(command, values=values, stray=left_out) if left_out.any() else command
-
-
-def _in_order(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, TimeArray, FloatArray]:
-    """The rows with both, by stamp; their stamps and values."""
-    rows = np.flatnonzero(np.isfinite(value) & (stamp != NO_STAMP))
-    rows = rows[np.argsort(stamp[rows], kind="stable")]
-    return rows, stamp[rows], value[rows]
 
 
 def _stray(stamp: TimeArray, value: FloatArray, sensors: Sequence[tuple[TimeArray, FloatArray]]) -> BoolArray:

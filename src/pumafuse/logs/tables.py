@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -29,6 +29,8 @@ from . import formats
 from .columns import BLANK, NUMBER, Table, find, longest, prefixes
 
 Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
+Choice: TypeAlias = Callable[[Sequence[str]], Sequence[str]]  # of some among all names of columns
+_Text: TypeAlias = tuple[pa.Table, list[str], list[str]]  # a table, names of all its columns, what was wrong with it
 
 _COMPRESSED = {".gz", ".bz2", ".lz4", ".zst", ".br"}  # a torn one cannot be read at all
 _RECORDINGS = {".mcap", ".bag", ".db3", ".rrd"}
@@ -37,6 +39,7 @@ _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _COMPRESSION = "zstd"
 _SOME = 8  # values in an error
 _HEAD = 1 << 16  # bytes of a text, among which its header is
+_WIDE = 2_000  # columns of a text, beyond which only those asked for are read: pyarrow needs 10 to 20 kB for each
 _BESIDE = 3  # rows of numbers that make the line above them a header
 _COMMENT = re.compile(r"\s*(#|%|//)\s*")
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
@@ -60,7 +63,7 @@ def read(
     path: Path,
     *,
     growing: bool = False,
-    fields: Sequence[str] | None = None,
+    fields: Sequence[str] | Choice | None = None,
     where: Where | None = None,
     topic: str = "",
     entity: str = "",
@@ -71,7 +74,8 @@ def read(
         path: The file, or the folder of a bag.
         growing: Whether it may still be growing, or its writer may have been killed. A last line of a CSV without its
             line break may then be torn within a number: it is left out, and noted.
-        fields: Columns and field paths that will be asked for; only of CSV others are read, too. All for None.
+        fields: Columns and field paths that will be asked for; of a text that is not wide others are read, too. Of a
+            text also what chooses them among its names. All for None.
         where: Which rows to read; of Parquet, parts of the file that can have none are skipped.
         topic: Which part of a recording is the table; which of several tables in a file.
         entity: The same in a Rerun recording.
@@ -79,9 +83,9 @@ def read(
     Raises:
         RunError: The file is absent, empty, or not inside what its ending says; or ``where`` leaves no row.
     """
-    where = where or {}
+    where, listed = where or {}, None if callable(fields) else fields
     if is_recording(path):
-        return _recording(path, topic, entity, fields, where)
+        return _recording(path, topic, entity, listed, where)
     of_several = path.name.endswith(formats.ENDINGS)
     if (topic and not of_several) or entity:
         key = "topic" if topic else "entity"
@@ -91,10 +95,11 @@ def read(
         )
     with _one_line(path):
         if path.suffix == ".parquet":
-            (table, names), notes = _parquet(path, fields, where), list[str]()
+            (table, names), notes = _parquet(path, listed, where), list[str]()
         else:
-            whole, notes = _of_several(path, topic) if of_several else _of_text(path, growing)
-            table, names = _only(path, whole, where), whole.column_names
+            choice = None if fields is None else partial(_asked, path, fields=fields, where=where)
+            whole, names, notes = _of_several(path, topic, choice) if of_several else _of_text(path, growing, choice)
+            table = _only(path, whole, where)
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
     notes += [
@@ -125,8 +130,8 @@ def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
     """
     with _one_line(path), _opened(path) as file:
         names = tuple(file.schema.column(place).path for place in range(len(file.schema)))
-        wanted = _wanted(path, file, fields, {})
-        for part in _parts(file, wanted, None) if file.metadata.num_rows else [file.schema_arrow.empty_table()]:
+        wanted, empty = _wanted(path, file, fields, {})
+        for part in _parts(file, wanted, None) if file.metadata.num_rows else [empty]:
             yield Table(path, _named(part), part.num_rows, (), names)
 
 
@@ -194,16 +199,10 @@ def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None
         raise RunError(f"{path}: of such a file the key is '{key}', not '{wrong}'")
     asked = None if fields is None else [*fields, *where]
     found = recordings.read(path, name, None if asked is None else prefixes(asked))
-    known = set(found.names)
-    for one in asked or ():
-        if longest(known, one) is None:
-            raise UnknownNameError(str(path), "column", one, found.names)
+    _asked(path, found.names, fields=asked or (), where={})
     if not where:
         return found
-    whole = pa.table(dict(found.columns))
-    table = _chosen(path, whole, _conditions(path, whole, where))
-    if not table.num_rows:
-        raise _no_row(path, [whole], where)
+    table = _only(path, pa.table(dict(found.columns)), where)
     return replace(found, columns=_named(table), rows=table.num_rows)
 
 
@@ -218,13 +217,26 @@ def _text(path: Path) -> bytes:
     return content
 
 
-def _of_several(path: Path, name: str) -> tuple[pa.Table, list[str]]:
+def _asked(path: Path, names: Sequence[str], *, fields: Sequence[str] | Choice, where: Where) -> list[str]:
+    """The names of columns, whole or to a field, that have to be read.
+
+    Raises:
+        UnknownNameError: A field is absent: that is reported now, while all names are known.
+    """
+    asked, known = [*(fields(names) if callable(fields) else fields), *where], set(names)
+    for one in asked:
+        if longest(known, one) is None:
+            raise UnknownNameError(str(path), "column", one, names)
+    return prefixes(asked)
+
+
+def _of_several(path: Path, name: str, choice: Choice | None) -> _Text:
     """A table of a file that may have several."""
     found = formats.table(path, name)
-    return _of_csv(path, found) if isinstance(found, bytes) else (found, [])
+    return _of_csv(path, found, choice) if isinstance(found, bytes) else (found, found.column_names, [])
 
 
-def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
+def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
     """The table in a text; lines with the wrong number of cells, and a torn last line, are left out and noted."""
     text, notes = _text(path), list[str]()
     if growing and b"\n" in text and not text.endswith((b"\n", b"\r")) and path.suffix not in _COMPRESSED:
@@ -232,30 +244,38 @@ def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
         torn = "the last line has no end and may be torn: left out (if it is whole, end it with a line break)"
         notes = [f"{path.name}: {torn}"]
     if path.name.endswith(JSON_LINES):
-        return pajson.read_json(pa.BufferReader(text), pajson.ReadOptions(use_threads=False)), notes
-    table, more = _of_csv(path, text)
-    return table, [*more, *notes]
+        block = len(text) if text.find(b"\n") > _HEAD else None  # no row may be longer than a block
+        table = pajson.read_json(pa.BufferReader(text), pajson.ReadOptions(use_threads=False, block_size=block))
+        names = table.column_names
+        used = None if choice is None or len(names) <= _WIDE else set(choice(names))
+        return table if used is None else table.select([one for one in names if one in used]), names, notes
+    table, names, more = _of_csv(path, text, choice)
+    return table, names, [*more, *notes]
 
 
-def _of_csv(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
+def _of_csv(path: Path, text: bytes, choice: Choice | None) -> _Text:
     """The table in a CSV text; lines with the wrong number of cells are left out and noted."""
     try:
-        table, more = _parsed(path, text)
-        _ = table.column_names  # only now it is seen whether they are UTF-8
+        table, names, more = _parsed(path, text, choice)
     except (UnicodeDecodeError, pa.ArrowInvalid) as error:
         if b"\0" in text or not (isinstance(error, UnicodeDecodeError) or "UTF8" in str(error)):
             raise
-        table, more = _parsed(path, text.decode("cp1252").encode())
+        table, names, more = _parsed(path, text.decode("cp1252").encode(), choice)
         more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
-    names = [name or _column(n) for n, name in enumerate(table.column_names)]
-    if repeated := sorted(_repeated(names)):
-        twice = ", ".join(map(shortened, repeated))
-        more = [f"{path.name}: headers that are there twice: {twice}; the second of each is called .1", *more]
-        count = Counter[str]()
-        for place, name in enumerate(names):
-            names[place] = f"{name}.{count[name]}" if count[name] else name  # as pandas calls them
-            count[name] += 1
-    return pa.table([_listed(one) for one in table.columns], names), more
+    found, twice = _numbered(path, table.column_names)
+    return pa.table([_listed(one) for one in table.columns], found), names or found, [*twice, *more]
+
+
+def _numbered(path: Path, given: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Names of columns of which none is empty or there twice, and a note on those that were there twice."""
+    names, count = [name or _column(place) for place, name in enumerate(given)], Counter[str]()
+    if not (repeated := sorted(_repeated(names))):
+        return names, []
+    for place, name in enumerate(names):
+        names[place] = f"{name}.{count[name]}" if count[name] else name  # as pandas calls them
+        count[name] += 1
+    twice = ", ".join(map(shortened, repeated))
+    return names, [f"{path.name}: headers that are there twice: {twice}; the second of each is called .1"]
 
 
 def _listed(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -277,8 +297,8 @@ def _listed(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return pa.chunked_array([pa.ListArray.from_arrays(lists.offsets, elements, mask=lists.is_null())])
 
 
-def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
-    """The table in a CSV text, and what was left out of it."""
+def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
+    """The table in a CSV text, what was left out of it, and, where only some columns are read, the names of all."""
     if (match := _BARE_LIST.search(text, 0, _HEAD)) and b'"' not in text[: match.start()]:
         text = _BARE_LIST.sub(rb'"\1"', text)
     text = _transforms_apart(text) if text.startswith(_TRANSFORMS) else text
@@ -287,6 +307,11 @@ def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
         text = re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)|(?<=[ \t])[ \t]+", b"", text)
     wrong: list[pacsv.InvalidRow] = []
     notes = [f"{path.name}: {counted(layout.above, 'line')} above the header left out"] if layout.above else []
+    names, used = list[str](), list[str]()
+    if choice is not None and layout.names is not None and len(layout.names) > _WIDE:
+        names, twice = _numbered(path, layout.names)
+        layout, chosen = layout._replace(names=names), set(choice(names))
+        used, notes = [name for name in names if name in chosen], [*twice, *notes]
 
     def leave_out(row: pacsv.InvalidRow) -> str:
         wrong.append(row)
@@ -303,27 +328,29 @@ def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
             ),
             parse_options=pacsv.ParseOptions(delimiter=layout.separator, newlines_in_values=layout.broken, **options),
             convert_options=pacsv.ConvertOptions(
-                null_values=BLANK, strings_can_be_null=True, decimal_point=layout.point
+                null_values=BLANK, strings_can_be_null=True, decimal_point=layout.point, include_columns=used
             ),
         )
 
     try:
-        return parsed(layout), notes
+        table = parsed(layout)
+        _ = table.column_names  # only now it is seen whether they are UTF-8
+        return table, names, notes
     except pa.ArrowInvalid as error:
         if " columns, got " not in str(error):
             raise
     text.decode("utf-8")  # pyarrow cannot hand over a wrong line that is not UTF-8
     table = parsed(layout, invalid_row_handler=leave_out)
-    if not table.num_rows and (short := _short_header(path, table.column_names, layout, wrong)):
+    if not table.num_rows and (short := _short_header(path, names or table.column_names, layout, wrong)):
         layout, note = short
-        return parsed(layout), [note, *notes]
+        return parsed(layout), (names and layout.names) or [], [note, *notes]
     note = (
         f"{path.name}: {counted(len(wrong), 'line')} left out: {wrong[0].actual_columns} cells where the header has"
         f" {wrong[0].expected_columns}, first in line {wrong[0].number}"
     )
     if table.num_rows == 0:  # not the kind of table that it should be
         raise RunError(f"{path}: the table has no rows; {note}")
-    return table, [note, *notes]
+    return table, names, [note, *notes]
 
 
 def _transforms_apart(text: bytes) -> bytes:
@@ -367,7 +394,7 @@ class _Layout(NamedTuple):
         point: Of decimals: ``1,5;2`` as well as ``1.5,2``.
         skipped: Lines above the header; with it where ``names`` are given.
         names: Of the columns, where the header is a comment (``# t x y``) or several lines (Position above X, Y, Z), or
-            there is none.
+            there is none, or they are many.
         units: Whether a line with units is below the header.
         above: How many of the lines above are no comments and not blank.
         broken: Whether cells in quotes go on in the next line.
@@ -406,6 +433,8 @@ def _layout(text: bytes) -> _Layout:
     separator = _separator(lines[header])
     units = header > first and all(map(_UNIT.fullmatch, _cells(lines[header], separator)))
     top, names = _told_apart(lines, header - units, separator)
+    cells = _cells(lines[header], separator)
+    names = cells if names is None and len(cells) > _WIDE else names
     skipped = header - units + (names is not None)
     return _Layout(separator, _point(text, separator), skipped, names, units, sum(n < top for n in full), broken)
 
@@ -532,7 +561,7 @@ def _split(line: str, separator: str) -> list[str]:
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
     """The columns asked for and the rows, some at a time; and the names of all that the file has."""
     with _opened(path) as file:
-        empty, wanted = _filterable(file.schema_arrow.empty_table()), _wanted(path, file, fields, where)
+        wanted, empty = _wanted(path, file, fields, where)
         conditions = _conditions(path, empty, where)
         groups = [
             place for place in range(file.num_row_groups) if _may_hold(file.metadata.row_group(place), conditions)
@@ -553,16 +582,25 @@ def _opened(path: Path) -> papq.ParquetFile:
     return papq.ParquetFile(str(path), pre_buffer=False, buffer_size=_READ_AHEAD)
 
 
-def _wanted(path: Path, file: papq.ParquetFile, fields: Sequence[str] | None, where: Where) -> list[str] | None:
-    """Which columns have to be read; None: all.
+def _wanted(
+    path: Path, file: papq.ParquetFile, fields: Sequence[str] | None, where: Where
+) -> tuple[list[str] | None, pa.Table]:
+    """Which columns have to be read, None: all; and the table of these without rows.
 
     Raises:
         RunError: A field is absent: that is reported now, while all names are known.
     """
-    columns = _named(file.schema_arrow.empty_table())
+    schema = file.schema_arrow
+    wanted = None if fields is None else _asked(path, schema.names, fields=fields, where=where)
+    if wanted is not None:
+        known = set(schema.names)
+        used = {longest(known, one) for one in wanted}
+        schema = pa.schema([one for one in schema if one.name in used])
+    empty = _filterable(schema.empty_table())
+    columns = _named(empty)
     for field in fields or ():
         find(columns, field, str(path))
-    return None if fields is None else prefixes([*fields, *where])
+    return wanted, empty
 
 
 def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] | None) -> Iterator[pa.Table]:
@@ -628,7 +666,7 @@ def _met(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.
 
 def _may_hold(group: Any, conditions: Mapping[str, pa.Scalar]) -> bool:
     """Whether a part of Parquet may have rows that meet all conditions, by the least and the greatest of its values."""
-    columns = [group.column(place) for place in range(group.num_columns)]
+    columns = [group.column(place) for place in range(group.num_columns if conditions else 0)]
     for name, value in conditions.items():
         known = [column.statistics for column in columns if column.path_in_schema == name and column.is_stats_set]
         if len(known) == 1 and known[0].has_min_max and not known[0].min <= value.as_py() <= known[0].max:
