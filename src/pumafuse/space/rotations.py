@@ -18,6 +18,7 @@ Order = Literal["xyzw", "wxyz"]
 # A, B, C of KUKA are about Z, Y, X in this order; W, P, R of FANUC and roll, pitch, yaw about x, y, z that stay.
 CONVENTIONS = {"kuka": "ZYX", "fanuc": "xyz", "rpy": "xyz"}
 _NORM = 0.05  # by which a quaternion's norm is off 1 that was rounded; what is farther off is none
+_ROUNDED = 1e-15  # by which the norm of a unit quaternion is off 1: it stays as it is, to the bit
 _SMALL = 1e-4  # rad, below which series replace quotients: their next terms are below 1e-10
 
 
@@ -31,8 +32,8 @@ def of_quaternions(value: FloatArray, order: Order = "xyzw") -> FloatArray:
     value = value[:, [1, 2, 3, 0]] if order == "wxyz" else value
     with np.errstate(invalid="ignore", over="ignore"):
         norm = np.sqrt(np.sum(value**2, axis=1))
-        known = np.abs(norm - 1.0) < _NORM
-    return np.where(known[:, None], value / np.where(known, norm, 1.0)[:, None], np.nan)
+        known, off = np.abs(norm - 1.0) < _NORM, np.abs(norm - 1.0) > _ROUNDED
+    return np.where(known[:, None], value / np.where(known & off, norm, 1.0)[:, None], np.nan)
 
 
 def of_vectors(vector: FloatArray) -> FloatArray:
@@ -70,7 +71,7 @@ def vectors(quaternion: FloatArray, reference: FloatArray) -> FloatArray:
     relative = product(quaternion, of_vectors(-reference[None]))
     relative = relative * np.where(relative[:, 3:] < 0.0, -1.0, 1.0)  # q and -q are one orientation
     sine = np.sqrt(np.sum(relative[:, :3] ** 2, axis=1, keepdims=True))
-    angle = 2.0 * np.arctan2(sine, relative[:, 3:])
+    angle = 2.0 * np.arctan2(sine, np.ascontiguousarray(relative[:, 3:]))  # else its bits depend on how many rows
     return relative[:, :3] * np.where(sine < _SMALL, 2.0 + angle**2 / 12.0, angle / np.where(sine < _SMALL, 1.0, sine))
 
 
