@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import math
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
@@ -10,6 +14,11 @@ from scipy.spatial.transform import Rotation
 import pumafuse as pf
 from pumafuse.fusion.config import Placement
 from pumafuse.fusion.placing import with_tool
+from pumafuse.live.export import header
+from pumafuse.live.record import Recorder
+from pumafuse.live.sources import replayed
+from pumafuse.live.stream import Stream
+from pumafuse.live.wire import BadLine, Event, LineDecoder
 from streams import counted, delayed, differences, events_of, feed, outcomes_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -111,3 +120,135 @@ def test_estimates_at_the_time_are_as_live() -> None:
     for axis, track in offline.axes.items():
         assert [estimate[axis].position for estimate in found] == track.position.tolist()
         assert [estimate[axis].position_sd for estimate in found] == track.position_sd.tolist()
+
+
+def lines_of(run: pf.Run) -> list[bytes]:
+    """A run on the wire, in mm."""
+    found = []
+    for stamp, sensor, values in events_of(run):
+        body = {
+            "q" if axis == "orientation" else axis: value if axis == "orientation" else value * 1e3
+            for axis, value in values.items()
+        }
+        found.append(
+            json.dumps({"t_ns": stamp, **({"sensor": sensor, **body} if sensor else {"command": body})}).encode()
+        )
+    return found
+
+
+def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
+    """Lines with orientations: every estimate that went out is, to the last bit, that of the record as live."""
+    recorder = Recorder(tmp_path / "record", KNOWN, {}, lambda _: None)
+    live, written = pf.LiveEstimator(KNOWN, event_log=recorder), list[bytes]()
+    Stream(live, written.extend, lambda _: None).take(lines_of(RUN))
+    recorder.close(live.sure)
+    found = pf.Run.read(tmp_path / "record")
+    assert found.notes == ()
+    assert found.sensors["tracker"].orientation is None
+    offline = pf.fuse(found, KNOWN, mode="as-live")
+    given = [json.loads(line) for line in written]
+    for axis, track in offline.axes.items():
+        unit, scale = ("deg", 180.0 / math.pi) if axis.startswith("r") else ("mm", 1e3)
+        assert [one[axis][f"position_{unit}"] for one in given] == (track.position * scale).tolist()
+        assert [one[axis][f"sd_{unit}"] for one in given] == (track.position_sd * scale).tolist()
+    vector = np.column_stack([offline.axes[axis].position for axis in ("rx", "ry", "rz")])
+    expected = Rotation.from_rotvec(vector) * Rotation.from_rotvec(KNOWN.tool.reference)
+    assert (Rotation.from_quat([one["q"] for one in given]) * expected.inv()).magnitude() == pytest.approx(
+        0.0, abs=1e-12
+    )
+
+
+def test_a_replay_is_as_live() -> None:
+    """A run that is replayed as a stream, a tenth of its rows without an orientation, gives the estimates of `fuse`."""
+    run = run_of()
+    run.sensors["mocap"].orientation[::10] = np.nan
+    offline, live = pf.fuse(run, KNOWN), pf.LiveEstimator(KNOWN)
+    stream = Stream(live, lambda _: None, lambda _: None)
+    for events in replayed(run, KNOWN, math.inf):
+        stream.take(events)
+    last = live.estimate(offline.origin + round(offline.time[-1] * 1e9))
+    for axis, track in offline.axes.items():
+        assert last[axis].position == track.position[-1]
+        assert last[axis].position_sd == track.position_sd[-1]
+
+
+DECODER = LineDecoder(ARM.kind_of, framed=False)
+Q = Rotation.from_rotvec(KNOWN.tool.reference).as_quat().tolist()
+
+
+def test_orientations_on_the_wire() -> None:
+    """Of a command and of a measurement q is a quaternion; null is none; an arm without rx may have an axis q."""
+    values = {"x": 0.5, "orientation": (0.5, -0.5, 0.5, 0.5)}
+    assert DECODER.decode(b'{"t": 1.0, "command": {"x": 500.0, "q": [0.5, -0.5, 0.5, 0.5]}}') == Event(1.0, "", values)
+    line = b'{"t": 1.0, "sensor": "mocap", "x": 500.0, "q": [0.5, -0.5, 0.5, 0.5]}'
+    assert DECODER.decode(line) == Event(1.0, "mocap", values)
+    assert DECODER.decode(b'{"t": 1.0, "sensor": "mocap", "x": 500.0, "q": null}').values == {"x": 0.5}
+    joint = LineDecoder({"q": "length"}, framed=False)
+    assert joint.decode(b'{"t": 1.0, "sensor": "encoder", "q": 500.0}').values == {"q": 0.5}
+    with pytest.raises(pf.ConfigError, match="axis 'q'"):
+        LineDecoder({**ARM.kind_of, "q": "length"}, framed=False)
+
+
+@pytest.mark.parametrize("q", ["[0, 0, 1]", '"north"', '[0, 0, 0, "1"]', "[0, 0, 0, NaN]", "[0, 0, 0, 1, 0]", "1.0"])
+def test_a_line_with_a_q_of_another_form_has_a_reason(q: str) -> None:
+    """Each is refused with a reason that names it, or is no JSON."""
+    with pytest.raises(BadLine, match=r"\.q|not JSON"):
+        DECODER.decode(f'{{"t": 1.0, "sensor": "mocap", "x": 500.0, "q": {q}}}'.encode())
+
+
+@pytest.mark.parametrize(
+    "orientation",
+    [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0], "north", [0.0, 0.0, 0.0, math.nan], [0, 0, 0, 1.2], 1.0, None],
+)
+def test_what_is_no_orientation_is_refused(orientation: object) -> None:
+    """The whole row is refused with one reason, and counted by axis; so is a command."""
+    live = pf.LiveEstimator(KNOWN)
+    live.command(0.0, x=0.5, y=0.2, z=0.1, orientation=Q)
+    for result in (
+        live.measurement(0.1, "mocap", x=0.5, y=0.2, z=0.1, orientation=orientation),
+        live.command(0.1, x=0.5, orientation=orientation),
+    ):
+        assert result.outcome is pf.Outcome.INVALID
+        assert "no quaternion x, y, z, w of norm 1" in result.reason
+        assert {"x", "rx", "ry", "rz"} <= set(result.axes)
+    assert live.health().sensors["mocap"].outcomes["invalid"] == 6
+
+
+def test_without_a_reference_orientation_a_row_with_q_says_what_to_write() -> None:
+    """Neither half used nor silently dropped; and a marker needs it from the beginning."""
+    sensors = {"camera": CONFIG.sensors["camera"]}
+    live = pf.LiveEstimator(pf.FusionConfig(arm=ARM, sensors=sensors))
+    live.command(0.0, x=0.5)
+    result = live.measurement(0.1, "camera", x=0.5, orientation=Q)
+    assert result.outcome is pf.Outcome.INVALID
+    assert "[tool] reference_rotation_vector_deg in fusion.toml" in result.reason
+    with pytest.raises(pf.ConfigError, match=r"sensors.mocap.marker: .*\[tool\]"):
+        pf.LiveEstimator(CONFIG)
+    with pytest.raises(pf.ConfigError, match="start: rx"):
+        pf.LiveEstimator(KNOWN, start={"rx": 0.1})
+
+
+def test_a_row_without_all_of_x_y_z_is_invalid() -> None:
+    """A sensor in a frame of its own that gives two coordinates tells nothing of any of the base's axes."""
+    live = pf.LiveEstimator(KNOWN)
+    live.command(0.0, x=0.5, y=0.2, z=0.1, orientation=Q)
+    result = live.measurement(0.1, "tracker", x=1.0, y=0.2)
+    assert dict(result.axes) == dict.fromkeys("xyz", pf.Outcome.INVALID)
+
+
+def test_a_command_that_turns_too_far_is_refused() -> None:
+    """Near half a turn from the reference a rotation vector changes its sign; from 120° on that is said."""
+    said: list[str] = []
+    live = pf.LiveEstimator(KNOWN, on_notice=said.append)
+    for turn, taken in ((130.0, True), (172.0, False)):
+        q = Rotation.from_rotvec([0.0, 0.0, math.radians(turn)]) * Rotation.from_rotvec(KNOWN.tool.reference)
+        result = live.command(turn, x=0.5, y=0.2, z=0.1, orientation=q.as_quat())
+        assert (result.outcome is pf.Outcome.FUSED) == taken
+    assert "170°" in result.reason
+    assert ["beyond 120°" in text for text in said] == [True]
+
+
+def test_a_header_says_that_the_placing_is_not_in_it() -> None:
+    """As of a [frame]: a controller gives events of the tool point, along the base's axes."""
+    text = header(KNOWN, "filter", "fusion.toml")
+    assert "the reference of its [tool]; frame and marker of mocap, tracker are not in here" in text

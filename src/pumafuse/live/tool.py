@@ -55,6 +55,13 @@ def check_tool(config: FusionConfig, start: Mapping[str, float]) -> None:
         raise ConfigError(f"start: {named[0]}: a tool that turns starts at its first commanded orientation")
 
 
+def takes_orientation(config: FusionConfig) -> bool:
+    """Whether events may have an orientation: as axes, or to say where the tool point is from what a sensor sees."""
+    if set(TURNING) <= set(config.arm.axes):
+        return config.tool is not None
+    return any(sensor.is_placed for sensor in config.sensors.values())
+
+
 def tool_of(config: FusionConfig, log: RateLimitedLog) -> Tool | None:
     """The tool of a configuration that has a reference orientation, or sensors in frames of their own; else None."""
     placed = any(sensor.is_placed for sensor in config.sensors.values())
@@ -99,7 +106,7 @@ class Tool:
         turns = set(TURNING) <= set(arm.axes)
         self._reference = np.array(config.tool.reference) if turns and config.tool is not None else None
         self._placings = {name: Placing(sensor) for name, sensor in config.sensors.items() if sensor.is_placed}
-        self.takes_orientation = self._reference is not None or (not turns and len(self._placings) > 0)
+        self._takes_orientation = takes_orientation(config)
         self._latency = {name: round(config.sensors[name].latency * 1e9) for name in self._placings}
         self._rows: dict[str, list[Row]] = {}
         if self._reference is not None:
@@ -117,7 +124,7 @@ class Tool:
             raise ValueError(f"'{twice}': with [tool] an orientation comes as a quaternion x, y, z, w")
         if ORIENTATION not in values:
             return values
-        if not self.takes_orientation:
+        if not self._takes_orientation:
             raise ValueError(NO_TOOL)
         found = dict(values)
         told = unit(found.pop(ORIENTATION))
