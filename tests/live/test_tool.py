@@ -19,6 +19,7 @@ from pumafuse.live.record import Recorder
 from pumafuse.live.sources import replayed
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import BadLine, Event, LineDecoder
+from pumafuse.logs.frames import Rotated
 from streams import counted, delayed, differences, events_of, feed, outcomes_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -90,6 +91,26 @@ def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 6.0) -> pf.Run:
 
 RUN = run_of()
 KNOWN = with_tool(CONFIG, RUN)
+
+
+# The same arm, its log in another frame: x, y, z are turned into its axes once they are the tool's.
+FRAMED = msgspec.structs.replace(
+    KNOWN,
+    arm=msgspec.structs.replace(
+        ARM,
+        axes={**dict.fromkeys(("tangential", "radial", "vertical"), LENGTH), "rx": ANGLE, "ry": SLOW, "rz": ANGLE},
+    ),
+    frame=Rotated(azimuth=0.4),
+    process={},
+    sensors={name: msgspec.structs.replace(sensor, sd=3e-4) for name, sensor in KNOWN.sensors.items()},
+)
+
+
+@pytest.mark.parametrize("longest", [0.0, 1.2])
+def test_in_a_frame_of_the_arm(longest: float) -> None:
+    """What sensors and commands tell in x, y, z becomes the arm's tangential, radial and vertical, as offline."""
+    offline, live = pf.fuse(RUN, FRAMED), pf.LiveEstimator(FRAMED)
+    assert differences(live, delayed(events_of(RUN), longest, seed=2), offline, longest + 0.25) == []
 
 
 @pytest.mark.parametrize("longest", [0.0, 1.2])
@@ -170,6 +191,32 @@ def test_a_replay_is_as_live() -> None:
     for axis, track in offline.axes.items():
         assert last[axis].position == track.position[-1]
         assert last[axis].position_sd == track.position_sd[-1]
+
+
+class Watching:
+    """What a live view is given."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def event(self, event: Event, _: pf.UpdateResult) -> None:
+        self.events.append(event)
+
+    def estimate(self, estimate: pf.LiveEstimate) -> None:
+        pass
+
+
+def test_a_live_view_sees_the_tool_along_the_bases_axes() -> None:
+    """Of each sensor, wherever it stands: within what an arm that lags is off the motion that it measured."""
+    watching = Watching()
+    Stream(pf.LiveEstimator(KNOWN), lambda _: None, lambda _: None, watchers=[watching]).take(lines_of(RUN))
+    for sensor, latency in (("mocap", 0.012), ("tracker", 0.005), ("camera", 0.03)):
+        events = [event for event in watching.events if event.sensor == sensor and event.t > 1e9]
+        measured = np.array([[event.values[axis] for axis in "xyz"] for event in events])
+        expected = pose(np.array([event.t for event in events]) / 1e9 - latency - 0.086)[0]
+        assert np.abs(measured - expected).max() < 3e-3
+        if sensor != "tracker":
+            assert {"rx", "ry", "rz"} <= events[0].values.keys()
 
 
 DECODER = LineDecoder(ARM.kind_of, framed=False)

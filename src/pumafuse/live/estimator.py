@@ -234,6 +234,19 @@ class LiveEstimator:
         right = self._clock.low <= stamp <= self._clock.high or (known and self._clock.ends_doubt(stamp, sensor))
         return stamp if right else self.sure
 
+    def of_tool(self, t: Time, sensor: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What an event that was taken tells of the tool: its orientation as axes, its position along the base's axes.
+
+        Args:
+            t: Its stamp.
+            sensor: Its name; empty for a command.
+            values: As it came.
+        """
+        if self._tool is None:
+            return values
+        parsed = self._tool.parsed(sensor or None, values)
+        return self._tool.of_tool(sensor, nanoseconds(t), parsed).values if sensor else parsed
+
     def health(self, at: Time | None = None) -> Health:
         """How each sensor does, and what became of everything so far.
 
@@ -490,28 +503,29 @@ class LiveEstimator:
         return result
 
     def _without_held(
-        self, stamp: int, sensor: str, given: int, held: int, released: Sequence[tuple[int, str, float]]
+        self, stamp: int, sensor: str, given: int, held: int, released: Sequence[tuple[int, str, float, float]]
     ) -> UpdateResult:
         """Give the window what is news of a measurement that has come to it, and what was not used before and is."""
         self._counts.came(self._sensors[sensor], stamp, self._clock.sure)
         kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (given & ~held) >> axis & 1}
         again = [name for name, axis in self._bits.items() if held >> axis & 1]
         result = self._feed(stamp, sensor, kept, judged=True) if kept else refused(again, _HELD, REASONS[_HELD])
-        for earlier, name, value in released:
+        for earlier, name, value, spread in released:
+            self._window.spread[self._bits[name]] = spread
             self._feed(earlier, sensor, {name: value}, judged=True)
         return result
 
-    def _held(self, stamp: int, sensor: str, given: int) -> tuple[int, list[tuple[int, str, float]]]:
+    def _held(self, stamp: int, sensor: str, given: int) -> tuple[int, list[tuple[int, str, float, float]]]:
         """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
-        held, released, number = 0, list[tuple[int, str, float]](), self._sensors[sensor]
+        held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
         for axis, name in enumerate(self.axes):
             if not given >> axis & 1:
                 continue
-            value, lag = self._window.value[axis], self._follows[number][axis]
-            found = self._holds.judge((number, axis), stamp, value, self._commands, lag)
+            value, spread, lag = self._window.value[axis], self._window.spread[axis], self._follows[number][axis]
+            found = self._holds.judge((number, axis), stamp, value, spread, self._commands, lag)
             held |= found.held << axis
             self._counts.outcomes[number, _HELD] += found.held - len(found.released)
-            released += [(earlier, name, one) for earlier, one in found.released]
+            released += [(earlier, name, one, factor) for earlier, one, factor in found.released]
             if found.sure:
                 self._log.write(
                     f"{sensor} {name} held",

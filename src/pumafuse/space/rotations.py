@@ -83,7 +83,7 @@ def quaternions(vector: FloatArray, reference: FloatArray) -> FloatArray:
 def product(left: FloatArray, right: FloatArray) -> FloatArray:
     """Quaternions of R_left R_right, row by row, (n, 4); either may be one row for all."""
     (a, w), (b, v) = ((one[:, :3], one[:, 3:]) for one in (left, right))
-    return np.column_stack([w * b + v * a + np.cross(a, b), w * v - np.sum(a * b, axis=1, keepdims=True)])
+    return np.column_stack([w * b + v * a + _cross(a, b), w * v - np.sum(a * b, axis=1, keepdims=True)])
 
 
 def inverse(quaternion: FloatArray) -> FloatArray:
@@ -93,8 +93,14 @@ def inverse(quaternion: FloatArray) -> FloatArray:
 
 def turned(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
     """R v, row by row, (n, 4) and (n, 3) → (n, 3); either may be one row for all."""
-    across = 2.0 * np.cross(quaternion[:, :3], vector)
-    return vector + quaternion[:, 3:] * across + np.cross(quaternion[:, :3], across)
+    across = 2.0 * _cross(quaternion[:, :3], vector)
+    return vector + quaternion[:, 3:] * across + _cross(quaternion[:, :3], across)
+
+
+def _cross(left: FloatArray, right: FloatArray) -> FloatArray:
+    """The cross products of rows; numpy's own takes three times as long for one row, as of a stream."""
+    one, two = [1, 2, 0], [2, 0, 1]
+    return left.take(one, 1) * right.take(two, 1) - left.take(two, 1) * right.take(one, 1)
 
 
 def between(quaternion: FloatArray, row: IntArray, share: FloatArray) -> FloatArray:
