@@ -117,11 +117,6 @@ class LiveEstimator:
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)
         self._no_spread = [1.0] * len(self.axes)
-        self._spreads = (
-            config.frame is not None
-            or config.tool is not None
-            or any(sensor.is_placed for sensor in config.sensors.values())
-        )
         self._log, self._event_log = RateLimitedLog(on_notice), event_log
         self._refused: IntArray = np.zeros((len(self._sensors) + 1, len(Outcome)), dtype=np.int64)
         self._strangers = 0
@@ -271,6 +266,7 @@ class LiveEstimator:
         model = live_model(self.config, self._frame_start.start(self._start))
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
         self._tool = tool_of(self.config, self._log)
+        self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled at all
         self._watch.restart()
         self._screen.restart()
         self._holds.restart()

@@ -291,9 +291,10 @@ def unit(orientation: Any) -> FloatArray:
     Raises:
         ValueError: It is none.
     """
-    known = isinstance(orientation, list | tuple | np.ndarray)
-    parts = [number(one) for one in cast(Sequence[Any], orientation)] if known else []
-    found = rotations.of_quaternions(np.array([parts])) if len(parts) == 4 else np.array([[np.nan]])
+    listed = isinstance(orientation, list | tuple) or (isinstance(orientation, np.ndarray) and orientation.ndim == 1)
+    given = cast(Sequence[Any], orientation) if listed else ()
+    parts = [number(one) for one in given] if len(given) == 4 else [math.nan] * 4
+    found = rotations.of_quaternions(np.array([parts]))
     if not np.isfinite(found).all():
         raise ValueError(f"the orientation is no quaternion x, y, z, w of norm 1: {orientation!r:.60}")
     return found
