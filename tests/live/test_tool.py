@@ -245,7 +245,18 @@ def test_a_line_with_a_q_of_another_form_has_a_reason(q: str) -> None:
 
 @pytest.mark.parametrize(
     "orientation",
-    [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0], "north", [0.0, 0.0, 0.0, math.nan], [0, 0, 0, 1.2], 1.0, None],
+    [
+        np.array(1.0),
+        np.eye(4),
+        [[0], 0, 0, 1],
+        [0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 1.0],
+        "north",
+        [0.0, 0.0, 0.0, math.nan],
+        [0, 0, 0, 1.2],
+        1.0,
+        None,
+    ],
 )
 def test_what_is_no_orientation_is_refused(orientation: object) -> None:
     """The whole row is refused with one reason, and counted by axis; so is a command."""
