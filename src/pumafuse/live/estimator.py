@@ -459,7 +459,7 @@ class LiveEstimator:
         oldest = self._oldest()
         if stamp < oldest:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
-        if self._tool is not None and sensor is not None and told is not None:
+        if told is not None and sensor is not None and self._tool is not None:
             for name in told.spread.keys() & self._bits.keys():
                 window.spread[self._bits[name]] = told.spread[name]
             if told.seen is not None:
@@ -517,8 +517,8 @@ class LiveEstimator:
         for axis, name in enumerate(self.axes):
             if not given >> axis & 1:
                 continue
-            value, spread, lag = self._window.value[axis], self._window.spread[axis], self._follows[number][axis]
-            found = self._holds.judge((number, axis), stamp, value, spread, self._commands, lag)
+            value, lag = self._window.value[axis], self._follows[number][axis]
+            found = self._holds.judge((number, axis), stamp, value, self._window.spread, self._commands, lag)
             held |= found.held << axis
             self._counts.outcomes[number, _HELD] += found.held - len(found.released)
             released += [(earlier, name, one, factor) for earlier, one, factor in found.released]

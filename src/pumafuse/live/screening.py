@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from ctypes import Array, c_double
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -135,7 +136,7 @@ class HoldWatch:
         self._seen = dict[tuple[int, int], _Repeated]()
 
     def judge(
-        self, key: tuple[int, int], stamp: int, value: float, spread: float, commands: Commands, lag: int
+        self, key: tuple[int, int], stamp: int, value: float, spreads: Array[c_double], commands: Commands, lag: int
     ) -> Judged:
         """Judge a value; where they come out of order nothing is held.
 
@@ -143,7 +144,7 @@ class HoldWatch:
             key: Which sensor, and which axis.
             stamp: Int ns.
             value: [m].
-            spread: By what its noise is scaled.
+            spreads: By what the noise of each axis is scaled.
             commands: As far as they have come.
             lag: How late the axis may follow them [ns].
         """
@@ -170,7 +171,7 @@ class HoldWatch:
         odd = led != before and (one.leapt or one.repeats ** (one.count - 1) < _ODD)
         if one.believed or not (odd or habit.is_clear(max(led - one.low, one.high - led))):
             return _NEWS
-        waited.append((stamp, value, spread))
+        waited.append((stamp, value, spreads[axis]))
         if stamp - waited[0][0] <= self._patience:
             return Judged(True, False)
         one.waiting, one.believed = [], True
