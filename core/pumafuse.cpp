@@ -62,6 +62,15 @@ void pf_response(const pf_axis* axis, int64_t commands, const int64_t* given, co
     respond(arm, axis->start, std::llround(axis->delay * 1e9), commands, given, command, n, time, position);
 }
 
+void pf_follow(const pf_axis* axis, pf_motion* motion, int64_t commands, const int64_t* given, const double* command,
+               int64_t n, const int64_t* time, double* position) {
+    const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
+    Response<double> response{{motion->time}, axis->start, motion->command, motion->step, motion->error,
+                              motion->position, motion->rate};
+    follow(response, arm, std::llround(axis->delay * 1e9), commands, given, command, n, time, position);
+    *motion = {response.time.ns, response.u, response.step, response.error, response.x, response.rate};
+}
+
 void pf_whiten(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,
                const double* columns, double* whitened, double* log_determinant) {
     const Whitening whitening(*noise, n, time, variance);
@@ -153,3 +162,8 @@ void pf_live_read(const pf_live* live, int64_t begin, int64_t end, int64_t* stam
 }
 
 void pf_live_forget(pf_live* live, int64_t after) { live->forget(after); }
+
+void pf_live_amend(pf_live* live, int64_t sensor, int64_t n, const int64_t* stamp, const double* before,
+                   const double* now) {
+    live->amend(int(sensor), n, stamp, before, now);
+}

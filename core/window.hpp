@@ -17,6 +17,8 @@ struct pf_live {
     virtual void read(std::int64_t begin, std::int64_t end, std::int64_t* stamp, std::int16_t* source,
                       const pf_results& results) const = 0;
     virtual void forget(std::int64_t after) = 0;
+    virtual void amend(int source, std::int64_t count, const std::int64_t* stamp, const double* before,
+                       const double* now) = 0;
 };
 
 namespace pumafuse {
@@ -93,6 +95,17 @@ class Window final : public pf_live {
         for (Time a = 0; a < size(); ++a) {
             if (first[a] > after && first[a] < PF_NEVER) first[a] = PF_NEVER, rest(a, model.axes[a].start);
             reclassify(a, begin, PF_NEVER);
+        }
+        run(target);
+        port.end = end;
+    }
+
+    void amend(int source, Time count, const Time* stamp, const double* before, const double* now) override {
+        const Time latency = nanoseconds(model.sensors[source].latency);
+        for (Time k = 0; k < count; ++k, before += 2 * size(), now += 2 * size()) {
+            const Time time = stamp[k] - latency;
+            for (Time row = first_after(time - 1); row < end && rows[row].time == time; ++row)
+                if (rows[row].source == source && rows[row].stamp == stamp[k]) amend(row, before, now);
         }
         run(target);
         port.end = end;
@@ -274,6 +287,18 @@ class Window final : public pf_live {
         std::copy_n(numbers.begin(), 2 * size(), made.numbers.begin());
         for (Time a = 0; a < size(); ++a) made.codes[a] = given >> a & 1 ? PF_FUSED : PF_ABSENT;
         return row;
+    }
+
+    // Values and spreads of a row that are as they were `before` are those of `now`.
+    void amend(Time row, const double* before, const double* now) {
+        double* number = rows.at(row).numbers.data();
+        for (Time a = 0; a < size(); ++a) {
+            const bool alike = number[a] == before[a] || (std::isnan(number[a]) && std::isnan(before[a]));
+            if (rows[row].known[a] == PF_ABSENT || !alike || now[a] == before[a]) continue;
+            restore(row);
+            number[a] = now[a], number[size() + a] = now[size() + a];
+            rows[row].known[a] = classified(row, a, PF_FUSED);
+        }
     }
 
     void remove(Time row) {

@@ -32,6 +32,8 @@ def events_of(run: pf.Run) -> list[Event]:
     found = []
     for sensor, source in [("", run.command), *run.sensors.items()]:
         columns = {axis: value.tolist() for axis, value in source.values.items()}
+        if source.orientation is not None:
+            columns["orientation"] = source.orientation.tolist()
         for row, stamp in enumerate(source.stamp.tolist()):
             if stamp != NO_STAMP:
                 values = {axis: column[row] for axis, column in columns.items() if column[row] == column[row]}

@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 5              /* of this interface: a program and its library must agree */
+#define PF_VERSION 6              /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -114,6 +114,19 @@ PF_API void pf_transition(const pf_axis *axis, double dt, double step[17]);
 PF_API void pf_response(const pf_axis *axis, int64_t commands, const int64_t *given, const double *command, int64_t n,
                         const int64_t *time, double *position);
 
+/* What an axis without noise does just after a command, relative to its start level: when it acts [ns], the command in
+ * force and the step that it was [m], the gain error [m], position [m] and rate [m/s]. At rest before any: PF_ALWAYS and
+ * zeros. */
+typedef struct {
+    int64_t time;
+    double command, step, error, position, rate;
+} pf_motion;
+
+/* The same as pf_response from a motion on, which becomes that after the commands. Each position follows from the last
+ * command alone: it is the same whatever else is asked for, and in whatever pieces. */
+PF_API void pf_follow(const pf_axis *axis, pf_motion *motion, int64_t commands, const int64_t *given,
+                      const double *command, int64_t n, const int64_t *time, double *position);
+
 /* What an arm leaves of what is measured, beside white noise. */
 typedef struct {
     double walk, offset_sd;                  /* of a random walk: density [m/sqrt(s)], and where it begins [m] */
@@ -196,6 +209,10 @@ PF_API void pf_live_read(const pf_live *live, int64_t begin, int64_t end, int64_
                          const pf_results *results);
 /* Take back all that is stamped after an instant: it was of another clock. */
 PF_API void pf_live_forget(pf_live *live, int64_t after);
+/* Measurements of a sensor that are known better now: of n rows by their stamps (n,) the values and spreads (n, 2 A),
+ * where the values are as they were before. */
+PF_API void pf_live_amend(pf_live *live, int64_t sensor, int64_t n, const int64_t *stamp, const double *before,
+                          const double *now);
 
 #ifdef __cplusplus
 }

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import pumafuse as pf
 from pumafuse import AxisModel, FirstOrder, Gain, SecondOrder
 from pumafuse.arrays import FloatArray, TimeArray
-from pumafuse.filter.response import response
+from pumafuse.filter.response import at_rest, follow, record_of, response
 from pumafuse.model.plants import PLANTS
 
 EPOCH = 1_790_000_000_000_000_000  # ns: stamps of a logger in 2026, too large for a float to hold
@@ -129,3 +129,24 @@ def test_the_filter_predicts_the_same(plant: PLANTS) -> None:
     time = np.rint(estimates.time * 1e9).astype(np.int64)
     expected = START + response(axis, PERIOD, DELAY, given, command, START, time)
     np.testing.assert_allclose(estimates["radial"].position, expected, rtol=0.0, atol=1e-14)
+
+
+@settings(max_examples=100)
+@given(PLANT, st.sampled_from([None, 0.03]), st.integers(0, 10**6), st.integers(0, 40), st.integers(0, 60))
+def test_followed_in_pieces_it_is_the_response(
+    plant: PLANTS, recovery: float | None, seed: int, commands: int, times: int
+) -> None:
+    """To rounding; and each position alone, by commands that come in pieces, is that of all at once to the bit."""
+    rng = np.random.default_rng(seed)
+    given = EPOCH + np.unique(rng.integers(0, 200, commands)) * 10**7
+    time = EPOCH + np.sort(rng.integers(-10, 300, times)) * 10**7
+    value, nothing = rng.normal(0.0, 0.01, len(given)), np.empty(0)
+    axis = AxisModel(plant=plant, gain=Gain(slope=0.02, intercept=0.9), gain_recovery=recovery)
+    record, ends = record_of(axis, PERIOD, DELAY, 0.0), np.searchsorted(given + round(DELAY * 1e9), time, side="right")
+    found = follow(record, at_rest(), given, value, time)
+    np.testing.assert_allclose(found, response(axis, PERIOD, DELAY, given, value, 0.0, time), rtol=0.0, atol=1e-14)
+    for place, end in enumerate(ends.tolist()):
+        motion, cut = at_rest(), int(rng.integers(0, end + 1))
+        for part in (slice(0, cut), slice(cut, end)):
+            follow(record, motion, given[part], value[part], nothing.astype(np.int64))
+        assert follow(record, motion, given[:0], nothing, time[place : place + 1])[0] == found[place]

@@ -23,6 +23,7 @@ from rich.text import Text
 from ..errors import ConfigError, RunError
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
+from ..fusion.placing import with_tool
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, Address
 from ..live.estimator import LiveEstimator
@@ -79,7 +80,7 @@ def run(
     recorded = Run.read(address.path) if address.kind == "replay" else None
     if recorded is not None:
         start = dict(recorded.start)
-        known = msgspec.structs.replace(known, frame=recorded.frame or known.frame)
+        known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
     errors = console(sys.stderr)
 
     def notify(text: str) -> None:

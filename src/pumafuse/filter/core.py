@@ -20,7 +20,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
 from ..errors import PumafuseError
 from .events import Events, Results
 
-VERSION = 5  # of the interface
+VERSION = 6  # of the interface
 FINEST = 1e-9  # PF_FINEST
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
@@ -37,6 +37,8 @@ AXIS = _numbers(
 )
 SENSOR = _numbers("scale", "latency", "latency_sd", "gate", "gate_rows")
 VIEW = _numbers("sd", "bias_sd", "bias_drift_sd", "bias_time", "turn")
+
+MOTION = np.dtype([("time", np.int64), *_numbers("command", "step", "error", "position", "rate").descr])
 
 
 class Output(IntEnum):
@@ -81,6 +83,7 @@ _KINDS = {"p": _POINTER, "n": _INT64, "d": ctypes.c_double, "i": ctypes.c_int, "
 _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double, int, uint64; v: nothing
     "transition": "vpdp",
     "response": "vpnppnpp",
+    "follow": "vppnppnpp",
     "whiten": "vpnppnppp",
     "weigh": "vpnppnpnppnpp",
     "classify": "vppnpp",
@@ -95,6 +98,7 @@ _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double
     "live_port": "pp",
     "live_add": "ipnnun",
     "live_estimate": "vpnnpp",
+    "live_amend": "vpnnppp",
     "live_read": "vpnnppp",
     "live_forget": "vpn",
 }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import FloatArray, TimeArray
+from ..arrays import ALWAYS, FloatArray, TimeArray
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
-from .core import AXIS, Record, at, library
+from .core import AXIS, MOTION, Record, at, library
 
 
 def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Record:
@@ -50,4 +50,31 @@ def response(
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
     record = record_of(axis, period, delay, start)
     library.pf_response(at(record), len(given), at(given), at(command), len(time), at(time), at(position))
+    return position
+
+
+def at_rest() -> Record:
+    """What an axis does before its first command, (1,)."""
+    found = np.zeros(1, MOTION)
+    found["time"] = ALWAYS
+    return found
+
+
+def follow(axis: Record, motion: Record, given: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
+    """The position of an axis from what it does after a command on.
+
+    No bit of it depends on what else is asked for, or on the pieces in which commands come.
+
+    Args:
+        axis: Of :func:`record_of`, with a start level of 0, (1,).
+        motion: What it does, (1,); becomes that after the last command.
+        given: When each further command is given, int64 ns, ascending, (k,).
+        command: u [m] relative to the level at which the axis rested, (k,).
+        time: Asked for, int64 ns, ascending, (n,).
+
+    Returns:
+        The position [m], relative likewise, (n,).
+    """
+    position = np.empty(len(time))
+    library.pf_follow(at(axis), at(motion), len(given), at(given), at(command), len(time), at(time), at(position))
     return position

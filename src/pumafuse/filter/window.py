@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from ..arrays import NEVER, IndexArray, TimeArray
+from ..arrays import NEVER, FloatArray, IndexArray, TimeArray
 from .core import Handle, Model, Output, at, checked, fates, library, struct_of
 from .events import Results
 
@@ -109,3 +109,14 @@ class Window(Handle):
     def forget(self, after: int) -> None:
         """Take back all that is stamped after ``after`` [ns]: it was of another clock."""
         library.pf_live_forget(self._core, after)
+
+    def amend(self, sensor: int, stamp: TimeArray, before: FloatArray, now: FloatArray) -> None:
+        """Change measurements that are known better now.
+
+        Args:
+            sensor: Which one.
+            stamp: Of its rows, int64 ns, (n,).
+            before: Their values and spreads as they were put in, (n, 2 A); what has other values stays as it is.
+            now: As they are now, (n, 2 A).
+        """
+        library.pf_live_amend(self._core, sensor, len(stamp), at(stamp), at(before), at(now))

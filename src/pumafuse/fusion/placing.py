@@ -11,40 +11,45 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from ..arrays import NO_STAMP, FloatArray
+from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import ConfigError, RunError
-from ..filter.response import response
+from ..filter.core import Record
+from ..filter.response import at_rest, follow, record_of
 from ..logs.axes import in_axes, reference_orientation
 from ..logs.clock import TOLERATED_STEP_BACK_NS, without_strays
 from ..logs.frames import CARTESIAN, Placed
 from ..logs.run import Run, Source
+from ..model.arm import ArmModel
 from ..space import rotations
 from ..space.rotations import TURNING
 from .config import FusionConfig, Placement, Sensor, Tool
 
 _HERE = Placement()
+_QUIET = np.errstate(over="ignore", invalid="ignore")  # a sensor without a target may report infinity
 
 
-def in_base(run: Run, config: FusionConfig) -> tuple[Run, Placed | None, FusionConfig]:
+def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run, Placed | None, FusionConfig]:
     """The run in the arm's axes, with what sensors in frames of their own tell of the tool.
 
     Args:
         run: As logged.
         config: Says where sensors stand, what they see, and how the tool turns.
+        whole: Whether the run begins with its first command; a piece of one does not.
 
     Returns:
         The run (see :func:`pumafuse.logs.axes.in_axes`), its placed frame, and the configuration with the reference
         orientation of the run where it had none.
 
     Raises:
-        RunError: See :func:`pumafuse.logs.axes.in_axes`; or a sensor in a frame of its own does not give x, y and z.
+        RunError: See :func:`pumafuse.logs.axes.in_axes`; or a sensor in a frame of its own does not give x, y and z, or
+            no orientation in a row of a piece.
         ConfigError: The tool's orientation is needed and nothing tells it.
     """
     run = without_strays(run)
     config = with_tool(config, run)
     tool = config.tool.reference if config.tool else None
     of_tool = {
-        name: _of_tool(name, source, run, config)
+        name: _of_tool(name, source, run, config, whole=whole)
         for name, source in run.sensors.items()
         if name in config.sensors and config.sensors[name].is_placed
     }
@@ -65,41 +70,77 @@ def _still(_: str, source: Source) -> Source:
     return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
-def _of_tool(name: str, source: Source, run: Run, config: FusionConfig) -> Source:
+class Placing:
+    """What a sensor in a frame of its own tells of the tool, row by row: no bit of a row depends on other rows.
+
+    Attributes:
+        has_marker: Whether the tool's orientation is needed to know where it is.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        """Take where the sensor stands, what it sees, and its noise."""
+        frame, marker = sensor.frame or _HERE, sensor.marker or _HERE
+        self._at, self._turn = np.array(frame.at), rotations.of_vectors(np.array([frame.rotation]))
+        self._marker, self._back = np.array([marker.at]), rotations.of_vectors(-np.array([marker.rotation]))
+        self.has_marker = any(marker.at)
+        self._variance = float(np.mean([(sensor.sd_of(axis) or 0.0) ** 2 for axis in TURNING]))
+        self._sd = {axis: sd for axis in CARTESIAN if (sd := sensor.sd_of(axis))}
+
+    @_QUIET
+    def seen(self, measured: FloatArray) -> FloatArray:
+        """What it sees, along the base's axes [m], of x, y and z [m] in its own frame, (n, 3) → (n, 3)."""
+        return self._at + rotations.turned(self._turn, measured)
+
+    def oriented(self, measured: FloatArray) -> FloatArray:
+        """The tool's orientation of what it measures, as quaternions, (n, 4) → (n, 4)."""
+        return rotations.product(rotations.product(self._turn, measured), self._back)
+
+    def lever(self, tool: FloatArray) -> FloatArray:
+        """From the tool point to what it sees [m], by the tool's orientation, (n, 4) → (n, 3)."""
+        return rotations.turned(tool, self._marker)
+
+    def spread(self, lever: FloatArray) -> dict[str, FloatArray]:
+        """How much larger the noise of the tool point is than that of what it sees, as its orientation is noisy, too.
+
+        The same along all axes, as the filters of the axes know no correlation: a third of the trace.
+
+        Args:
+            lever: [m], (n, 3); NaN where the sensor tells no orientation.
+        """
+        x, y, z = np.square(lever).T
+        more = np.nan_to_num(2.0 / 3.0 * (x + y + z)) * self._variance
+        return {axis: np.sqrt(1.0 + more / sd**2) for axis, sd in self._sd.items()}
+
+
+def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole: bool) -> Source:
     """What a sensor in a frame of its own tells of the tool."""
-    sensor = config.sensors[name]
     if not set(CARTESIAN) <= source.values.keys():
         raise RunError(f"{source.label_for(name)}: has a frame or a marker, so that it must give x, y and z")
-    frame, marker = sensor.frame or _HERE, sensor.marker or _HERE
-    turn = rotations.of_vectors(np.array([frame.rotation]))
-    measured = np.column_stack([source.values[axis] for axis in CARTESIAN])
-    point = frame.at + rotations.turned(turn, measured)
-    oriented, spread = source.orientation, dict(source.spread)
-    if oriented is not None:
-        back = rotations.of_vectors(-np.array([marker.rotation]))
-        oriented = rotations.product(rotations.product(turn, oriented), back)
-    if any(marker.at):
-        tool = _commanded(name, source, run, config) if oriented is None else oriented
-        lever = rotations.turned(tool, np.array([marker.at]))
+    placing, told, spread = Placing(config.sensors[name]), source.orientation, dict(source.spread)
+    point = placing.seen(np.column_stack([source.values[axis] for axis in CARTESIAN]))
+    oriented = None if told is None else placing.oriented(told)
+    if placing.has_marker:
+        lever = np.full(point.shape, np.nan) if oriented is None else placing.lever(oriented)
+        spread |= placing.spread(lever)
+        untold = np.isnan(lever[:, 0]) & np.isfinite(point[:, 0])
+        if untold.any() and not whole:
+            raise RunError(
+                f"{source.label_for(name)}: {np.count_nonzero(untold)} rows tell no orientation, so that the commands say"
+                " where the marker is; so long a run is fused piece by piece, without: cut it into shorter runs"
+            )
+        if oriented is None or (untold.any() and _can_be_commanded(run, config)):
+            lever[untold] = placing.lever(_commanded(name, source.stamp[untold], run, config))
         point = point - lever
-        if oriented is not None:
-            spread |= _spread(sensor, lever)
     values = dict(source.values) | dict(zip(CARTESIAN, point.T.copy(), strict=True))
     return replace(source, values=values, orientation=oriented, spread=spread)
 
 
-def _spread(sensor: Sensor, lever: FloatArray) -> dict[str, FloatArray]:
-    """How much larger the noise of the tool point is than that of the marker, as its orientation is noisy, too.
-
-    The same along all axes, as the filters of the axes know no correlation: a third of the trace.
-    """
-    of_turning = np.mean([(sensor.sd_of(axis) or 0.0) ** 2 for axis in TURNING])
-    more = np.nan_to_num(2.0 / 3.0 * np.sum(lever**2, axis=1)) * of_turning
-    given = {axis: sd for axis in CARTESIAN if (sd := sensor.sd_of(axis))}
-    return {axis: np.sqrt(1.0 + more / sd**2) for axis, sd in given.items()}
+def _can_be_commanded(run: Run, config: FusionConfig) -> bool:
+    """Whether commands turn the tool."""
+    return run.command.orientation is not None and config.tool is not None and set(TURNING) <= set(config.arm.axes)
 
 
-def _commanded(name: str, source: Source, run: Run, config: FusionConfig) -> FloatArray:
+def _commanded(name: str, stamp: TimeArray, run: Run, config: FusionConfig) -> FloatArray:
     """Where the commands have turned the tool by the instants of a sensor's measurements, as quaternions, (rows, 4).
 
     Raises:
@@ -107,24 +148,29 @@ def _commanded(name: str, source: Source, run: Run, config: FusionConfig) -> Flo
         RunError: The commands' clock was set back.
     """
     commanded, arm, where = run.command.orientation, config.arm, f"sensors.{name}.marker"
-    if commanded is None or config.tool is None:
+    if commanded is None or config.tool is None or np.isnan(commanded).all():
         raise ConfigError(f"{where}: nothing tells how the tool is turned: neither the sensor nor the commands")
     if not set(TURNING) <= set(arm.axes):
         raise ConfigError(f"{where}: the sensor tells no orientation, and the arm '{arm.name}' has no axes rx, ry, rz")
-    reference, stamp = np.array(config.tool.reference), run.command.stamp
+    reference, given = np.array(config.tool.reference), run.command.stamp
     vector = rotations.vectors(commanded, reference)
-    told = np.isfinite(vector[:, 0]) & (stamp != NO_STAMP)
-    given, vector = stamp[told], vector[told]
+    told = np.isfinite(vector[:, 0]) & (given != NO_STAMP)
+    given, vector = given[told], vector[told]
     if (np.diff(given) < -TOLERATED_STEP_BACK_NS).any():
         raise RunError(f"{run.command.label}: the clock is set back; sensor '{name}' needs one time: cut the log there")
-    if (np.diff(given) < 0).any():
-        order = np.argsort(given, kind="stable")
-        given, vector = given[order], vector[order]
-    asked = np.where(source.stamp == NO_STAMP, given[0], source.stamp - round(config.sensors[name].latency * 1e9))
+    order = np.argsort(given, kind="stable")
+    given, vector = given[order], vector[order]
+    last = np.append(np.diff(given) > 0, True)  # of a stamp the last command counts
+    given, vector = given[last], vector[last]
+    asked = np.where(stamp == NO_STAMP, given[0], stamp - round(config.sensors[name].latency * 1e9))
     order = np.argsort(asked, kind="stable")
     found = np.empty((len(asked), 3))
-    for column, axis in enumerate(TURNING):
-        model, start = arm.axes[axis], float(vector[0, column])
-        moved = response(model, arm.update_period, arm.delay_of(axis), given, vector[:, column], start, asked[order])
-        found[order, column] = start + moved
+    for column, record in enumerate(turning_axes(arm)):
+        relative = vector[:, column] - vector[0, column]
+        found[order, column] = vector[0, column] + follow(record, at_rest(), given, relative, asked[order])
     return rotations.quaternions(found, reference)
+
+
+def turning_axes(arm: ArmModel) -> list[Record]:
+    """The axes rx, ry and rz of an arm, without noise, as the core takes them, relative to where they rest."""
+    return [record_of(arm.axes[axis], arm.update_period, arm.delay_of(axis), 0.0) for axis in TURNING]

@@ -19,6 +19,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS, latest_follow
 from ..fusion.setup import live_model
 from ..logs.frames import CARTESIAN
+from ..space.rotations import TURNING
 from .clock import Clock, Time, Verdict, nanoseconds
 from .commands import Commands, CommandWatch, number
 from .frame_start import FrameStart
@@ -26,6 +27,7 @@ from .health import Counts, Health, by_word
 from .rate_limit import RateLimitedLog
 from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
 from .screening import CommandScreen, HoldWatch, Screened
+from .tool import NO_TOOL, ORIENTATION, Row, axes_of, check_tool, tool_of
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
@@ -107,6 +109,7 @@ class LiveEstimator:
         for name, value in (start or {}).items():
             if not abs(number(value)) < FARTHEST:
                 raise ConfigError(f"start: the level of {name} must be a finite position in m, not {value!r:.40}")
+        check_tool(config, start or {})
         self.config = config
         self.segment = 0
         self.axes = tuple(config.arm.axes)
@@ -128,22 +131,24 @@ class LiveEstimator:
         self._start = dict(start or {})
         self._begin(Counts(len(self._sensors)))
 
-    def command(self, t: Time, /, **axes: float) -> UpdateResult:
+    def command(self, t: Time, /, **axes: Any) -> UpdateResult:
         """Add a command: the arm is to go to a position [m] on each of ``axes``.
 
         Args:
             t: When, float seconds or int nanoseconds.
-            **axes: u [m] of each commanded axis; x, y and z with a frame.
+            **axes: u [m] of each commanded axis; x, y and z with a frame; and ``orientation``, a quaternion x, y, z, w,
+                for a tool that turns.
         """
         return self._take(t, None, axes)
 
-    def measurement(self, t: Time, sensor: str, /, **axes: float) -> UpdateResult:
+    def measurement(self, t: Time, sensor: str, /, **axes: Any) -> UpdateResult:
         """Add a measurement of where the tool was.
 
         Args:
             t: Its stamp, float seconds or int nanoseconds; its latency is in the configuration.
             sensor: Its name there.
-            **axes: z [m] of each axis it saw; x, y and z with a frame.
+            **axes: z [m] of each axis it saw; x, y and z with a frame; and ``orientation``, likewise. Of a sensor with
+                a frame or a marker all are as it measures them.
         """
         return self._take(t, str(sensor), axes)
 
@@ -186,7 +191,10 @@ class LiveEstimator:
         placed = None
         if self._frame_start.placed is not None:
             placed = self._frame_start.in_log({axis: now.position for axis, now in axes.items()})
-        return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason)
+        orientation = None
+        if self._tool is not None:
+            orientation = self._tool.orientation([axes[axis].position for axis in TURNING if axis in axes])
+        return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason, orientation)
 
     @property
     def newest(self) -> int | None:
@@ -221,6 +229,19 @@ class LiveEstimator:
         right = self._clock.low <= stamp <= self._clock.high or (known and self._clock.ends_doubt(stamp, sensor))
         return stamp if right else self.sure
 
+    def of_tool(self, t: Time, sensor: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What an event that was taken tells of the tool: its orientation as axes, its position along the base's axes.
+
+        Args:
+            t: Its stamp.
+            sensor: Its name; empty for a command.
+            values: As it came.
+        """
+        if self._tool is None:
+            return values
+        parsed = self._tool.parsed(sensor or None, values)
+        return self._tool.of_tool(sensor, nanoseconds(t), parsed).values if sensor else parsed
+
     def health(self, at: Time | None = None) -> Health:
         """How each sensor does, and what became of everything so far.
 
@@ -244,6 +265,8 @@ class LiveEstimator:
         self._frame_start = FrameStart(self.config.frame, self.axes)
         model = live_model(self.config, self._frame_start.start(self._start))
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
+        self._tool = tool_of(self.config, self._log)
+        self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled at all
         self._watch.restart()
         self._screen.restart()
         self._holds.restart()
@@ -259,8 +282,13 @@ class LiveEstimator:
 
     def _take(self, t: Time, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Put an event where its stamp says, if that can be."""
+        parsed = values
         try:
             stamp = nanoseconds(t)
+            if self._tool is not None:
+                parsed = self._tool.parsed(sensor, values)
+            elif ORIENTATION in values:
+                raise ValueError(NO_TOOL)
         except ValueError as error:
             return self._refuse(sensor, values, _INVALID, str(error), self._refused)
         if sensor is not None and sensor not in self._sensors:
@@ -279,10 +307,10 @@ class LiveEstimator:
         if self._event_log is not None:
             self._event_log.append(stamp, sensor, values)
         if sensor is None:
-            return self._take_screened(stamp, values)
+            return self._take_screened(stamp, parsed)
         if stamp > self._screen.until:
             self._settle(self._screen.believed())
-        return self._enter(stamp, sensor, values)
+        return self._enter(stamp, sensor, parsed)
 
     def _take_screened(self, stamp: int, values: Mapping[str, Any]) -> UpdateResult:
         """Take a command that is in time, or let it wait for the next."""
@@ -357,6 +385,8 @@ class LiveEstimator:
         self._counts.forget(self._window, after)
         self._window.forget(after)
         self._commands.forget(after)
+        if self._tool is not None:
+            self._place_again(self._tool.forget(after))
         self._screen.restart()
         if self._event_log is not None:
             self._event_log.discard(after)
@@ -412,7 +442,10 @@ class LiveEstimator:
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any], judged: bool = False) -> UpdateResult:
         """Give an event that is in time to the window; ``judged``: nothing of it is held."""
         window, counts, given, stranger = self._window, self._counts, 0, ""
-        new = window.value
+        new, told = window.value, None
+        if self._tool is not None and sensor is not None and not judged:
+            told = self._tool.of_tool(sensor, stamp, values)
+            values, window.spread[:] = told.values, self._no_spread
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
@@ -426,6 +459,11 @@ class LiveEstimator:
         oldest = self._oldest()
         if stamp < oldest:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
+        if told is not None and sensor is not None and self._tool is not None:
+            for name in told.spread.keys() & self._bits.keys():
+                window.spread[self._bits[name]] = told.spread[name]
+            if told.seen is not None:
+                self._tool.keep(sensor, Row(stamp, told.seen, [*new, *window.spread]), oldest)
         if sensor is not None and not judged:
             held, released = self._held(stamp, sensor, given)
             if released or held:
@@ -438,7 +476,7 @@ class LiveEstimator:
         rows = window.port.end
         source = COMMAND if sensor is None else self._sensors[sensor]
         taken = window.add(stamp, source, given, oldest)
-        if self.config.frame is not None:
+        if self._spreads:
             window.spread[:] = self._no_spread
         if not taken:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
@@ -461,28 +499,29 @@ class LiveEstimator:
         return result
 
     def _without_held(
-        self, stamp: int, sensor: str, given: int, held: int, released: Sequence[tuple[int, str, float]]
+        self, stamp: int, sensor: str, given: int, held: int, released: Sequence[tuple[int, str, float, float]]
     ) -> UpdateResult:
         """Give the window what is news of a measurement that has come to it, and what was not used before and is."""
         self._counts.came(self._sensors[sensor], stamp, self._clock.sure)
         kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (given & ~held) >> axis & 1}
         again = [name for name, axis in self._bits.items() if held >> axis & 1]
         result = self._feed(stamp, sensor, kept, judged=True) if kept else refused(again, _HELD, REASONS[_HELD])
-        for earlier, name, value in released:
+        for earlier, name, value, spread in released:
+            self._window.spread[self._bits[name]] = spread
             self._feed(earlier, sensor, {name: value}, judged=True)
         return result
 
-    def _held(self, stamp: int, sensor: str, given: int) -> tuple[int, list[tuple[int, str, float]]]:
+    def _held(self, stamp: int, sensor: str, given: int) -> tuple[int, list[tuple[int, str, float, float]]]:
         """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
-        held, released, number = 0, list[tuple[int, str, float]](), self._sensors[sensor]
+        held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
         for axis, name in enumerate(self.axes):
             if not given >> axis & 1:
                 continue
             value, lag = self._window.value[axis], self._follows[number][axis]
-            found = self._holds.judge((number, axis), stamp, value, self._commands, lag)
+            found = self._holds.judge((number, axis), stamp, value, self._window.spread, self._commands, lag)
             held |= found.held << axis
             self._counts.outcomes[number, _HELD] += found.held - len(found.released)
-            released += [(earlier, name, one) for earlier, one in found.released]
+            released += [(earlier, name, one, factor) for earlier, one, factor in found.released]
             if found.sure:
                 self._log.write(
                     f"{sensor} {name} held",
@@ -499,6 +538,27 @@ class LiveEstimator:
         if outcome is _FUSED:
             self._doubtful += self._clock.doubtful
             self._watch.intervals(stamp, values)
+        if self._tool is not None:
+            self._place_again(self._tool.command(stamp, values, oldest))
+
+    def _place_again(self, since: int | None) -> None:
+        """Put measurements that the commands place where they are by now, those valid from an instant [ns] on."""
+        if self._tool is None or since is None:
+            return
+        window = self._window
+        for sensor, rows, points in self._tool.placed_since(since):
+            before = np.array([row.numbers for row in rows])
+            for row, point in zip(rows, points, strict=True):
+                values: dict[str, float] = dict(zip(CARTESIAN, point, strict=True))
+                window.value[:], window.spread[:] = row.numbers[: len(self.axes)], row.numbers[len(self.axes) :]
+                for name in values.keys() & self._bits.keys():
+                    window.value[self._bits[name]] = values[name]
+                if self.config.frame is not None:
+                    self._turned(row.stamp, sensor, values)
+                row.numbers = [*window.value, *window.spread]
+            stamps, now = np.array([row.stamp for row in rows]), np.array([row.numbers for row in rows])
+            window.amend(self._sensors[sensor], stamps, before, now)
+        window.spread[:] = self._no_spread
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
@@ -569,7 +629,7 @@ class LiveEstimator:
     ) -> UpdateResult:
         """Count an event that never comes into the window, among ``outcomes``."""
         self._count(sensor, values, outcome, outcomes, 1)
-        return refused(values, outcome, reason)
+        return refused(axes_of(values), outcome, reason)
 
     def _count(
         self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, outcomes: IntArray, times: int
@@ -578,6 +638,6 @@ class LiveEstimator:
         if sensor is None:
             outcomes[COMMAND, outcome] += times
         elif sensor in self._sensors:
-            outcomes[self._sensors[sensor], outcome] += times * len(values)
+            outcomes[self._sensors[sensor], outcome] += times * len(axes_of(values))
         else:
             self._strangers += times

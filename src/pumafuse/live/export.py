@@ -59,7 +59,7 @@ def header(config: FusionConfig, name: str, source: str) -> str:
         mark=MARK,
         version=version("pumafuse"),
         source=_comment(source),
-        frame="" if config.frame is None else ", in the axes of the arm: its [frame] is not in here",
+        frame="" if (missing := left_out(config)) is None else f", in the axes of the arm: {missing} not in here",
         upper=upper,
         name=name,
         interface=VERSION,
@@ -69,6 +69,15 @@ def header(config: FusionConfig, name: str, source: str) -> str:
         sensor=_structs(sensor, sensors),
         view=_structs(view.ravel(), (f"{one} on {axis}" for one in sensors for axis in axes)),
     )
+
+
+def left_out(config: FusionConfig) -> str | None:
+    """What of a configuration turns events into the arm's axes and is not in its header, with a verb; or None."""
+    placed = [name for name, sensor in config.sensors.items() if sensor.is_placed]
+    parts = ["its [frame]"] if config.frame is not None else []
+    parts += ["the reference of its [tool]"] if config.tool is not None else []
+    parts += [f"frame and marker of {', '.join(placed)}"] if placed else []
+    return f"{'; '.join(parts)} {'is' if len(parts) == 1 and not placed else 'are'}" if parts else None
 
 
 def identifier(text: str) -> str:

@@ -23,8 +23,11 @@ from ..fusion.config import FusionConfig
 from ..logs.clock import TOLERATED_STEP_BACK_NS
 from ..logs.frames import CARTESIAN
 from ..logs.save import check_axis, check_name
+from ..space.rotations import TURNING
 from ..units import SCREEN
+from .commands import number
 from .rate_limit import RateLimitedLog
+from .tool import ORIENTATION, takes_orientation
 
 _FLUSHED = 0.5  # s between two writes
 _REPORTED_AGAIN = 60.0  # s until a trouble that lasts is reported again
@@ -34,12 +37,13 @@ _TRIED_AGAIN = 1.0  # s after the disk refused
 _MOST_WAITING = 64 << 20  # bytes that wait for a disk
 _PATIENCE = 5.0  # s for the disk at the end
 _COMMANDS, _MANIFEST, _TIME = "commands.csv", "run.toml", "time_ns"
+_QUATERNION = ["qx", "qy", "qz", "qw"]  # columns
 
 
 class _Row(NamedTuple):
     stamp: int
     sensor: str | None
-    given: list[str]  # axes with a value
+    given: list[str]  # axes with a value, and whether it has an orientation
     line: bytes
 
 
@@ -70,7 +74,8 @@ class Recorder:
             FolderError: The folder holds something, or cannot be made.
             RunError: A sensor or axis has a name that a recorded run cannot have.
         """
-        axes = config.arm.axes
+        turns = takes_orientation(config)
+        axes = [axis for axis in config.arm.axes if not (turns and axis in TURNING)]
         for sensor in config.sensors:
             check_name(sensor)
         for axis in axes:
@@ -86,7 +91,8 @@ class Recorder:
         self._segment = self._folders = 1
         check_writable(folder, force=False, markers=(), ours=lambda _: False)
         folder.mkdir(parents=True, exist_ok=True)
-        self._writer = Writer(",".join((_TIME, *self._columns.values())).encode() + b"\n")
+        self._turning = _QUATERNION if turns else []
+        self._writer = Writer(",".join((_TIME, *self._columns.values(), *self._turning)).encode() + b"\n")
         self._due, self._reported, self._troubled = 0.0, -math.inf, False
         self._clear()
 
@@ -110,17 +116,18 @@ class Recorder:
         Args:
             stamp: Int ns.
             sensor: None for a command.
-            values: By axis [m or rad].
+            values: By axis [m or rad], and an orientation.
         """
         cells = {axis: _cell(values[axis], scale) for axis, scale in self._scales.items() if axis in values}
-        if not cells:
+        turned = [repr(number(one)) for one in values[ORIENTATION]] if ORIENTATION in values else []
+        if not cells and not turned:
             return
-        given = [axis for axis, cell in cells.items() if cell]
+        given = [axis for axis, cell in cells.items() if cell] + [ORIENTATION] * bool(turned)
         if sensor is None and given and not self._commanded:
             self._commanded, self._due = True, 0.0
         elif not self._commanded and len(self._pending) >= _MOST_BEFORE:
             del self._pending[: _MOST_BEFORE // 2]
-        line = ",".join([cells.get(axis, "") for axis in self._columns])
+        line = ",".join([cells.get(axis, "") for axis in self._columns] + (turned or [""] * len(self._turning)))
         self._pending.append(_Row(stamp, sensor, given, f"{stamp},{line}\n".encode()))
 
     def discard(self, after: int) -> None:
@@ -226,6 +233,7 @@ class Recorder:
                 "file": _file(sensor),
                 "time": _TIME,
                 **{axis: column for axis, column in self._columns.items() if axis in seen},
+                **({ORIENTATION: {"quaternion": self._turning}} if ORIENTATION in seen else {}),
             }
             for sensor, seen in self._seen.items()
             if sensor in listed

@@ -89,6 +89,7 @@ class LiveEstimate:
         outcome: ``fused``; ``before_start`` or ``too_late`` where there is no estimate; ``invalid`` where there is none
             that far ahead.
         reason: In words.
+        orientation: Of a tool that turns, a quaternion x, y, z, w; else None.
     """
 
     stamp: int
@@ -97,6 +98,7 @@ class LiveEstimate:
     stale: tuple[str, ...]
     outcome: Outcome
     reason: str
+    orientation: tuple[float, float, float, float] | None = None
 
     @property
     def time(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
+from ctypes import Array, c_double
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,7 +69,7 @@ class _Repeated:
         """No value yet."""
         self.value, self.stamp, self.since, self.count, self.leapt = math.nan, ALWAYS, ALWAYS, 0, False
         self.low, self.high = 0.0, 0.0
-        self.waiting, self.believed = list[tuple[int, float]](), False
+        self.waiting, self.believed = list[tuple[int, float, float]](), False
         self.habit: Habit | None = None
         self._steps, self._lengths = deque[float](maxlen=_REMEMBERED), deque[int](maxlen=_REMEMBERED)
         self._new = 0
@@ -106,12 +107,13 @@ class Judged(NamedTuple):
     Attributes:
         held: Whether it is not used, at least not now.
         sure: Whether it never will be.
-        released: Stamps [ns] and values [m] of those before it that were not used, and are news after all.
+        released: Of those before it that were not used, and are news after all: stamp [ns], value [m], and by what its
+            noise is scaled.
     """
 
     held: bool
     sure: bool
-    released: Sequence[tuple[int, float]] = ()
+    released: Sequence[tuple[int, float, float]] = ()
 
 
 _NEWS = Judged(False, False)
@@ -133,13 +135,16 @@ class HoldWatch:
         """Begin anew by another clock."""
         self._seen = dict[tuple[int, int], _Repeated]()
 
-    def judge(self, key: tuple[int, int], stamp: int, value: float, commands: Commands, lag: int) -> Judged:
+    def judge(
+        self, key: tuple[int, int], stamp: int, value: float, spreads: Array[c_double], commands: Commands, lag: int
+    ) -> Judged:
         """Judge a value; where they come out of order nothing is held.
 
         Args:
             key: Which sensor, and which axis.
             stamp: Int ns.
             value: [m].
+            spreads: By what the noise of each axis is scaled.
             commands: As far as they have come.
             lag: How late the axis may follow them [ns].
         """
@@ -166,7 +171,7 @@ class HoldWatch:
         odd = led != before and (one.leapt or one.repeats ** (one.count - 1) < _ODD)
         if one.believed or not (odd or habit.is_clear(max(led - one.low, one.high - led))):
             return _NEWS
-        waited.append((stamp, value))
+        waited.append((stamp, value, spreads[axis]))
         if stamp - waited[0][0] <= self._patience:
             return Judged(True, False)
         one.waiting, one.believed = [], True

@@ -7,6 +7,7 @@ import os
 import select
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.segments import as_commanded
 from ..logs.clock import segments
 from ..logs.run import Run, Source
+from .tool import ORIENTATION
 from .wire import Event, Lines
 
 QUIET = 0.1  # s without an event after which a source gives an empty list
@@ -53,6 +55,8 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
     Raises:
         RunError: The clocks of the run cannot be followed.
     """
+    if run.clock != "stamps" and run.has_orientation:
+        raise RunError(f"run '{run.name}': with orientations its clock = '{run.clock}' cannot be replayed; fuse it")
     for part in segments(run)[0]:
         yield from _paced(*_arrivals(part, config), speed)
 
@@ -69,9 +73,12 @@ def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
 def _events(name: str, source: Source) -> Iterator[Event]:
     """The rows of a sensor, or of commands (no name), which give only the axes that they have a value for, if any."""
     columns: list[list[float]] = [value.tolist() for value in source.values.values()]
-    for stamp, *row in zip(source.stamp.tolist(), *columns, strict=True):
+    turned = [None] * len(source.stamp) if source.orientation is None else source.orientation.tolist()
+    for stamp, orientation, *row in zip(source.stamp.tolist(), turned, *columns, strict=True):
         every = dict(zip(source.values, row, strict=True))
-        values = {axis: value for axis, value in every.items() if name or value == value}
+        values: dict[str, Any] = {axis: value for axis, value in every.items() if name or value == value}
+        if orientation is not None and orientation[0] == orientation[0]:
+            values[ORIENTATION] = orientation
         yield Event(math.nan if stamp == NO_STAMP else stamp, name, values or every)
 
 

@@ -22,7 +22,7 @@ class Watcher(Protocol):
     """Receiver of all events and estimates, called at once: it must not take long."""
 
     def event(self, event: Event, result: UpdateResult) -> None:
-        """Receive an event and what became of it."""
+        """Receive an event and what became of it; of one that was taken what it tells of the tool."""
 
     def estimate(self, estimate: LiveEstimate) -> None:
         """Receive an estimate that goes out."""
@@ -99,6 +99,8 @@ class Stream:
         if self._step is not None:
             self._on_grid(live.until(t, sensor or None))
         result = live.measurement(t, sensor, **values) if sensor else live.command(t, **values)
+        if self._watchers and result.outcome in COMPARED:
+            event = event._replace(values=live.of_tool(t, sensor, values))
         for watcher in self._watchers:
             watcher.event(event, result)
         waits = result.outcome is Outcome.STRAY  # whether it is stray is said once the next has come

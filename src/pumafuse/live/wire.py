@@ -11,11 +11,14 @@ from msgspec import UNSET, UnsetType
 
 from ..errors import ConfigError
 from ..logs.frames import CARTESIAN
+from ..space.rotations import TURNING
 from ..units import MM, SCREEN, Kind
 from .results import LiveEstimate
+from .tool import ORIENTATION
 
 _LONGEST = 64 * 1024  # bytes of a line
 _NAMES = ("t", "t_ns", "command", "sensor")
+_QUATERNION = "q"  # x, y, z, w; an arm that does not turn a tool may have an axis of this name
 _KEYS = {  # of an estimate, and their scale
     kind: (f"position_{one.unit}", f"sd_{one.unit}", f"velocity_{one.unit}_s", one.scale)
     for kind, one in SCREEN.items()
@@ -63,7 +66,8 @@ class Event(NamedTuple):
     Attributes:
         t: Float seconds or int nanoseconds.
         sensor: Its name, empty for a command.
-        values: By axis [m or rad]; values under unknown names are passed on as they are.
+        values: By axis [m or rad], and an orientation as a quaternion x, y, z, w; values under unknown names are passed
+            on as they are.
     """
 
     t: float | int
@@ -83,12 +87,18 @@ class LineDecoder:
         every: dict[str, Kind] = {**dict.fromkeys(CARTESIAN if framed else (), "length"), **kinds}
         self._axes = tuple(dict.fromkeys((*kinds, *every)))
         self._scales = [SCREEN[every[axis]].scale for axis in self._axes]
+        self._turns = _QUATERNION not in kinds or set(TURNING) <= kinds.keys()
+        self._names = (*_NAMES, _QUATERNION) if self._turns else _NAMES
         for axis in self._axes:
-            if axis in _NAMES:
-                raise ConfigError(f"axis '{axis}': lines of a stream call something else so ({', '.join(_NAMES)})")
-        fields = [(f"axis_{number}", float | UnsetType | None, UNSET) for number in range(len(self._axes))]
+            if axis in self._names:
+                raise ConfigError(f"axis '{axis}': lines of a stream call something else so ({', '.join(self._names)})")
+        fields: list[tuple[str, Any, Any]] = [
+            (f"axis_{number}", float | UnsetType | None, UNSET) for number in range(len(self._axes))
+        ]
         names = {f"axis_{number}": axis for number, axis in enumerate(self._axes)}
         options: dict[str, Any] = {"rename": names, "forbid_unknown_fields": True, "gc": False}
+        if self._turns:
+            fields.append((_QUATERNION, tuple[float, float, float, float] | UnsetType | None, UNSET))
         command = msgspec.defstruct("Command", fields, **options)
         head = [
             ("t", float | None, None),
@@ -124,30 +134,34 @@ class LineDecoder:
         if command is not None:
             if sensor is not None or any(value is not UNSET for value in values):
                 raise BadLine("gives a command and a measurement at once")
-            sensor, values = "", msgspec.structs.astuple(command)
+            sensor, values = "", [*msgspec.structs.astuple(command)]
         elif not sensor:
             raise BadLine("gives neither 'command' nor 'sensor'" if sensor is None else "'sensor' is empty")
         if (t is None) == (t_ns is None):
             raise BadLine("needs one of 't' (s) and 't_ns' (ns)")
+        orientation = values.pop() if self._turns else None
         by_axis: dict[str, Any] = {
             axis: float("nan") if value is None else cast(float, value) / scale
             for axis, scale, value in zip(self._axes, self._scales, values, strict=True)
             if value is not UNSET
         }
+        if isinstance(orientation, tuple):
+            by_axis[ORIENTATION] = orientation
         return Event(cast(float | int, t if t_ns is None else t_ns), sensor, by_axis | unknown)
 
     def _without_unknown(self, line: bytes) -> tuple[msgspec.Struct, dict[str, Any]]:
         """A line without its unknown names, and the values under those."""
         tree = cast(dict[str, Any], msgspec.json.decode(line))
-        unknown = {name: tree.pop(name) for name in list(tree) if name not in _NAMES and name not in self._axes}
+        unknown = {name: tree.pop(name) for name in list(tree) if name not in self._names and name not in self._axes}
         if isinstance(tree.get("command"), dict):
             command = cast(dict[str, Any], tree["command"])
-            unknown |= {name: command.pop(name) for name in list(command) if name not in self._axes}
+            known = {*self._axes, *self._names[len(_NAMES) :]}
+            unknown |= {name: command.pop(name) for name in list(command) if name not in known}
         return self._decoder.decode(msgspec.json.encode(tree)), unknown
 
 
 def encode(estimate: LiveEstimate, kinds: Mapping[str, Kind], with_ns: bool) -> bytes:
-    """The line of an estimate: position, its sd and velocity of each axis, x, y, z with a frame, and stale axes.
+    """The line of an estimate: each axis's position, sd and velocity, x, y, z with a frame, q of a tool, stale axes.
 
     Args:
         estimate: The estimate.
@@ -162,6 +176,8 @@ def encode(estimate: LiveEstimate, kinds: Mapping[str, Kind], with_ns: bool) -> 
         line[name] = {position: axis.position * scale, sd: axis.position_sd * scale, velocity: axis.velocity * scale}
     for name, position in (estimate.cartesian or {}).items():
         line[f"{name}_mm"] = position * MM
+    if estimate.orientation is not None:
+        line[_QUATERNION] = estimate.orientation
     if estimate.stale:
         line["stale"] = estimate.stale
     return msgspec.json.encode(line) + b"\n"

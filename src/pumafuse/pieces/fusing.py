@@ -163,7 +163,7 @@ def _piece(
     own: tuple[int, int],
 ) -> Estimates:
     """The estimates of the rows after and until the instants ``own`` [int ns], with notes."""
-    in_place, placed, config = in_base(run, config)
+    in_place, placed, config = in_base(run, config, whole=False)
     lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
         raise RunError(

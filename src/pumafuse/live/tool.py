@@ -1,0 +1,304 @@
+"""A tool that turns, in a stream: orientations as axes, and what sensors in frames of their own tell of it.
+
+Where a sensor tells no orientation, its rows are placed by the commands that act until they are valid. They are kept:
+a command that comes late places them anew.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from ..arrays import ALWAYS, FloatArray, IntArray, TimeArray
+from ..errors import ConfigError
+from ..filter.core import Record
+from ..filter.response import at_rest, follow
+from ..fusion.config import FusionConfig
+from ..fusion.placing import Placing, turning_axes
+from ..logs.axes import FAR_TURN, FARTHEST_TURN
+from ..logs.frames import CARTESIAN
+from ..model.arm import ArmModel
+from ..space import rotations
+from ..space.rotations import TURNING
+from .commands import number
+from .rate_limit import RateLimitedLog
+
+ORIENTATION = "orientation"  # what an event calls its quaternion x, y, z, w
+NO_TOOL = (
+    "an orientation needs axes rx, ry, rz of the arm, and [tool] reference_rotation_vector_deg in fusion.toml; init,"
+    " tune and register write it"
+)
+
+
+def axes_of(values: Iterable[str]) -> list[str]:
+    """The names of what an event gives: an orientation is rx, ry and rz."""
+    return [axis for name in values for axis in (TURNING if name == ORIENTATION else (name,))]
+
+
+def check_tool(config: FusionConfig, start: Mapping[str, float]) -> None:
+    """Refuse a configuration by which a stream cannot tell how the tool is turned.
+
+    Raises:
+        ConfigError: It has a marker and no reference orientation; or the start has an orientation.
+    """
+    turns = set(TURNING) <= set(config.arm.axes)
+    if turns and config.tool is None:
+        for name, sensor in config.sensors.items():
+            if sensor.is_placed and Placing(sensor).has_marker:
+                raise ConfigError(f"sensors.{name}.marker: {NO_TOOL}")
+    if config.tool is not None and (named := [axis for axis in TURNING if axis in start]):
+        raise ConfigError(f"start: {named[0]}: a tool that turns starts at its first commanded orientation")
+
+
+def takes_orientation(config: FusionConfig) -> bool:
+    """Whether events may have an orientation: as axes, or to say where the tool point is from what a sensor sees."""
+    if set(TURNING) <= set(config.arm.axes):
+        return config.tool is not None
+    return any(sensor.is_placed for sensor in config.sensors.values())
+
+
+def tool_of(config: FusionConfig, log: RateLimitedLog) -> Tool | None:
+    """The tool of a configuration that has a reference orientation, or sensors in frames of their own; else None."""
+    placed = any(sensor.is_placed for sensor in config.sensors.values())
+    return Tool(config, log) if placed or config.tool is not None else None
+
+
+class Told(NamedTuple):
+    """What a measurement tells of the tool.
+
+    Attributes:
+        values: By axis.
+        spread: By what the noise of some is scaled.
+        seen: What the sensor saw, along the base's axes [m], (3,), if the commands say where the tool point is from it.
+    """
+
+    values: dict[str, Any]
+    spread: dict[str, float]
+    seen: FloatArray | None
+
+
+@dataclass(slots=True)
+class Row:
+    """A measurement of a sensor that tells no orientation.
+
+    Attributes:
+        stamp: Int ns.
+        seen: What the sensor saw, along the base's axes [m], (3,).
+        numbers: Values and spreads as they are in the window, (2 A,).
+    """
+
+    stamp: int
+    seen: FloatArray
+    numbers: list[float]
+
+
+class Tool:
+    """What events tell of a tool that turns, as axes; bit for bit as :mod:`pumafuse.fusion.placing` has it."""
+
+    def __init__(self, config: FusionConfig, log: RateLimitedLog) -> None:
+        """Nothing known yet; ``log`` gets the sentences."""
+        self._log, arm = log, config.arm
+        turns = set(TURNING) <= set(arm.axes)
+        self._reference = np.array(config.tool.reference) if turns and config.tool is not None else None
+        self._placings = {name: Placing(sensor) for name, sensor in config.sensors.items() if sensor.is_placed}
+        self._takes_orientation = takes_orientation(config)
+        self._latency = {name: round(config.sensors[name].latency * 1e9) for name in self._placings}
+        self._rows: dict[str, list[Row]] = {}
+        if self._reference is not None:
+            self._rows = {name: [] for name, placing in self._placings.items() if placing.has_marker}
+        self._turn = CommandedTurn(arm) if self._rows else None
+        self._behind = round((max(map(arm.delay_of, arm.axes)) + max((*self._latency.values(), 0)) / 1e9) * 1e9)
+
+    def parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """An event's values: a commanded orientation as axes, a measured one as a quaternion, (1, 4).
+
+        Raises:
+            ValueError: It cannot be used; says why.
+        """
+        if self._reference is not None and (twice := next((axis for axis in TURNING if axis in values), None)):
+            raise ValueError(f"'{twice}': with [tool] an orientation comes as a quaternion x, y, z, w")
+        if ORIENTATION not in values:
+            return values
+        if not self._takes_orientation:
+            raise ValueError(NO_TOOL)
+        found = dict(values)
+        told = unit(found.pop(ORIENTATION))
+        if sensor is not None:
+            return found | {ORIENTATION: told}
+        return found if self._reference is None else found | self._commanded(told, self._reference)
+
+    def _commanded(self, told: FloatArray, reference: FloatArray) -> dict[str, float]:
+        """A commanded orientation (1, 4) as axes.
+
+        Raises:
+            ValueError: It is too far from the reference orientation.
+        """
+        vector: list[float] = rotations.vectors(told, reference)[0].tolist()
+        turn = math.hypot(*vector)
+        far = f"the tool is told to turn by {math.degrees(turn):.0f}° from its reference orientation"
+        if turn > FARTHEST_TURN:
+            raise ValueError(f"{far}; up to 170° can be followed: give another [tool] in fusion.toml")
+        if turn > FAR_TURN:
+            self._log.write("turn", f"{far}: beyond 120° error bars of its orientation are too small")
+        return dict(zip(TURNING, vector, strict=True))
+
+    def of_tool(self, sensor: str, stamp: int, values: Mapping[str, Any]) -> Told:
+        """What a sensor tells of the tool.
+
+        Args:
+            sensor: Its name.
+            stamp: Int ns.
+            values: Of :meth:`parsed`.
+        """
+        found, spread = dict(values), dict[str, FloatArray]()
+        oriented: FloatArray | None = found.pop(ORIENTATION, None)
+        placing, seen = self._placings.get(sensor), None
+        if placing is not None:
+            point = placing.seen(np.array([[number(values.get(axis)) for axis in CARTESIAN]]))
+            oriented = None if oriented is None else placing.oriented(oriented)
+            if placing.has_marker and oriented is None:
+                seen = point[0]
+                point = point - self._lever(sensor, np.array([stamp]))
+            elif placing.has_marker and oriented is not None:
+                lever = placing.lever(oriented)
+                point, spread = point - lever, placing.spread(lever)
+            found.update(zip(CARTESIAN, point[0].tolist(), strict=True))
+        if oriented is not None and self._reference is not None:
+            vector = rotations.vectors(oriented, self._reference)
+            found.update(zip(TURNING, vector[0].tolist(), strict=True))
+            spread |= dict.fromkeys(TURNING, rotations.spread(vector))
+        return Told(found, {axis: float(factor[0]) for axis, factor in spread.items()}, seen)
+
+    def _lever(self, sensor: str, stamp: TimeArray) -> FloatArray:
+        """From the tool point to what a sensor sees [m], by the commands, (n, 3); NaN as long as there is none."""
+        if self._turn is None or self._reference is None:
+            return np.full((len(stamp), 3), np.nan)
+        turn = self._turn.at(stamp - self._latency[sensor])
+        return self._placings[sensor].lever(rotations.quaternions(turn, self._reference))
+
+    def keep(self, sensor: str, row: Row, oldest: int) -> None:
+        """Keep a row that the commands place; nothing that is stamped before ``oldest`` [ns] will come any more."""
+        if (rows := self._rows.get(sensor)) is not None:
+            rows.insert(bisect_right(rows, row.stamp, key=_stamp), row)
+            if rows[0].stamp < oldest - self._behind:
+                del rows[0]
+
+    def command(self, stamp: int, values: Mapping[str, Any], oldest: int) -> int | None:
+        """Take a command in; from which instant on it turns the tool otherwise than was known [ns], if from any."""
+        if self._turn is None or any(axis not in values for axis in TURNING):
+            return None
+        return self._turn.add(stamp, [values[axis] for axis in TURNING], oldest - self._behind)
+
+    def forget(self, after: int) -> int | None:
+        """Take back all that is stamped after an instant [ns]; from when on the tool is turned otherwise then [ns]."""
+        for rows in self._rows.values():
+            del rows[bisect_right(rows, after, key=_stamp) :]
+        return None if self._turn is None else self._turn.forget(after)
+
+    def placed_since(self, since: int) -> Iterator[tuple[str, Sequence[Row], list[list[float]]]]:
+        """The rows of each sensor that are valid from an instant [ns] on, and where they place the tool point now."""
+        for name, rows in self._rows.items():
+            late = rows[bisect_left(rows, since, key=lambda row: row.stamp - self._latency[name]) :]
+            if late:
+                lever = self._lever(name, np.array([row.stamp for row in late]))
+                yield name, late, (np.array([row.seen for row in late]) - lever).tolist()
+
+    def orientation(self, turn: Sequence[float]) -> tuple[float, float, float, float] | None:
+        """The quaternion x, y, z, w of rx, ry and rz [rad]; None where these are no orientation."""
+        if self._reference is None or len(turn) != len(TURNING):
+            return None
+        x, y, z, w = rotations.quaternions(np.array([turn]), self._reference)[0].tolist()
+        return x, y, z, w
+
+
+class CommandedTurn:
+    """How the commands turn the tool, without noise: by all that have come, in whatever order."""
+
+    def __init__(self, arm: ArmModel) -> None:
+        """No command yet."""
+        self._axes: list[Record] = turning_axes(arm)
+        self._delay = [round(arm.delay_of(axis) * 1e9) for axis in TURNING]
+        self._given: list[int] = []
+        self._vector: list[list[float]] = []
+        self._motion: list[list[Record]] = []  # of each axis, after each of them
+        self._start = [math.nan] * len(TURNING)
+
+    def add(self, stamp: int, vector: list[float], oldest: int) -> int | None:
+        """Add a command, in the place of one of the same stamp; from when on it turns the tool otherwise, if it does.
+
+        Args:
+            stamp: Int ns.
+            vector: rx, ry and rz [rad].
+            oldest: Nobody will ask for what was before [ns].
+        """
+        place = bisect_left(self._given, stamp)
+        again = place < len(self._given) and self._given[place] == stamp
+        if again and self._vector[place] == vector:
+            return None
+        self._given[place : place + again], self._vector[place : place + again] = [stamp], [vector]
+        if place == 0:
+            self._start = vector
+        del self._motion[place:]
+        for later in range(place, len(self._given)):
+            self._motion.append([self._after(later, axis) for axis in range(len(TURNING))])
+        if len(self._given) > 2 and self._given[2] <= oldest:  # one acts then, and one may be given anew
+            del self._given[0], self._vector[0], self._motion[0]
+        return stamp + min(self._delay) if place else ALWAYS
+
+    def _after(self, place: int, axis: int) -> Record:
+        """What an axis does after a command."""
+        motion = self._motion[place - 1][axis].copy() if place else at_rest()
+        given, relative = self._commands(slice(place, place + 1), axis)
+        follow(self._axes[axis], motion, given, relative, np.empty(0, np.int64))
+        return motion
+
+    def _commands(self, chosen: slice, axis: int) -> tuple[TimeArray, FloatArray]:
+        """Stamps of commands, and an axis relative to where it starts."""
+        relative = np.array([vector[axis] - self._start[axis] for vector in self._vector[chosen]])
+        return np.array(self._given[chosen], dtype=np.int64), relative
+
+    def at(self, time: IntArray) -> FloatArray:
+        """rx, ry and rz [rad] at some instants, int64 ns, ascending, (n,) → (n, 3); NaN before any command is known."""
+        found = np.full((len(time), len(TURNING)), np.nan)
+        if not self._given:
+            return found
+        first, last = int(time[0]), int(time[-1])
+        for axis, delay in enumerate(self._delay):
+            place, end = (bisect_right(self._given, instant - delay) for instant in (first, last))
+            motion = self._motion[place - 1][axis].copy() if place else at_rest()
+            moved = follow(self._axes[axis], motion, *self._commands(slice(place, end), axis), time)
+            found[:, axis] = self._start[axis] + moved
+        return found
+
+    def forget(self, after: int) -> int | None:
+        """Take back the commands stamped after an instant [ns]; from when on the tool is turned otherwise then [ns]."""
+        place = bisect_right(self._given, after)
+        if place == len(self._given):
+            return None
+        since = self._given[place] + min(self._delay)
+        del self._given[place:], self._vector[place:], self._motion[place:]
+        return since if place else ALWAYS
+
+
+def unit(orientation: Any) -> FloatArray:
+    """A quaternion x, y, z, w of norm 1, (1, 4).
+
+    Raises:
+        ValueError: It is none.
+    """
+    listed = isinstance(orientation, list | tuple) or (isinstance(orientation, np.ndarray) and orientation.ndim == 1)
+    given = cast(Sequence[Any], orientation) if listed else ()
+    parts = [number(one) for one in given] if len(given) == 4 else [math.nan] * 4
+    found = rotations.of_quaternions(np.array([parts]))
+    if not np.isfinite(found).all():
+        raise ValueError(f"the orientation is no quaternion x, y, z, w of norm 1: {orientation!r:.60}")
+    return found
+
+
+def _stamp(row: Row) -> int:
+    return row.stamp

@@ -1,0 +1,312 @@
+"""A tool that turns, live: orientations, sensors in frames of their own, and what they are to the last bit."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import pumafuse as pf
+from pumafuse.fusion.config import Placement
+from pumafuse.fusion.placing import with_tool
+from pumafuse.live.export import header
+from pumafuse.live.record import Recorder
+from pumafuse.live.sources import replayed
+from pumafuse.live.stream import Stream
+from pumafuse.live.wire import BadLine, Event, LineDecoder
+from pumafuse.logs.frames import Rotated
+from streams import counted, delayed, differences, events_of, feed, outcomes_of
+
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+LENGTH = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04), gain=pf.Gain(slope=0.001))
+ANGLE = pf.AxisModel(
+    kind="angle",
+    plant=pf.SecondOrder(natural_frequency=45.0, damping=0.9),
+    gain=pf.Gain(intercept=0.98),
+    gain_recovery=0.1,
+)
+# It acts later than the others.
+SLOW = msgspec.structs.replace(ANGLE, delay=0.06, plant=pf.FirstOrder(time_constant=0.026))
+ARM = pf.ArmModel(
+    name="any",
+    update_period=0.028,
+    delay=0.046,
+    axes={"x": LENGTH, "y": LENGTH, "z": LENGTH, "rx": ANGLE, "ry": SLOW, "rz": ANGLE},
+)
+MOCAP = Placement(at=(2.1, -1.3, 0.7), rotation=(-2.585, 0.919, -0.12))
+ON_TOOL = Placement(at=(0.03, -0.05, 0.12), rotation=(1.147, -0.726, -0.106))
+TRACKER, REFLECTOR = (
+    Placement(at=(-0.9, 3.2, 0.45), rotation=(-0.035, 0.004, -1.955)),
+    Placement(at=(0.0, 0.062, 0.035)),
+)
+SD = {"x": 1.5e-4, "y": 1.5e-4, "z": 4e-4, "rx": 9e-4, "ry": 9e-4, "rz": 2e-3}
+CONFIG = pf.FusionConfig(
+    arm=ARM,
+    sensors={
+        "mocap": pf.Sensor(sd=SD, latency=0.012, gate=8.0, frame=MOCAP, marker=ON_TOOL),
+        "tracker": pf.Sensor(sd=dict.fromkeys("xyz", 2e-4), latency=0.005, frame=TRACKER, marker=REFLECTOR),
+        "camera": pf.Sensor(sd=SD, latency=0.03),
+    },
+)
+
+
+def pose(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """A motion of the tool: where it is [m], (n, 3), and how it is turned, up to 70° from its mean."""
+    at = 0.1 * np.column_stack([np.sin(time), np.sin(0.7 * time + 1.0), np.cos(1.3 * time)]) + [0.5, 0.2, -0.1]
+    turn = np.column_stack([0.9 * np.sin(0.9 * time), 0.5 * np.sin(1.7 * time), 0.8 * np.cos(0.6 * time)])
+    return at, Rotation.from_rotvec(turn) * Rotation.from_rotvec([-1.6, 0.2, 0.4])
+
+
+def seen(sensor: pf.Sensor, at: np.ndarray, turned: Rotation, rng: np.random.Generator) -> tuple[np.ndarray, Rotation]:
+    """What a sensor measures of poses, with noise: by scipy, the other way round than pumafuse computes."""
+    frame, marker = sensor.frame or Placement(), sensor.marker or Placement()
+    stands, on_tool = Rotation.from_rotvec(frame.rotation), Rotation.from_rotvec(marker.rotation)
+    point = stands.inv().apply(at + turned.apply(marker.at) - frame.at)
+    noise = Rotation.from_rotvec(rng.normal(0.0, 9e-4, point.shape))
+    return point + rng.normal(0.0, 1e-4, point.shape), noise * (stands.inv() * turned * on_tool)
+
+
+def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 6.0) -> pf.Run:
+    """A run of commands and of all sensors, of which the tracker tells no orientation."""
+    rng, lag = np.random.default_rng(8), 0.086
+    given = np.sort(
+        np.arange(0, round(seconds * 1e9), 28_000_000) + rng.integers(0, 3_000_000, round(seconds / 0.028) + 1)
+    )
+    at, turned = pose(given / 1e9)
+    command = dict(zip("xyz", at.T, strict=True)) | {"orientation": turned.as_quat()}
+    sensors = {}
+    for name, rate in (("mocap", 90.0), ("tracker", 70.0), ("camera", 25.0)):
+        stamp = np.sort(rng.integers(-50_000_000, round(seconds * 1e9), round(seconds * rate)))
+        sensor = config.sensors[name]
+        point, oriented = seen(sensor, *pose(np.maximum(stamp / 1e9 - sensor.latency - lag, 0.0)), rng)
+        values = dict(zip("xyz", point.T, strict=True))
+        sensors[name] = stamp, values if name == "tracker" else values | {"orientation": oriented.as_quat()}
+    return pf.Run.from_arrays(given, command, sensors)
+
+
+RUN = run_of()
+KNOWN = with_tool(CONFIG, RUN)
+
+
+# The same arm, its log in another frame: x, y, z are turned into its axes once they are the tool's.
+FRAMED = msgspec.structs.replace(
+    KNOWN,
+    arm=msgspec.structs.replace(
+        ARM,
+        axes={**dict.fromkeys(("tangential", "radial", "vertical"), LENGTH), "rx": ANGLE, "ry": SLOW, "rz": ANGLE},
+    ),
+    frame=Rotated(azimuth=0.4),
+    process={},
+    sensors={name: msgspec.structs.replace(sensor, sd=3e-4) for name, sensor in KNOWN.sensors.items()},
+)
+
+
+@pytest.mark.parametrize("longest", [0.0, 1.2])
+def test_in_a_frame_of_the_arm(longest: float) -> None:
+    """What sensors and commands tell in x, y, z becomes the arm's tangential, radial and vertical, as offline."""
+    offline, live = pf.fuse(RUN, FRAMED), pf.LiveEstimator(FRAMED)
+    assert differences(live, delayed(events_of(RUN), longest, seed=2), offline, longest + 0.25) == []
+
+
+@pytest.mark.parametrize("longest", [0.0, 1.2])
+def test_in_any_order(longest: float) -> None:
+    """Each event up to 1.2 s late, a tenth twice: the offline estimates, also of what the commands place."""
+    offline, live = pf.fuse(RUN, KNOWN), pf.LiveEstimator(KNOWN)
+    events = events_of(RUN)
+    arrivals = delayed(events, longest, seed=5, twice=0.1) if longest else events
+    assert differences(live, arrivals, offline, longest + 0.25) == []
+    expected = {
+        sensor: {outcome: count for outcome, count in counts.items() if outcome != "duplicate"}
+        for sensor, counts in outcomes_of(offline).items()
+    }
+    assert counted(live, "duplicate") == expected
+    for sensor in ("mocap", "tracker", "camera"):
+        assert expected[sensor]["fused"] > 400
+        assert expected[sensor]["rejected"] < 40
+
+
+def test_estimates_at_the_time_are_as_live() -> None:
+    """Fed in order, the estimate at each command is that of `fuse --as-live`."""
+    offline, live = pf.fuse(RUN, KNOWN, mode="as-live"), pf.LiveEstimator(KNOWN)
+    found = [
+        live.estimate(event.stamp)
+        for event in events_of(RUN)
+        if feed(live, event).outcome is pf.Outcome.FUSED and not event.sensor
+    ]
+    for axis, track in offline.axes.items():
+        assert [estimate[axis].position for estimate in found] == track.position.tolist()
+        assert [estimate[axis].position_sd for estimate in found] == track.position_sd.tolist()
+
+
+def lines_of(run: pf.Run) -> list[bytes]:
+    """A run on the wire, in mm."""
+    found = []
+    for stamp, sensor, values in events_of(run):
+        body = {
+            "q" if axis == "orientation" else axis: value if axis == "orientation" else value * 1e3
+            for axis, value in values.items()
+        }
+        found.append(
+            json.dumps({"t_ns": stamp, **({"sensor": sensor, **body} if sensor else {"command": body})}).encode()
+        )
+    return found
+
+
+def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
+    """Lines with orientations: every estimate that went out is, to the last bit, that of the record as live."""
+    recorder = Recorder(tmp_path / "record", KNOWN, {}, lambda _: None)
+    live, written = pf.LiveEstimator(KNOWN, event_log=recorder), list[bytes]()
+    Stream(live, written.extend, lambda _: None).take(lines_of(RUN))
+    recorder.close(live.sure)
+    found = pf.Run.read(tmp_path / "record")
+    assert found.notes == ()
+    assert found.sensors["tracker"].orientation is None
+    offline = pf.fuse(found, KNOWN, mode="as-live")
+    given = [json.loads(line) for line in written]
+    for axis, track in offline.axes.items():
+        unit, scale = ("deg", 180.0 / math.pi) if axis.startswith("r") else ("mm", 1e3)
+        assert [one[axis][f"position_{unit}"] for one in given] == (track.position * scale).tolist()
+        assert [one[axis][f"sd_{unit}"] for one in given] == (track.position_sd * scale).tolist()
+    vector = np.column_stack([offline.axes[axis].position for axis in ("rx", "ry", "rz")])
+    expected = Rotation.from_rotvec(vector) * Rotation.from_rotvec(KNOWN.tool.reference)
+    assert (Rotation.from_quat([one["q"] for one in given]) * expected.inv()).magnitude() == pytest.approx(
+        0.0, abs=1e-12
+    )
+
+
+def test_a_replay_is_as_live() -> None:
+    """A run that is replayed as a stream, a tenth of its rows without an orientation, gives the estimates of `fuse`."""
+    run = run_of()
+    run.sensors["mocap"].orientation[::10] = np.nan
+    offline, live = pf.fuse(run, KNOWN), pf.LiveEstimator(KNOWN)
+    stream = Stream(live, lambda _: None, lambda _: None)
+    for events in replayed(run, KNOWN, math.inf):
+        stream.take(events)
+    last = live.estimate(offline.origin + round(offline.time[-1] * 1e9))
+    for axis, track in offline.axes.items():
+        assert last[axis].position == track.position[-1]
+        assert last[axis].position_sd == track.position_sd[-1]
+
+
+class Watching:
+    """What a live view is given."""
+
+    def __init__(self) -> None:
+        self.events: list[Event] = []
+
+    def event(self, event: Event, _: pf.UpdateResult) -> None:
+        self.events.append(event)
+
+    def estimate(self, estimate: pf.LiveEstimate) -> None:
+        pass
+
+
+def test_a_live_view_sees_the_tool_along_the_bases_axes() -> None:
+    """Of each sensor, wherever it stands: within what an arm that lags is off the motion that it measured."""
+    watching = Watching()
+    Stream(pf.LiveEstimator(KNOWN), lambda _: None, lambda _: None, watchers=[watching]).take(lines_of(RUN))
+    for sensor, latency in (("mocap", 0.012), ("tracker", 0.005), ("camera", 0.03)):
+        events = [event for event in watching.events if event.sensor == sensor and event.t > 1e9]
+        measured = np.array([[event.values[axis] for axis in "xyz"] for event in events])
+        expected = pose(np.array([event.t for event in events]) / 1e9 - latency - 0.086)[0]
+        assert np.abs(measured - expected).max() < 3e-3
+        if sensor != "tracker":
+            assert {"rx", "ry", "rz"} <= events[0].values.keys()
+
+
+DECODER = LineDecoder(ARM.kind_of, framed=False)
+Q = Rotation.from_rotvec(KNOWN.tool.reference).as_quat().tolist()
+
+
+def test_orientations_on_the_wire() -> None:
+    """Of a command and of a measurement q is a quaternion; null is none; an arm without rx may have an axis q."""
+    values = {"x": 0.5, "orientation": (0.5, -0.5, 0.5, 0.5)}
+    assert DECODER.decode(b'{"t": 1.0, "command": {"x": 500.0, "q": [0.5, -0.5, 0.5, 0.5]}}') == Event(1.0, "", values)
+    line = b'{"t": 1.0, "sensor": "mocap", "x": 500.0, "q": [0.5, -0.5, 0.5, 0.5]}'
+    assert DECODER.decode(line) == Event(1.0, "mocap", values)
+    assert DECODER.decode(b'{"t": 1.0, "sensor": "mocap", "x": 500.0, "q": null}').values == {"x": 0.5}
+    joint = LineDecoder({"q": "length"}, framed=False)
+    assert joint.decode(b'{"t": 1.0, "sensor": "encoder", "q": 500.0}').values == {"q": 0.5}
+    with pytest.raises(pf.ConfigError, match="axis 'q'"):
+        LineDecoder({**ARM.kind_of, "q": "length"}, framed=False)
+
+
+@pytest.mark.parametrize("q", ["[0, 0, 1]", '"north"', '[0, 0, 0, "1"]', "[0, 0, 0, NaN]", "[0, 0, 0, 1, 0]", "1.0"])
+def test_a_line_with_a_q_of_another_form_has_a_reason(q: str) -> None:
+    """Each is refused with a reason that names it, or is no JSON."""
+    with pytest.raises(BadLine, match=r"\.q|not JSON"):
+        DECODER.decode(f'{{"t": 1.0, "sensor": "mocap", "x": 500.0, "q": {q}}}'.encode())
+
+
+@pytest.mark.parametrize(
+    "orientation",
+    [
+        np.array(1.0),
+        np.eye(4),
+        [[0], 0, 0, 1],
+        [0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 1.0],
+        "north",
+        [0.0, 0.0, 0.0, math.nan],
+        [0, 0, 0, 1.2],
+        1.0,
+        None,
+    ],
+)
+def test_what_is_no_orientation_is_refused(orientation: object) -> None:
+    """The whole row is refused with one reason, and counted by axis; so is a command."""
+    live = pf.LiveEstimator(KNOWN)
+    live.command(0.0, x=0.5, y=0.2, z=0.1, orientation=Q)
+    for result in (
+        live.measurement(0.1, "mocap", x=0.5, y=0.2, z=0.1, orientation=orientation),
+        live.command(0.1, x=0.5, orientation=orientation),
+    ):
+        assert result.outcome is pf.Outcome.INVALID
+        assert "no quaternion x, y, z, w of norm 1" in result.reason
+        assert {"x", "rx", "ry", "rz"} <= set(result.axes)
+    assert live.health().sensors["mocap"].outcomes["invalid"] == 6
+
+
+def test_without_a_reference_orientation_a_row_with_q_says_what_to_write() -> None:
+    """Neither half used nor silently dropped; and a marker needs it from the beginning."""
+    sensors = {"camera": CONFIG.sensors["camera"]}
+    live = pf.LiveEstimator(pf.FusionConfig(arm=ARM, sensors=sensors))
+    live.command(0.0, x=0.5)
+    result = live.measurement(0.1, "camera", x=0.5, orientation=Q)
+    assert result.outcome is pf.Outcome.INVALID
+    assert "[tool] reference_rotation_vector_deg in fusion.toml" in result.reason
+    with pytest.raises(pf.ConfigError, match=r"sensors.mocap.marker: .*\[tool\]"):
+        pf.LiveEstimator(CONFIG)
+    with pytest.raises(pf.ConfigError, match="start: rx"):
+        pf.LiveEstimator(KNOWN, start={"rx": 0.1})
+
+
+def test_a_row_without_all_of_x_y_z_is_invalid() -> None:
+    """A sensor in a frame of its own that gives two coordinates tells nothing of any of the base's axes."""
+    live = pf.LiveEstimator(KNOWN)
+    live.command(0.0, x=0.5, y=0.2, z=0.1, orientation=Q)
+    result = live.measurement(0.1, "tracker", x=1.0, y=0.2)
+    assert dict(result.axes) == dict.fromkeys("xyz", pf.Outcome.INVALID)
+
+
+def test_a_command_that_turns_too_far_is_refused() -> None:
+    """Near half a turn from the reference a rotation vector changes its sign; from 120° on that is said."""
+    said: list[str] = []
+    live = pf.LiveEstimator(KNOWN, on_notice=said.append)
+    for turn, taken in ((130.0, True), (172.0, False)):
+        q = Rotation.from_rotvec([0.0, 0.0, math.radians(turn)]) * Rotation.from_rotvec(KNOWN.tool.reference)
+        result = live.command(turn, x=0.5, y=0.2, z=0.1, orientation=q.as_quat())
+        assert (result.outcome is pf.Outcome.FUSED) == taken
+    assert "170°" in result.reason
+    assert ["beyond 120°" in text for text in said] == [True]
+
+
+def test_a_header_says_that_the_placing_is_not_in_it() -> None:
+    """As of a [frame]: a controller gives events of the tool point, along the base's axes."""
+    text = header(KNOWN, "filter", "fusion.toml")
+    assert "the reference of its [tool]; frame and marker of mocap, tracker are not in here" in text
