@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
+from pumafuse.logs.frames import Frame
 
 START = 1_700_000_000.0  # s
 LATE = 0.060  # s, from a command to the tool
@@ -53,6 +56,13 @@ def recorded() -> pf.Run:
         for stamp, point, turn in sources().values()
     )
     return pf.Run.from_arrays(*command, {"camera": camera}, truth)
+
+
+def commanded(config: pf.FusionConfig, frame: Frame) -> pf.Estimates:
+    """The run without its camera, of an arm with tangential, radial and vertical instead of x, y and z."""
+    names = dict(zip(("tangential", "radial", "vertical", "rx", "ry", "rz"), config.arm.axes, strict=True))
+    arm = msgspec.structs.replace(config.arm, axes={name: config.arm.axes[axis] for name, axis in names.items()})
+    return pf.fuse(replace(recorded(), sensors={}), pf.FusionConfig(arm=arm, frame=frame))
 
 
 def written(folder: Path) -> Path:

@@ -85,12 +85,12 @@ __all__ = [
     "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
     "Events", "FirstOrder", "Fitted", "FittedLag", "FusionConfig", "Gain", "Health", "Identification", "Latency",
     "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "OrientationScore", "Outcome",
-    "PartLag", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Rotated",
-    "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor",
-    "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary",
-    "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary",
-    "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize", "error_figure", "fuse",
-    "fused_figure", "identify", "latency", "plan", "score", "simulate", "summarise", "to_rerun", "tune",
+    "PartLag", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile", "PumafuseError", "PumafuseWarning",
+    "ReferenceTrack", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder",
+    "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start",
+    "StepTrials", "Summary", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError", "Tuning",
+    "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize", "error_figure",
+    "fuse", "fused_figure", "identify", "latency", "plan", "score", "simulate", "summarise", "to_rerun", "tune",
     "validation_figure", "verify",
 ]  # fmt: skip
 

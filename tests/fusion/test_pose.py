@@ -17,7 +17,6 @@ from executable import pumafuse
 from pumafuse.errors import RunError
 from pumafuse.fusion import results
 from pumafuse.fusion.config import Tool
-from pumafuse.fusion.placing import in_base
 from pumafuse.logs.frames import Cylindrical, Frame, Rotated
 from refusals import one_line
 
@@ -97,22 +96,17 @@ def test_across_a_turn_sds_shrink_by_the_sine(est: pf.Estimates) -> None:
 )
 def test_with_a_frame_positions_and_their_covariance_are_in_the_log(frame: Frame, config: pf.FusionConfig) -> None:
     """Axes drawn with their sds lie in x, y, z as the covariance says: within 2 % of the largest variance."""
-    names = dict(zip(("tangential", "radial", "vertical"), "xyz", strict=True))
-    arm = config.arm
-    axes = {name: arm.axes[axis] for name, axis in names.items()} | {axis: arm.axes[axis] for axis in TURNING}
-    mine = pf.FusionConfig(arm=msgspec.structs.replace(arm, axes=axes), frame=frame)
-    est = pf.fuse(replace(turning.recorded(), sensors={}), mine)
+    names, est = ("tangential", "radial", "vertical"), turning.commanded(config, frame)
     assert est.cartesian is not None
     assert np.array_equal(est.pose.position, np.column_stack([est.cartesian[axis] for axis in "xyz"]))
-    placed = in_base(turning.recorded(), mine)[1]
-    assert placed is not None
+    assert est.placed is not None
     row, rng, sd = 150, np.random.default_rng(2), np.array([1e-3, 4e-4, 2e-4])
     sds = {
         name: replace(est[name], position_sd=np.full(len(est.time), one)) for name, one in zip(names, sd, strict=True)
     }
     found = replace(est, axes={**est.axes, **sds}).pose.covariance[row, :3, :3]
     at = [est[name].position[row] + one * rng.standard_normal(SAMPLES) for name, one in zip(names, sd, strict=True)]
-    wanted = np.cov([*placed.to_log(at[0], at[1]), at[2]])
+    wanted = np.cov([*est.placed.to_log(at[0], at[1]), at[2]])
     assert np.abs(found - wanted).max() < 0.02 * wanted.max()
 
 

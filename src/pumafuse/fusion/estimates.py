@@ -216,6 +216,12 @@ class Estimates:
         """Quaternions x, y, z, w of the tool, (n, 4); None without axes rx, ry, rz."""
         return orientation(self.positions, self.config)
 
+    @property
+    def turns(self) -> bool:
+        """Whether there is a :attr:`pose`."""
+        there = self.axes if self.cartesian is None else self.cartesian
+        return set(CARTESIAN) <= there.keys() and self.orientation is not None
+
     @cached_property
     def pose(self) -> Pose:
         """Position, quaternion and covariance of the tool.
