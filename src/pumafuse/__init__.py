@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from .fusion.config import FusionConfig, Process, Sensor, Start
     from .fusion.estimates import AxisEstimate, Bias, Estimates, Measurements
     from .fusion.offline import fuse
-    from .fusion.score import ReferenceTrack, Score, score
+    from .fusion.pose import Pose
+    from .fusion.score import OrientationScore, ReferenceTrack, Score, score
     from .fusion.segments import Segment
     from .fusion.skill import Skill
     from .fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, ValiditySummary, summarise
@@ -49,7 +50,8 @@ _NAMES = {
     "fusion.config": ["FusionConfig", "Process", "Sensor", "Start"],
     "fusion.estimates": ["AxisEstimate", "Bias", "Estimates", "Measurements"],
     "fusion.offline": ["fuse"],
-    "fusion.score": ["ReferenceTrack", "Score", "score"],
+    "fusion.pose": ["Pose"],
+    "fusion.score": ["OrientationScore", "ReferenceTrack", "Score", "score"],
     "fusion.segments": ["Segment"],
     "fusion.skill": ["Skill"],
     "fusion.summary": ["AxisSummary", "ScoreSummary", "SensorSummary", "Summary", "ValiditySummary", "summarise"],
@@ -84,14 +86,15 @@ __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
     "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
     "Events", "FirstOrder", "Fitted", "FittedLag", "FusionConfig", "Gain", "Health", "Identification", "Latency",
-    "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "Outcome", "PartLag", "Plan",
-    "PlannedTrial", "Plant", "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack",
-    "RegisteredSensor", "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score",
-    "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary",
-    "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Trace", "Trial", "TrialResult",
-    "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult",
-    "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency",
-    "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
+    "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "OrientationScore", "Outcome",
+    "PartLag", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile", "PumafuseError", "PumafuseWarning",
+    "ReferenceTrack", "RegisteredSensor", "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError",
+    "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag",
+    "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Trace", "Trial",
+    "TrialResult", "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary", "UnknownNameError",
+    "UpdateResult", "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify",
+    "latency", "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure",
+    "verify",
 ]  # fmt: skip
 
 

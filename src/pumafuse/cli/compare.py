@@ -19,12 +19,13 @@ from ..folders import FolderError
 from ..fusion import results
 from ..fusion.estimates import write_tum
 from ..fusion.results import Result
-from ..fusion.score import ReferenceTrack
+from ..fusion.score import OrientationScore, ReferenceTrack
 from ..fusion.summary import ScoreSummary
 from ..logs.frames import CARTESIAN
 from ..units import KINDS, SCREEN, Kind
 from .tables import (
     consistency_table,
+    orientation_table,
     position,
     print_json,
     print_tables,
@@ -46,6 +47,7 @@ class Compared(NamedTuple):
     result: Result
     track: ReferenceTrack | None
     scores: Mapping[str, ScoreSummary]
+    orientation: OrientationScore | None
     differences: Mapping[str, Difference]
 
 
@@ -76,7 +78,8 @@ def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | N
                 " and its clock fit the run?"
             )
         first = compared[0].result if compared else result
-        compared.append(Compared(str(folder), result, track, scores, _differences(first, result)))
+        turned = None if track is None else result.orientation_score(track)
+        compared.append(Compared(str(folder), result, track, scores, turned, _differences(first, result)))
     best, why = verdict(compared)
     if draw:
         _draw(compared, why)
@@ -86,6 +89,7 @@ def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | N
     scored = [(one.name, one.result.summary, one.scores) for one in compared if one.scores]
     every = [(one.name, one.result.summary) for one in compared]
     print_tables(score_table(scored, kind) for kind in KINDS)
+    print_tables([orientation_table((one.name, one.orientation) for one in compared)])
     print_tables(consistency_table(every, kind) for kind in KINDS)
     print_tables(skill_table(every, kind) for kind in KINDS)
     print_tables(_difference_table(compared, kind) for kind in KINDS)
@@ -100,9 +104,9 @@ def _differences(first: Result, other: Result) -> dict[str, Difference]:
         return {}
     time = first.time[(first.time >= other.time[0]) & (first.time <= other.time[-1])]
     found = dict[str, Difference]()
+    mine, yours = (one.positions(first.config) for one in (first, other))
     for axis in (axis for axis in first.axes if axis in other.axes and len(time)):
-        mine, yours = (np.interp(time, one.time, one.axes[axis].position) for one in (first, other))
-        apart = yours - mine
+        apart = np.interp(time, other.time, yours[axis]) - np.interp(time, first.time, mine[axis])
         at = int(np.argmax(np.abs(apart)))
         found[axis] = Difference(rms=float(np.sqrt(np.mean(apart**2))), largest=float(apart[at]), at=float(time[at]))
     return found
@@ -224,7 +228,7 @@ def _write_trajectories(given: Sequence[Path], reference: Path | None, output: P
     with folders.replacing(output) as new:
         for folder, name in zip(given, names, strict=True):
             result = results.read(folder)
-            of = result.config.arm, result.summary.origin_ns
+            of = result.config, result.summary.origin_ns
             write_tum(result.track, *of, str(folder), new / f"{name}.tum")
             track = _reference(result, reference)
             if track is not None and (track.cartesian or set(CARTESIAN) <= set(track.position)):
@@ -245,6 +249,7 @@ def _reported(one: Compared) -> dict[str, Any]:
         "run": summary.run,
         "mode": summary.mode,
         "axes": {axis: toml.reported(each, of[axis].kind) for axis, each in one.scores.items()},
+        "orientation": one.orientation and toml.reported(one.orientation),
         "log_likelihood": {axis: part.log_likelihood for axis, part in of.items()},
         "nis": {axis: {name: each.nis_mean for name, each in part.sensors.items()} for axis, part in of.items()},
         "rejected": {

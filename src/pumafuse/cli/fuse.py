@@ -22,7 +22,7 @@ from ..pieces.fusing import fuse_to
 from ..pieces.reading import needs_whole, rows_of
 from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
-from .tables import left_out, outcome_table, print_tables, runs_table, score_table, skill_table
+from .tables import left_out, orientation_table, outcome_table, print_tables, runs_table, score_table, skill_table
 
 SHORT = 5_000_000  # rows of a run, each half a kB in memory; a longer one goes through piece by piece
 MOST_IN_MEMORY = 30_000_000  # rows of one that cannot
@@ -174,6 +174,7 @@ def show(summary: Summary) -> None:
     print_tables(outcome_table(summary, kind) for kind in KINDS)
     print_tables(skill_table([("", summary)], kind) for kind in KINDS)
     print_tables(score_table([(summary.run, summary, scores)], kind) for kind in KINDS)
+    print_tables([orientation_table([(summary.run, summary.orientation)])])
 
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:

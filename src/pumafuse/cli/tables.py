@@ -16,11 +16,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from ..errors import printable
-from ..fusion.score import Z95
+from ..fusion.score import Z95, OrientationScore
 from ..fusion.segments import NOT_SELECTED
 from ..fusion.skill import PredictionError
 from ..fusion.summary import ScoreSummary, SensorSummary, Summary
-from ..units import SCREEN, Kind
+from ..units import DEG, SCREEN, Kind
 
 # By heading: an attribute, its format, and what it is multiplied by; None: what positions are on the screen.
 Columns = Mapping[str, tuple[str, str, float | None]]
@@ -210,6 +210,16 @@ def score_table(results: Iterable[tuple[str, Summary, Mapping[str, ScoreSummary]
         if summary.axes[axis].kind == kind
     ]
     return table(["result", "axis", *headings(_SCORE, kind)], rows)
+
+
+def orientation_table(results: Iterable[tuple[str, OrientationScore | None]]) -> Table:
+    """The angle between estimated and reference orientation of each result, where there is one."""
+    rows = [
+        [name, f"{one.rms * DEG:.3f}", f"{one.expected * DEG:.3f}", str(one.rows), str(one.left_out)]
+        for name, one in results
+        if one is not None
+    ]
+    return table(["result", "angle to the reference,\nRMS, deg", "expected,\ndeg", "scored", "left\nout"], rows)
 
 
 def runs_table(results: Mapping[str, Summary], kind: Kind) -> Table:

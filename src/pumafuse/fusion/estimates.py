@@ -16,10 +16,11 @@ from .. import folders
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import RunError, UnknownNameError
 from ..filter.outcome import Outcome
-from ..logs.frames import CARTESIAN, in_space
-from ..model.arm import ArmModel
+from ..logs.frames import CARTESIAN, Placed, in_space
+from ..model.arm import CANONICAL_AXES, ArmModel
 from ..units import Kind
 from .config import FusionConfig
+from .pose import Pose, orientation, turning_covariance
 from .score import ReferenceTrack
 from .segments import Segment
 from .setup import turn_of
@@ -164,6 +165,7 @@ class Estimates:
         until: Where it ends [s], likewise.
         rate: Of the even grid of estimates [Hz]; None: one for each command.
         selected: The sensors that were asked for; None: all that are configured.
+        placed: The frame in which the axes are, if there is one.
     """
 
     run: str
@@ -188,6 +190,7 @@ class Estimates:
     until: float | None = None
     rate: float | None = None
     selected: tuple[str, ...] | None = None
+    placed: Placed | None = None
 
     def __getitem__(self, axis: str) -> AxisEstimate:
         """The estimates of one axis.
@@ -203,12 +206,57 @@ class Estimates:
         span = f"{self.time[0]:.4g} to {self.time[-1]:.4g} s" if len(self.time) else "no time"
         return f"Estimates({self.run!r}, {self.mode}: {len(self.time):,} of {', '.join(self.axes)}; {span})"
 
+    @property
+    def positions(self) -> dict[str, FloatArray]:
+        """Of each axis [m or rad], (n,)."""
+        return {axis: one.position for axis, one in self.axes.items()}
+
+    @property
+    def orientation(self) -> FloatArray | None:
+        """Quaternions x, y, z, w of the tool, (n, 4); None without axes rx, ry, rz."""
+        return orientation(self.positions, self.config)
+
+    @property
+    def turns(self) -> bool:
+        """Whether there is a :attr:`pose`."""
+        there = self.axes if self.cartesian is None else self.cartesian
+        return set(CARTESIAN) <= there.keys() and self.orientation is not None
+
+    @cached_property
+    def pose(self) -> Pose:
+        """Position, quaternion and covariance of the tool.
+
+        Raises:
+            RunError: The run has no x, y and z, neither as axes nor by a frame, or no orientation.
+        """
+        where, turned = f"run '{self.run}'", self.orientation
+        position = points(self.positions, self.cartesian, self.config.arm, where, "a pose")
+        if turned is None:
+            raise RunError(
+                f"{where}: a pose needs an orientation: commands that have one, and axes rx, ry, rz of the arm; it has"
+                f" {', '.join(self.axes)}"
+            )
+        sd = {axis: one.position_sd for axis, one in self.axes.items()}
+        covariance = np.zeros((len(self.time), 6, 6))
+        covariance[:, :3, :3] = self._covariance_in_log(sd)
+        covariance[:, 3:, 3:] = turning_covariance(self.positions, sd)
+        return Pose(position, turned, covariance)
+
+    def _covariance_in_log(self, sd: Mapping[str, FloatArray]) -> FloatArray:
+        """The covariance of x, y and z [m²], (n, 3, 3)."""
+        axes = CARTESIAN if self.placed is None else CANONICAL_AXES
+        scaled = np.eye(3) * np.column_stack([sd[axis] for axis in axes])[:, None]
+        if self.placed is not None:
+            in_plane = self.placed.jacobian(self["tangential"].position, self["radial"].position)
+            scaled[:, :2, :2] = in_plane @ scaled[:, :2, :2]
+        return scaled @ scaled.transpose(0, 2, 1)
+
     def to_arrow(self) -> pa.Table:
         """All estimates as an Arrow table in SI.
 
         Columns are ``time_s`` since the first command, ``x.position_m`` and so on (``_rad`` of an angle), the log's
-        ``x_m``, ``y_m`` and ``z_m`` with a frame, and ``segment`` where the clock was set back; null where there is no
-        number, as of smoothed velocities.
+        ``x_m``, ``y_m`` and ``z_m`` with a frame, ``qx``, ``qy``, ``qz`` and ``qw`` of a tool that turns, and
+        ``segment`` where the clock was set back; null where there is no number, as of smoothed velocities.
         """
         from .results import estimates_table
 
@@ -251,9 +299,10 @@ class Estimates:
         write(self, Path(folder), force)
 
     def to_tum(self, path: str | Path) -> None:
-        """Write the trajectory in the TUM format, which ``evo`` reads: a line ``stamp x y z 0 0 0 1`` an estimate.
+        """Write the trajectory in the TUM format, which ``evo`` reads: a line ``stamp x y z qx qy qz qw`` an estimate.
 
-        Stamps are those of the log's clock [s], with all digits; positions are in m; the rotation is always none.
+        Stamps are those of the log's clock [s], with all digits; positions are in m; without axes rx, ry, rz the
+        quaternion is ``0 0 0 1``.
 
         Args:
             path: The file; an earlier one is replaced.
@@ -262,9 +311,8 @@ class Estimates:
             RunError: The run has no x, y and z, neither as axes nor by a frame; or its clock was set back.
             FolderError: The file cannot be written.
         """
-        position = {axis: one.position for axis, one in self.axes.items()}
-        track = ReferenceTrack(self.time, position, {}, self.segment, self.cartesian)
-        write_tum(track, self.config.arm, self.origin, f"run '{self.run}'", Path(path))
+        track = ReferenceTrack(self.time, self.positions, {}, self.segment, self.cartesian)
+        write_tum(track, self.config, self.origin, f"run '{self.run}'", Path(path))
 
     def measured_positions(self, sensor: str, axis: str) -> Measurements:
         """A sensor's components with positions for values [m]: (z − estimated bias) / scale; none if not configured."""
@@ -292,12 +340,36 @@ class Estimates:
         return start, start + length
 
 
-def write_tum(track: ReferenceTrack, arm: ArmModel, origin: int, where: str, path: Path) -> None:
+def points(
+    position: Mapping[str, FloatArray], cartesian: Mapping[str, FloatArray] | None, arm: ArmModel, where: str, what: str
+) -> FloatArray:
+    """Positions in space [m], (n, 3).
+
+    Args:
+        position: Of each axis [m or rad], (n,).
+        cartesian: With a frame, the log's x, y and z [m].
+        arm: Its axes say whether x, y, z are positions in space.
+        where: Whose they are, for errors.
+        what: What needs them, likewise.
+
+    Raises:
+        RunError: There is no x, y and z.
+    """
+    found = position if cartesian is None and in_space(arm) == CARTESIAN else cartesian or {}
+    if not all(name in found for name in CARTESIAN):
+        raise RunError(
+            f"{where}: {what} needs x, y and z, as axes of the arm or by a [frame]; there are only"
+            f" {', '.join(found or position)}"
+        )
+    return np.column_stack([found[name] for name in CARTESIAN])
+
+
+def write_tum(track: ReferenceTrack, config: FusionConfig, origin: int, where: str, path: Path) -> None:
     """Write positions in time as a trajectory in the TUM format, see :meth:`Estimates.to_tum`.
 
     Args:
-        track: What to write; rows without all of x, y, z are left out, and those of a stamp after the first.
-        arm: Its axes say whether x, y, z are positions in space.
+        track: What to write; rows that are not whole are left out, and those of a stamp after the first.
+        config: Its arm says whether x, y, z are positions in space.
         origin: Stamp of time 0, int ns.
         where: Whose they are, for errors.
         path: The file.
@@ -306,19 +378,17 @@ def write_tum(track: ReferenceTrack, arm: ArmModel, origin: int, where: str, pat
         RunError: See :meth:`Estimates.to_tum`.
         FolderError: The file cannot be written.
     """
-    found = track.position if track.cartesian is None and in_space(arm) == CARTESIAN else track.cartesian or {}
-    if not all(name in found for name in CARTESIAN):
-        raise RunError(
-            f"{where}: a trajectory needs x, y and z, as axes of the arm or by a [frame]; there are only"
-            f" {', '.join(found or track.position)}"
-        )
+    row = points(track.position, track.cartesian, config.arm, where, "a trajectory")
     if track.segment.any():
         raise RunError(f"{where}: the log's clock was set back, so that it is no one trajectory; use --from and --to")
-    position = np.column_stack([found[name] for name in CARTESIAN])
+    turned = orientation(track.position, config)
+    if turned is not None:
+        row = np.column_stack([row, turned])
     stamp = origin + np.rint(track.time * 1e9).astype(np.int64)
-    kept = np.isfinite(position).all(axis=1) & (np.diff(stamp, prepend=stamp[:1] - 1) > 0)
+    kept = np.isfinite(row).all(axis=1) & (np.diff(stamp, prepend=stamp[:1] - 1) > 0)
+    unturned = " 0 0 0 1" if turned is None else ""
     lines = (
-        f"{Decimal(ns).scaleb(-9):f} {x!r} {y!r} {z!r} 0 0 0 1\n"
-        for ns, (x, y, z) in zip(stamp[kept].tolist(), position[kept].tolist(), strict=True)
+        f"{Decimal(ns).scaleb(-9):f} {' '.join(map(repr, numbers))}{unturned}\n"
+        for ns, numbers in zip(stamp[kept].tolist(), row[kept].tolist(), strict=True)
     )
     folders.write_file(path, "".join(lines))

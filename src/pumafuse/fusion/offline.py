@@ -163,6 +163,7 @@ def estimates_of(
         notes=(),
         since=run.since,
         until=run.until,
+        placed=placed,
     )
 
 

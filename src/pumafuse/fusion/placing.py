@@ -125,8 +125,8 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
         untold = np.isnan(lever[:, 0]) & np.isfinite(point[:, 0])
         if untold.any() and not whole:
             raise RunError(
-                f"{source.label_for(name)}: {np.count_nonzero(untold)} rows tell no orientation, which only the commands"
-                " of a whole run do; so long a run is fused piece by piece: cut it into shorter ones"
+                f"{source.label_for(name)}: rows without an orientation, which only the commands"
+                " of a whole run tell; so long a run is fused piece by piece: cut it into shorter ones"
             )
         if oriented is None or (untold.any() and _can_be_commanded(run, config)):
             lever[untold] = placing.lever(_commanded(name, source.stamp[untold], run, config))

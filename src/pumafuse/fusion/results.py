@@ -28,7 +28,8 @@ from ..units import AN, KINDS, SCREEN, SI, Kind, Screen, kind_of, of_kind, secon
 from .config import FusionConfig
 from .estimates import AxisEstimate, Estimates, Mode
 from .placing import in_base
-from .score import ReferenceTrack, reference_track
+from .pose import orientation, relative_to
+from .score import OrientationScore, ReferenceTrack, reference_track, score_orientation
 from .summary import ScoreSummary, Summary, decode, encode, score_axis, summarise
 
 ESTIMATES, MEASUREMENTS, REFERENCE = "estimates.parquet", "measurements.parquet", "reference.parquet"
@@ -42,6 +43,7 @@ _FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"
 }  # a folder with anything else in it is never replaced
 _RUN = "run.toml"
 _REFERENCE_PREFIX = "reference."
+_QUATERNION = ("qx", "qy", "qz", "qw")
 
 
 @dataclass(frozen=True)
@@ -66,11 +68,16 @@ class Result:
     cartesian: Mapping[str, FloatArray] | None
     reference: ReferenceTrack | None
 
+    def positions(self, config: FusionConfig) -> dict[str, FloatArray]:
+        """Of each axis [m or rad], (n,); rx, ry, rz relative to the orientation at which they are 0 by ``config``."""
+        position = {axis: one.position for axis, one in self.axes.items()}
+        turned = orientation(position, self.config) if config.tool != self.config.tool else None
+        return position if turned is None else position | relative_to(turned, config)
+
     @property
     def track(self) -> ReferenceTrack:
         """The estimates as positions in time."""
-        position = {axis: one.position for axis, one in self.axes.items()}
-        return ReferenceTrack(self.time, position, {}, self.segment, self.cartesian)
+        return ReferenceTrack(self.time, self.positions(self.config), {}, self.segment, self.cartesian)
 
     def scores(self, reference: ReferenceTrack) -> dict[str, ScoreSummary]:
         """The score of each axis that the reference has."""
@@ -80,6 +87,11 @@ class Result:
             for axis, estimate in self.axes.items()
         }
         return {axis: value for axis, value in found.items() if value is not None}
+
+    def orientation_score(self, reference: ReferenceTrack) -> OrientationScore | None:
+        """The score of the axes rx, ry, rz together, where the reference has them."""
+        sd = {axis: one.position_sd for axis, one in self.axes.items()}
+        return score_orientation(self.time, self.segment, self.positions(self.config), sd, reference)
 
 
 def check_writable(folder: Path, force: bool, with_run: bool = False) -> None:
@@ -191,7 +203,7 @@ def write(
         tables.write(estimates_table(est), new / ESTIMATES)
         tables.write(measurements_table(est), new / MEASUREMENTS)
         if est.reference is not None:
-            tables.write(reference_table(est.reference, est.config.arm), new / REFERENCE)
+            tables.write(reference_table(est.reference, est.config), new / REFERENCE)
         est.config.save(new)
         (new / SUMMARY).write_bytes(encode(summary))
         if run_toml is not None:
@@ -216,7 +228,7 @@ def read(folder: Path) -> Result:
     time, segment = _time_and_segment(table)
     _check_read(folder / ESTIMATES, time, segment, axes)
     path = folder / REFERENCE
-    reference = _own_reference(tables.read(path), config.arm) if path.exists() else None
+    reference = _own_reference(tables.read(path), config) if path.exists() else None
     return Result(summary, config, time, segment, axes, _cartesian(table), reference)
 
 
@@ -263,7 +275,7 @@ def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTr
     table = tables.read(path)
     logged = [name for name in table.columns if name.startswith(_REFERENCE_PREFIX)]
     if not logged:
-        return _own_reference(table, config.arm)
+        return _own_reference(table, config)
     time = seconds(table.stamps("time_s")[0], origin)
     columns = {name[len(_REFERENCE_PREFIX) : name.rindex("_")]: name for name in logged}
     position = {axis: _numbers(table, axis, name, config.arm) for axis, name in columns.items()}
@@ -280,7 +292,8 @@ def estimates_table(est: Estimates, *, files: bool = True) -> pa.Table:
             unit = f"{screen.unit}_s" if name.startswith("velocity") else screen.unit
             columns[f"{axis}.{name}_{unit}"] = _column_of(getattr(estimate, name) * screen.scale)
     in_log = _in_log(est.cartesian, SCREEN["length"] if files else SI["length"])
-    return pa.table({"time_s": _column_of(est.time), **columns, **in_log, **_segment_column(est.segment)})
+    turned = _quaternion_columns(est.orientation)
+    return pa.table({"time_s": _column_of(est.time), **columns, **in_log, **turned, **_segment_column(est.segment)})
 
 
 def measurements_table(est: Estimates) -> pa.Table:
@@ -306,14 +319,15 @@ def measurements_table(est: Estimates) -> pa.Table:
     )
 
 
-def reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
+def reference_table(reference: ReferenceTrack, config: FusionConfig) -> pa.Table:
     """The reference as a table, in the units of files."""
-    columns = {"time_s": _column_of(reference.time)}
+    columns, arm = {"time_s": _column_of(reference.time)}, config.arm
     for axis, position in reference.position.items():
         kind = arm.axes[axis].kind if axis in arm.axes else "length"  # x, y and z
         columns[_column(axis, "position", kind)] = _column_of(position * SCREEN[kind].scale)
         columns[_column(axis, "position_sd", kind)] = _column_of(reference.sd[axis] * SCREEN[kind].scale)
-    return pa.table({**columns, **_in_log(reference.cartesian), **_segment_column(reference.segment)})
+    turned = _quaternion_columns(orientation(reference.position, config))
+    return pa.table({**columns, **_in_log(reference.cartesian), **turned, **_segment_column(reference.segment)})
 
 
 def _in_log(cartesian: Mapping[str, FloatArray] | None, screen: Screen = SCREEN["length"]) -> dict[str, pa.Array]:
@@ -321,19 +335,24 @@ def _in_log(cartesian: Mapping[str, FloatArray] | None, screen: Screen = SCREEN[
     return {f"{name}_{screen.unit}": _column_of(x * screen.scale) for name, x in (cartesian or {}).items()}
 
 
+def _quaternion_columns(quaternion: FloatArray | None) -> dict[str, pa.Array]:
+    """Columns of an orientation; none of a tool that does not turn."""
+    return {} if quaternion is None else dict(zip(_QUATERNION, map(_column_of, quaternion.T), strict=True))
+
+
 def _cartesian(table: Table) -> dict[str, FloatArray] | None:
     """The log's x, y and z [m] that a table has; None without any."""
     return {name: table.numbers(f"{name}_mm")[0] for name in CARTESIAN if f"{name}_mm" in table.columns} or None
 
 
-def _own_reference(table: Table, arm: ArmModel) -> ReferenceTrack:
+def _own_reference(table: Table, config: FusionConfig) -> ReferenceTrack:
     position, noise = dict[str, FloatArray](), dict[str, FloatArray]()
     for kind in KINDS:
         ending = _column("", "position", kind)
         for name in table.columns:
             if name.endswith(ending):
                 axis = name.removesuffix(ending)
-                position[axis] = _numbers(table, axis, name, arm)
+                position[axis] = _numbers(table, axis, name, config.arm)
                 sd = _column(axis, "position_sd", kind)
                 noise[axis] = table.numbers(sd)[0] if sd in table.columns else np.zeros(table.rows)
     if not position:
@@ -341,6 +360,8 @@ def _own_reference(table: Table, arm: ArmModel) -> ReferenceTrack:
             f"{table.path}: no column 'reference.<axis>_mm' or '<axis>.position_mm' (for an angle: _deg); it has:"
             f" {', '.join(table.columns)}"
         )
+    if set(_QUATERNION) <= set(table.columns):  # its rx, ry, rz may be relative to another orientation
+        position |= relative_to(np.column_stack([table.plain(name)[0] for name in _QUATERNION]), config)
     time, segment = _time_and_segment(table)
     return ReferenceTrack(time, position, noise, segment, _cartesian(table))
 

@@ -1,16 +1,21 @@
-"""Scores against a reference: error, coverage and NEES of position and velocity; and the reference in order."""
+"""Scores against a reference: error, coverage and NEES of position and velocity, the angle; the reference in order."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
+from .. import toml
 from ..arrays import NO_STAMP, BoolArray, FloatArray, IndexArray, IntArray, TimeArray, median
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, in_order
 from ..logs.run import Source
+from ..space import rotations
+from ..space.rotations import TURNING
 from ..units import seconds
+from .pose import turning_covariance
 
 Z95 = 1.959963984540054  # a normal variable lies within ± this in 95 % of cases
 _SHORTEST_GAP = 0.050  # s; a reference is interpolated at least across this
@@ -142,6 +147,60 @@ def score_velocity(
         return None
     (before, noise), (after, more) = (_true(t, segment, reference, axis) for t in (time, time + period))
     return _score(velocity - (after - before) / period, sd**2 + (noise + more) / period**2)
+
+
+class OrientationScore(toml.Reported, frozen=True, kw_only=True):
+    """Angles between the estimated orientations and those of a reference.
+
+    Attributes:
+        rms: Their root mean square [rad].
+        expected: What it is by the covariance of the estimates and the reference's own noise [rad].
+        rows: Estimates scored.
+        left_out: Estimates with no reference near enough.
+    """
+
+    rms: float = msgspec.field(name="rms_deg")
+    expected: float = msgspec.field(name="expected_deg")
+    rows: int
+    left_out: int
+
+
+def score_orientation(
+    time: FloatArray,
+    segment: IntArray,
+    position: Mapping[str, FloatArray],
+    sd: Mapping[str, FloatArray],
+    reference: ReferenceTrack,
+) -> OrientationScore | None:
+    """Score the axes rx, ry, rz together, which are relative to one orientation in both.
+
+    Args:
+        time: Of the estimates [s], (n,).
+        segment: Of the estimates, (n,).
+        position: Of each axis [m or rad], (n,).
+        sd: Its standard deviation, likewise.
+        reference: What is taken for the true orientations.
+
+    Returns:
+        The score; None where no estimate has a reference for all three.
+    """
+    if not (set(TURNING) <= position.keys() and set(TURNING) <= reference.position.keys()):
+        return None
+    true = {axis: _true(time, segment, reference, axis) for axis in TURNING}
+    known = np.isfinite([value for value, _ in true.values()]).all(axis=0)
+    if not known.any():
+        return None
+    mine = {axis: position[axis][known] for axis in TURNING}
+    noise = {axis: np.sqrt(sd[axis] ** 2 + variance)[known] for axis, (_, variance) in true.items()}
+    vectors = np.column_stack([*mine.values()]), np.column_stack([value[known] for value, _ in true.values()])
+    angle = rotations.angle_between(*map(rotations.of_vectors, vectors))
+    variance: FloatArray = np.einsum("nii->n", turning_covariance(mine, noise))
+    return OrientationScore(
+        rms=float(np.sqrt(np.mean(angle**2))),
+        expected=float(np.sqrt(np.mean(variance))),
+        rows=int(known.sum()),
+        left_out=int((~known).sum()),
+    )
 
 
 def interpolated(time: FloatArray, segment: IntArray | IndexArray, reference: ReferenceTrack, axis: str) -> FloatArray:

@@ -21,7 +21,7 @@ from ..units import Kind, to_si
 from .causes import Evidence, evidence_of
 from .consistency import Consistency, chi_square_band, consistency, log_likelihood
 from .estimates import AxisEstimate, Bias, Estimates
-from .score import ReferenceTrack, score, score_velocity
+from .score import OrientationScore, ReferenceTrack, score, score_orientation, score_velocity
 from .skill import Skill, skill
 
 
@@ -145,6 +145,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         rows: Of each sensor how many rows were ``fused``, ``rejected``, ``reacquired`` or left out for what; of a row
             of several axes the best that became of any.
         axes: By axis.
+        orientation: Of axes rx, ry, rz together, against the reference; null without one.
         validity: Commands against the arm model's limits.
         notes: What was noticed, a sentence each.
     """
@@ -165,6 +166,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     commands: dict[str, int] = {}
     rows: dict[str, dict[str, int]] = {}
     axes: dict[str, AxisSummary]
+    orientation: OrientationScore | None = None
     validity: ValiditySummary
     notes: list[str]
 
@@ -176,6 +178,7 @@ def encode(summary: Summary) -> bytes:
     """The text of ``summary.json``."""
     tree = msgspec.to_builtins(summary) | {"validity": toml.reported(summary.validity)}
     tree["axes"] = {axis: toml.reported(one, one.kind) for axis, one in summary.axes.items()}
+    tree["orientation"] = summary.orientation and toml.reported(summary.orientation)
     return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2) + b"\n"
 
 
@@ -188,7 +191,9 @@ def decode(text: bytes) -> Summary:
     tree = msgspec.json.decode(text, type=dict[str, Any])
     parts = msgspec.convert(tree, _InUnits)
     axes = {axis: toml.as_lengths(to_si(one)) for axis, one in parts.axes.items()}
-    return msgspec.convert(tree | {"axes": axes, "validity": to_si(parts.validity)}, Summary)
+    orientation = parts.orientation and to_si(parts.orientation)
+    in_si = {"axes": axes, "orientation": orientation, "validity": to_si(parts.validity)}
+    return msgspec.convert(tree | in_si, Summary)
 
 
 class _InUnits(msgspec.Struct):
@@ -196,15 +201,24 @@ class _InUnits(msgspec.Struct):
 
     axes: dict[str, dict[str, Any]]
     validity: dict[str, Any]
+    orientation: dict[str, Any] | None = None
 
 
 def summarise(est: Estimates) -> Summary:
     """Counts, consistency and scores of a fusion."""
-    return summary_of(est, {axis: axis_summary(est, axis) for axis in est.axes})
+    return summary_of(est, {axis: axis_summary(est, axis) for axis in est.axes}, orientation_score(est))
 
 
-def summary_of(est: Estimates, axes: dict[str, AxisSummary]) -> Summary:
-    """The summary of a fusion from those of its axes."""
+def orientation_score(est: Estimates) -> OrientationScore | None:
+    """The score of the axes rx, ry, rz together; None without such, or without a reference of them."""
+    if est.reference is None:
+        return None
+    sd = {axis: one.position_sd for axis, one in est.axes.items()}
+    return score_orientation(est.time, est.segment, est.positions, sd, est.reference)
+
+
+def summary_of(est: Estimates, axes: dict[str, AxisSummary], orientation: OrientationScore | None) -> Summary:
+    """The summary of a fusion from those of its axes, and the score of its orientation."""
     limits = est.config.arm.validity
     return Summary(
         pumafuse=version("pumafuse"),
@@ -223,6 +237,7 @@ def summary_of(est: Estimates, axes: dict[str, AxisSummary]) -> Summary:
         commands=dict(est.command_counts),
         rows={name: dict(counts) for name, counts in est.counts.items()},
         axes=axes,
+        orientation=orientation,
         validity=ValiditySummary(
             max_speed=limits.max_speed,
             commanded_speed=est.speed.get("length"),

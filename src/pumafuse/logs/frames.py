@@ -135,3 +135,11 @@ class Placed:
             return radial * cos - across * sin, radial * sin + across * cos
         theta = self.angle + tangential / self._lever
         return self.frame.base[0] + radial * np.cos(theta), self.frame.base[1] + radial * np.sin(theta)
+
+    def jacobian(self, tangential: FloatArray, radial: FloatArray) -> FloatArray:
+        """How the log's x and y change with the tangential and the radial position [m], (n, 2, 2)."""
+        rotated = isinstance(self.frame, Rotated)
+        theta = np.full(len(radial), self.angle) if rotated else self.angle + tangential / self._lever
+        along = self._sign if rotated else radial / self._lever
+        cos, sin = np.cos(theta), np.sin(theta)
+        return np.stack([-along * sin, cos, along * cos, sin], axis=1).reshape(-1, 2, 2)

@@ -87,7 +87,7 @@ def fuse_to(
                 write[0](results.estimates_table(est))
                 write[1](results.measurements_table(est))
                 if est.reference is not None:
-                    write[2](results.reference_table(est.reference.between(*own), config.arm))
+                    write[2](results.reference_table(est.reference.between(*own), est.config))
                 digests.append(digest(est))
                 if progress is not None:
                     progress(done)

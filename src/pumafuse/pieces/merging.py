@@ -21,9 +21,19 @@ from ..fusion.config import FusionConfig
 from ..fusion.consistency import Consistency, chi_square_band, whiteness_of
 from ..fusion.estimates import Estimates
 from ..fusion.offline import UNCOVERED
+from ..fusion.score import OrientationScore
 from ..fusion.segments import added
 from ..fusion.skill import PredictionError, Skill
-from ..fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, axis_summary, sensor_summary, summary_of
+from ..fusion.summary import (
+    AxisSummary,
+    ScoreSummary,
+    SensorSummary,
+    Summary,
+    axis_summary,
+    orientation_score,
+    sensor_summary,
+    summary_of,
+)
 from ..units import Kind
 
 _NUMBER = re.compile(r"\d[\d.,]*(e[+-]?\d+)?")
@@ -45,6 +55,7 @@ class Digest(NamedTuple):
         axes: The summary of each axis.
         innovations: By axis and sensor, where any was fused.
         scored: Whether the run has a reference.
+        orientation: The score of the axes rx, ry, rz together.
     """
 
     est: Estimates
@@ -52,6 +63,7 @@ class Digest(NamedTuple):
     axes: dict[str, AxisSummary]
     innovations: dict[tuple[str, str], Innovations]
     scored: bool
+    orientation: OrientationScore | None
 
 
 def digest(est: Estimates) -> Digest:
@@ -69,7 +81,7 @@ def digest(est: Estimates) -> Digest:
     small = replace(est, time=est.time[:: max(len(est.time) - 1, 1)].copy(), axes={}, cartesian=None, measurements=none)
     small = replace(small, reference=None, segment=np.zeros(2, dtype=np.int64), segments=())
     axes = {axis: axis_summary(est, axis) for axis in est.axes}
-    return Digest(small, len(est.time), axes, found, est.reference is not None)
+    return Digest(small, len(est.time), axes, found, est.reference is not None, orientation_score(est))
 
 
 def merged(digests: Sequence[Digest]) -> Summary:
@@ -94,7 +106,8 @@ def merged(digests: Sequence[Digest]) -> Summary:
         speed=speed,
         notes=tuple(notes),
     )
-    return msgspec.structs.replace(summary_of(whole, axes), estimates=sum(one.estimates for one in digests))
+    turned = _orientation([one.orientation for one in digests if one.orientation is not None])
+    return msgspec.structs.replace(summary_of(whole, axes, turned), estimates=sum(one.estimates for one in digests))
 
 
 def _notes(parts: Sequence[Estimates]) -> list[str]:
@@ -139,6 +152,17 @@ def _score(parts: Sequence[ScoreSummary]) -> ScoreSummary | None:
         velocity_rmse=None if velocity is None else math.sqrt(velocity),
         velocity_coverage=_mean([part.velocity_coverage for part in parts], rows),
     )
+
+
+def _orientation(parts: Sequence[OrientationScore]) -> OrientationScore | None:
+    if not parts:
+        return None
+    rows = [part.rows for part in parts]
+    rms, expected = (
+        math.sqrt(_mean([one**2 for one in each], rows) or 0.0)
+        for each in ([part.rms for part in parts], [part.expected for part in parts])
+    )
+    return OrientationScore(rms=rms, expected=expected, rows=sum(rows), left_out=sum(part.left_out for part in parts))
 
 
 def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:

@@ -81,6 +81,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
     first = next(iter(results.values()))
     start = _busiest(first.time, _travelled(first), _ZOOM_S)
     colour = dict(zip(results, colours.several(len(results)), strict=True))
+    positions = {name: one.positions(first.config) for name, one in results.items()}
     with drawing(2, 2 * len(first.axes), width=13.0, height=2.4, sharex="col") as canvas:
         for number, axis in enumerate(first.axes):
             screen = first.config.arm.screen_of(axis)
@@ -88,7 +89,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
             for axes in (whole, zoom):
                 for name, one in results.items():
                     if axis in one.axes:
-                        position = one.axes[axis].position * screen.scale
+                        position = positions[name][axis] * screen.scale
                         axes.plot(one.time, position, lw=1.0, color=colour[name], label=name)
                 if reference is not None and axis in reference.position:
                     value = reference.position[axis] * screen.scale
@@ -99,9 +100,9 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
                 if axis not in one.axes or (reference is None and one is first):
                     continue
                 if reference is not None and axis in reference.position:
-                    rest = one.axes[axis].position - interpolated(one.time, one.segment, reference, axis)
+                    rest = positions[name][axis] - interpolated(one.time, one.segment, reference, axis)
                 else:
-                    rest = one.axes[axis].position - np.interp(one.time, first.time, first.axes[axis].position)
+                    rest = positions[name][axis] - np.interp(one.time, first.time, first.axes[axis].position)
                 shown.append(rest)
                 for axes in (left, left_zoom):
                     axes.plot(one.time, rest * screen.scale, lw=0.8, color=colour[name])

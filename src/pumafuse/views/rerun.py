@@ -3,8 +3,8 @@
 Entities: ``<axis>/command``, ``/estimate`` with its variance, ``/<sensor>`` and ``/<sensor>/rejected``, and the
 ``/reference``; ``innovation/<axis>/<sensor>``, divided by its standard deviation, with the band of ±2;
 ``residual/<axis>/<sensor>``, the measurement minus the estimate, about ``residual/<axis>/estimate``, 0 with the
-estimate's variance; ``outcome/<sensor>``, a state; ``path/command`` and ``path/estimate`` in 3D. All against seconds
-since the run's first command, positions in mm or degrees.
+estimate's variance; ``outcome/<sensor>``, a state; ``path``, in 3D (``scene.py``). All against seconds since the run's
+first command, positions in mm or degrees.
 
 The result of a run that was read from a Rerun recording is a layer of that: it has the same ids, so that the viewer
 shows both as one. Its entities are below ``pumafuse/``, on the recording's timeline, too; the path is in m.
@@ -12,8 +12,7 @@ shows both as one. Its entities are below ``pumafuse/``, on the recording's time
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -27,10 +26,12 @@ from ..filter.outcome import Outcome
 from ..fusion.estimates import Estimates
 from ..fusion.placing import in_base
 from ..logs.entities import Recording
-from ..logs.frames import CARTESIAN, in_space
+from ..logs.frames import in_space
 from ..logs.run import Run
-from ..units import MM, Screen, seconds
+from ..units import KINDS, Screen, seconds
 from . import colours, styles
+from .scene import send_scene, views
+from .sink import Sink
 
 _OPENING_S = 4.0
 _LEGEND = (0.35, 0.6)  # of a plot's width and height, that a legend covers
@@ -48,7 +49,6 @@ _BY_GRAVITY = (
     Outcome.STRAY,
     Outcome.REJECTED,
 )
-_PATH_POINTS = 20_000  # a 3D path needs no more, whatever the rate of the estimates
 
 
 def to_rerun(est: Estimates, run: Run, sink: str | Path | rr.RecordingStream) -> None:
@@ -82,34 +82,9 @@ def recording_of(est: Estimates, run: Run) -> bytes:
         return memory.drain_as_bytes()
 
 
-@dataclass(frozen=True)
-class _Sink:
-    """Where entities go.
-
-    Attributes:
-        stream: The recording.
-        times: The timelines of seconds since the first command, (n,).
-        root: What their paths begin with.
-        scale: How many units of the scene a metre is.
-    """
-
-    stream: rr.RecordingStream
-    times: Callable[[FloatArray], list[rr.TimeColumn]] = styles.timeline
-    root: str = ""
-    scale: float = MM
-
-    def log(self, path: str, style: rr.AsComponents) -> None:
-        """Send what holds at all times."""
-        rr.log(f"{self.root}{path}", style, static=True, recording=self.stream)
-
-    def columns(self, path: str, time: FloatArray, columns: rr.ComponentColumnList) -> None:
-        """Send what is for times [s since the first command], (n,)."""
-        rr.send_columns(f"{self.root}{path}", self.times(time), columns, recording=self.stream)
-
-
 def _send_named(est: Estimates, run: Run, stream: rr.RecordingStream) -> None:
     stream.send_recording_name(f"{est.run}, {est.mode}")
-    _send(est, run, _Sink(stream))
+    _send(est, run, Sink(stream))
 
 
 def _layer(est: Estimates, run: Run, under: Recording) -> bytes:
@@ -127,11 +102,11 @@ def _layer(est: Estimates, run: Run, under: Recording) -> bytes:
 
     with rr.RecordingStream(under.application, recording_id=under.id, send_properties=False) as stream:
         memory = stream.memory_recording()
-        _send(est, run, _Sink(stream, times if under.timeline else styles.timeline, "pumafuse/", 1.0))
+        _send(est, run, Sink(stream, times if under.timeline else styles.timeline, "pumafuse/", 1.0))
         return memory.drain_as_bytes()
 
 
-def _send(est: Estimates, run: Run, sink: _Sink) -> None:
+def _send(est: Estimates, run: Run, sink: Sink) -> None:
     by_sensor = colours.sensor_colours(est.measurements.sensors)
     command = in_base(run, est.config)[0].command
     time = seconds(command.stamp, est.origin)
@@ -154,7 +129,7 @@ def _send(est: Estimates, run: Run, sink: _Sink) -> None:
             _series(sink, path, styles.edge(f"{edge:+.0f}"), est.time[[0, -1]], np.full(2, edge))
     for sensor in est.measurements.sensors:
         _outcomes(sink, est, sensor)
-    _paths(sink, est, run)
+    send_scene(sink, est, run)
 
 
 def _measured(est: Estimates) -> list[str]:
@@ -162,7 +137,7 @@ def _measured(est: Estimates) -> list[str]:
     return [est.measurements.axes[place] for place in np.unique(est.measurements.axis)]
 
 
-def _sensor(sink: _Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
+def _sensor(sink: Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
     measured, screen = est.measured_positions(sensor, axis), est.config.arm.screen_of(axis)
     fused = (measured.outcome == Outcome.FUSED) | (measured.outcome == Outcome.REACQUIRED)
     name = styles.entity(sensor)
@@ -175,7 +150,7 @@ def _sensor(sink: _Sink, est: Estimates, sensor: str, axis: str, colour: str) ->
     _series(sink, f"innovation/{axis}/{name}", points, measured.time, normalised)
 
 
-def _outcomes(sink: _Sink, est: Estimates, sensor: str) -> None:
+def _outcomes(sink: Sink, est: Estimates, sensor: str) -> None:
     """Send what became of a sensor's rows: the worst of its axes, where that changes; and when it falls silent."""
     mine = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index(sensor))
     mine = mine.where(np.isfinite(mine.stamp))
@@ -197,41 +172,8 @@ def _outcomes(sink: _Sink, est: Estimates, sensor: str) -> None:
     sink.columns(f"outcome/{sensor}", np.array([at for at, _ in states]), changes)
 
 
-def _paths(sink: _Sink, est: Estimates, run: Run) -> None:
-    """Send command and estimate in 3D: the log's x, y, z, or the lengths among the axes."""
-    names = in_space(est.config.arm) if est.cartesian is None else CARTESIAN
-    estimated = est.cartesian or {name: axis.position for name, axis in est.axes.items()}
-    command = run.command.values
-    if not names or not all(name in estimated for name in names):
-        return
-    if all(name in command for name in names):
-        _strip(sink, "path/command", [command[name] for name in names], colours.COMMAND, -0.7)
-    _strip(sink, "path/estimate", [estimated[name] for name in names], colours.ESTIMATE, -1.2)
-    every = max(1, len(est.time) // _PATH_POINTS)
-    position = _points([estimated[name][::every] for name in names]) * sink.scale
-    style = rr.Points3D.from_fields(colors=[colours.rgb(colours.REJECTED)], radii=[-5.0])
-    sink.log("path/tool", style)
-    sink.columns("path/tool", est.time[::every], rr.Points3D.columns(positions=position))
-
-
-def _strip(sink: _Sink, path: str, coordinates: list[FloatArray], colour: str, radius: float) -> None:
-    """Send a path; a negative radius is in points of the screen, right for a path of any size."""
-    points = _points(coordinates) * sink.scale
-    points = points[np.isfinite(points).all(axis=1)]
-    points = points[:: max(1, len(points) // _PATH_POINTS)]
-    line = rr.LineStrips3D([points], colors=[colours.rgb(colour)], radii=[radius])
-    sink.log(path, line)
-
-
-def _points(coordinates: list[FloatArray]) -> FloatArray:
-    """Positions in space of two or three coordinates, (n, 3)."""
-    found = np.zeros((len(coordinates[0]), 3))
-    found[:, : len(coordinates)] = np.column_stack(coordinates)
-    return found
-
-
 def _estimate(
-    sink: _Sink, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, screen: Screen
+    sink: Sink, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, screen: Screen
 ) -> None:
     """Send values [SI] with their variances."""
     sink.log(path, styles.banded(label, screen.unit))
@@ -240,7 +182,7 @@ def _estimate(
 
 
 def _series(
-    sink: _Sink, path: str, style: styles.Style, time: FloatArray, value: FloatArray, screen: Screen | None = None
+    sink: Sink, path: str, style: styles.Style, time: FloatArray, value: FloatArray, screen: Screen | None = None
 ) -> None:
     """Send the style and the finite values of an entity, with a screen from SI; nothing where there are none."""
     there = np.isfinite(time) & np.isfinite(value)
@@ -251,7 +193,10 @@ def _series(
 
 
 def _blueprint(est: Estimates) -> rrb.Blueprint:
-    """A layout that opens on the busiest seconds: positions on the left; the path, residuals and outcomes right."""
+    """A layout that opens on the busiest seconds: positions on the left; the path, residuals and outcomes right.
+
+    Of a tool that turns the path has the left side, and positions are beside rotations.
+    """
     start, end = est.busiest(_OPENING_S)
     whole = float(est.time[0]), float(est.time[-1])
     spans = {
@@ -271,18 +216,48 @@ def _blueprint(est: Estimates) -> rrb.Blueprint:
         title = f"{name}: measurement − estimate [{unit}]"
         residuals.append(_plot(f"/residual/{name}", title, whole, (-limit, limit)))
     layout: rrb.Container = rrb.Grid(*positions, grid_columns=1 if len(positions) < _TWO_COLUMNS else 2)
+    if est.turns:
+        return rrb.Blueprint(_of_turning(est, positions, innovations, residuals, whole), collapse_panels=True)
     right, shares = list[rrb.View | rrb.Container](), list[float]()
     if est.cartesian is not None or in_space(est.config.arm):
         right.append(rrb.Spatial3DView(origin="/path", name="path [mm]"))
         shares.append(3.0)
     if innovations:
         tabs = rrb.Tabs(rrb.Vertical(*innovations, name="innovations"), rrb.Vertical(*residuals, name="residuals"))
-        time = rrb.TimeAxis(view_range=_range(whole))
-        right += [tabs, rrb.StateTimelineView(origin="/outcome", name="outcomes", time_view=time)]
+        right += [tabs, _outcome_view(whole)]
         shares += [4.0, 0.6 + 0.4 * len(est.measurements.sensors)]
     if right:
         layout = rrb.Horizontal(layout, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2])
     return rrb.Blueprint(layout, collapse_panels=True)
+
+
+def _of_turning(
+    est: Estimates,
+    positions: Sequence[rrb.View],
+    innovations: Sequence[rrb.View],
+    residuals: Sequence[rrb.View],
+    whole: tuple[float, float],
+) -> rrb.Container:
+    """The scene and outcomes on the left; on the right tabs of axes, those of rotations beside those of positions."""
+    kinds = est.config.arm.kind_of
+    measured = [axis for axis in est.axes if axis in _measured(est)]
+
+    def tab(plots: Sequence[rrb.View], axes: Iterable[str], name: str) -> rrb.Container:
+        sides = [[plot for plot, axis in zip(plots, axes, strict=True) if kinds[axis] == kind] for kind in KINDS]
+        return rrb.Horizontal(*(rrb.Vertical(*side) for side in sides if side), name=name)
+
+    left, tabs = list[rrb.View | rrb.Container](views(est)), [tab(positions, est.axes, "positions")]
+    shares = [5.0, 3.0][: len(left)]
+    if innovations:
+        tabs += [tab(innovations, measured, "innovations"), tab(residuals, measured, "residuals")]
+        left.append(_outcome_view(whole))
+        shares.append(0.6 + 0.4 * len(est.measurements.sensors))
+    return rrb.Horizontal(rrb.Vertical(*left, row_shares=shares), rrb.Tabs(*tabs), column_shares=[1, 1])
+
+
+def _outcome_view(whole: tuple[float, float]) -> rrb.StateTimelineView:
+    time = rrb.TimeAxis(view_range=_range(whole))
+    return rrb.StateTimelineView(origin="/outcome", name="outcomes", time_view=time)
 
 
 def _plot(
