@@ -1060,3 +1060,30 @@ def test_a_reference_that_runs_ahead_of_the_commands_is_no_truth(tmp_path: Path)
     found = survey(tmp_path / "log.csv")
     assert found.run.reference is None
     assert any(one.startswith("reference is not used on x: it does not follow the commands") for one in asked(found))
+
+
+def test_what_repeats_the_commands_later_is_no_copy(tmp_path: Path) -> None:
+    """An ideal drive, its steps apart by 80 times its lag: nine in ten of its numbers are those of the commands."""
+    t = np.arange(0.0, 60.0, 0.01)
+    told = 0.3 * (np.floor(t / 4.0) % 2.0) + 0.1 * (np.floor(t / 4.0) % 3.0)
+    seen = np.interp(np.floor((t - 0.05) * 100.0 + 0.5) / 100.0, t, told)
+    write(tmp_path / "drive.csv", {"t_s": t, "target_x_m": told, "actual_x_m": np.round(seen, 6)})
+    found = survey(tmp_path / "drive.csv")
+    assert found.relations["actual", "x"].lag == pytest.approx(0.05 - 0.005, abs=0.01)
+    write(tmp_path / "drive.csv", {"t_s": t, "target_x_m": told, "actual_x_m": told})
+    with pytest.raises(RunError, match="the same numbers as the commands, at the same time"):
+        survey(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize(("tick", "every"), [(1.0 / 64.0, 0.004), (0.05, 0.01)])
+def test_stamps_of_a_headerless_table_may_repeat(tick: float, every: float, tmp_path: Path) -> None:
+    """As a clock that ticks more slowly than rows are written; seconds are too coarse, and said to be."""
+    t = np.arange(0.0, 40.0, every)
+    for name, ticks in (("fine", np.floor(t / tick) * tick), ("coarse", np.floor(t))):
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack([ticks, path(t), path(t - LAG)]), "%.4f", ",")
+    (fine,) = parts_of(tmp_path / "fine.csv")
+    assert fine.clock is not None
+    assert fine.clock.stamp[-1] == pytest.approx(40e9, abs=1.1e9 * tick)
+    (coarse,) = parts_of(tmp_path / "coarse.csv")
+    assert coarse.clock is None
+    assert any("is no clock: 40 distinct stamps, one every 1 s" in note for note in coarse.notes)

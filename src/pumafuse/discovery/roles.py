@@ -412,13 +412,14 @@ def _follows(command: Stream, stream: Stream) -> str:
 
 
 def _copies(command: Stream, stream: Stream) -> bool:
-    """Whether a stream says again what is commanded just then."""
+    """Whether a stream says again what is commanded just then, also where that changes: one that is late does not."""
     told, source = command.source, stream.source
     order = np.argsort(told.stamp, kind="stable")
     place = np.searchsorted(told.stamp[order], source.stamp, side="right") - 1
     return all(
-        float(np.mean(np.isclose(value, told.values[axis][order][place], rtol=1e-9, atol=0.0))) > _COPY
+        float(np.mean(np.isclose(value, now, rtol=1e-9, atol=0.0)[np.append(True, np.diff(now) != 0.0)])) > _COPY
         for axis, value in source.values.items()
+        if len(now := told.values[axis][order][place])
     )
 
 
