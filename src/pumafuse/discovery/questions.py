@@ -32,6 +32,8 @@ def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
         signals = [some[0] for one in streams for some in one.axes.values()]
         units = " and ".join(sorted({one.unit for one in signals}))
         yield "units", units, _sure([one.column for one in signals if one.basis == "range"])
+        if turns := [f"{one.name} {axis}" for one in streams for axis in one.turns]:
+            yield "turns", f"{', '.join(turns)}: jumps by whole turns go on (turn_deg in run.toml)", "sure"
         who = ", ".join(f"{one.name} is a sensor" for one in roles.sensors)
         moved = [one.name for one in streams if "follow" in one.why]
         yield "who is who", f"{roles.command.part.label} is commanded, {who}", _sure(moved, "by how they move")
