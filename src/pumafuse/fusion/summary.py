@@ -285,7 +285,7 @@ def beaten(axes: Mapping[str, AxisSummary]) -> list[str]:
             if one.skill is None or (ratio := one.skill.of_best_other) is None or ratio < _BEATEN:
                 continue
             words, least = one.skill.best_other
-            sizes = [f"{error.rms * screen.scale:.3g}" for error in (least, one.skill.filter)]
+            sizes = [f"{error * screen.scale:.3g}" for error in (least, one.skill.filter.rms)]
             found.append(
                 f"{axis}: {words} predicts the next measurement of {sensor} better than the fused estimate (RMS"
                 f" {sizes[0]} against {sizes[1]} {screen.unit}): the model of arm or noise is wrong somewhere; look at"
