@@ -17,7 +17,15 @@ if TYPE_CHECKING:
     from .fusion.score import OrientationScore, ReferenceTrack, Score, score
     from .fusion.segments import Segment
     from .fusion.skill import Skill
-    from .fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, ValiditySummary, summarise
+    from .fusion.summary import (
+        AxisSummary,
+        FoundCause,
+        ScoreSummary,
+        SensorSummary,
+        Summary,
+        ValiditySummary,
+        summarise,
+    )
     from .identification.identify import CombinedAxis, Identification, TrialResult, identify
     from .identification.plan import Design, Plan, PlannedTrial, plan
     from .identification.trials import StepTrials, Trial, TrialsError
@@ -54,7 +62,15 @@ _NAMES = {
     "fusion.score": ["OrientationScore", "ReferenceTrack", "Score", "score"],
     "fusion.segments": ["Segment"],
     "fusion.skill": ["Skill"],
-    "fusion.summary": ["AxisSummary", "ScoreSummary", "SensorSummary", "Summary", "ValiditySummary", "summarise"],
+    "fusion.summary": [
+        "AxisSummary",
+        "FoundCause",
+        "ScoreSummary",
+        "SensorSummary",
+        "Summary",
+        "ValiditySummary",
+        "summarise",
+    ],
     "identification.identify": ["CombinedAxis", "Identification", "TrialResult", "identify"],
     "identification.plan": ["Design", "Plan", "PlannedTrial", "plan"],
     "identification.trials": ["StepTrials", "Trial", "TrialsError"],
@@ -85,16 +101,16 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
     "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
-    "Events", "FirstOrder", "Fitted", "FittedLag", "FusionConfig", "Gain", "Health", "Identification", "Latency",
-    "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "OrientationScore", "Outcome",
-    "PartLag", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile", "PumafuseError", "PumafuseWarning",
-    "ReferenceTrack", "RegisteredSensor", "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError",
-    "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag",
-    "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Trace", "Trial",
-    "TrialResult", "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary", "UnknownNameError",
-    "UpdateResult", "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify",
-    "latency", "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure",
-    "verify",
+    "Events", "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification",
+    "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "OrientationScore",
+    "Outcome", "PartLag", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile", "PumafuseError",
+    "PumafuseWarning", "ReferenceTrack", "RegisteredSensor", "RegistrationSummary", "Registrations", "Rotated",
+    "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor",
+    "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary",
+    "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary",
+    "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize", "error_figure", "fuse",
+    "fused_figure", "identify", "latency", "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune",
+    "validation_figure", "verify",
 ]  # fmt: skip
 
 

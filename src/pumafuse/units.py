@@ -47,6 +47,9 @@ MM = 1e3  # mm in a metre
 MS = 1e3  # ms in a second
 DEG = 180.0 / math.pi  # degrees in a radian
 TURN = 2.0 * math.pi
+_BESIDE = np.array([0, 1, 3, 4])  # places of the two steps before and after one, with two before the first
+_NOISE = 0.2 / DEG  # rad, of an encoder
+_FEW_JUMPS = 0.05  # of the rows: more are a rotation of nearly a turn from row to row
 _JUMP, _STEP, _ALIKE = 0.75 * TURN, 0.25 * TURN, 3.0  # rad; times the steps beside it, as which a jump goes on
 SCREEN: dict[Kind, Screen] = {
     "length": Screen("mm", MM, "m/s", 1.0),
@@ -202,18 +205,28 @@ def unwrapped(angle: FloatArray, turn: float = TURN) -> FloatArray:
 def wraps(angle: FloatArray) -> IntArray:
     """Rows in which an angle [rad] begins a turn, or two, anew: it jumps by nearly that, but else goes on as around.
 
-    A step of nearly a turn from rest, and steps at random, are none.
+    A step of nearly a turn from rest, and steps at random, are none. An angle that also goes on over turns, as before
+    or after a restart of what counts them, jumps by a turn while it moves, or its noise does.
     """
     rows = np.flatnonzero(np.isfinite(angle))
     turns = math.ceil(np.ptp(angle[rows]) / TURN - 1e-6) if len(rows) > 3 else 0
-    if turns not in (1, 2):
-        return rows[:0]
     step = np.diff(angle[rows])
-    jumps = np.flatnonzero(np.abs(step) > turns * _JUMP)
-    turn = turns * TURN
-    rest = np.pad(np.abs(step - turn * np.round(step / turn)), 2, mode="edge")
-    beside = np.max([rest[jumps + place] for place in (0, 1, 3, 4)], axis=0)
-    true = (beside < _STEP) & (rest[jumps + 2] <= _ALIKE * beside + 1.0 / DEG)
+    if turns in (1, 2):
+        jumps = np.flatnonzero(np.abs(step) > turns * _JUMP)
+        turn = turns * TURN
+        rest = np.pad(np.abs(step - turn * np.round(step / turn)), 2, mode="edge")
+        beside = np.max([rest[jumps + place] for place in _BESIDE], axis=0)
+        true = (beside < _STEP) & (rest[jumps + 2] <= _ALIKE * beside + 1.0 / DEG)
+        if len(jumps) and true.mean() > 0.9:
+            return rows[jumps + 1]
+    jumps = np.flatnonzero(np.abs(step) > _JUMP)
+    if turns < 2 or len(jumps) > _FEW_JUMPS * len(step):
+        return rows[:0]
+    rest = np.pad(step - TURN * np.round(step / TURN), 2, mode="edge")
+    around = rest[jumps[:, None] + _BESIDE]
+    beside = np.abs(around).max(axis=1)
+    goes_on = np.abs(rest[jumps + 2] - around.mean(axis=1)) <= 0.5 * beside + _NOISE
+    true = (beside > 0.0) & (beside < _STEP) & goes_on
     return rows[jumps + 1] if len(jumps) and true.mean() > 0.9 else rows[:0]
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from executable import pumafuse, refused
+from pumafuse.arrays import FloatArray
 
 MY_RUN = Path(__file__).parents[2] / "examples/my-run"
 
@@ -24,6 +28,11 @@ def edit(path: Path, *changes: tuple[str, str]) -> None:
         assert old in text
         text = text.replace(old, new)
     path.write_text(text, encoding="utf-8")
+
+
+def write(path: Path, columns: Mapping[str, FloatArray]) -> None:
+    table, names = np.column_stack(list(columns.values())), ",".join(columns)
+    np.savetxt(path, table, fmt="%.5f", delimiter=",", header=names, comments="")
 
 
 def fuse(log: Path) -> tuple[object, ...]:
@@ -71,6 +80,58 @@ def test_rows_that_are_left_out_are_on_the_screen_and_in_json(log: Path) -> None
     summary = json.loads((log / "result/summary.json").read_text(encoding="utf-8"))
     assert summary["commands"] == {"used": 1132}
     assert summary["rows"]["camera"] == {"fused": 898, "rejected": 15, "duplicate": 1, "invalid": 1}
+
+
+def swings(time: FloatArray) -> FloatArray:
+    """A motion [deg] that is not periodic."""
+    return 30.0 * np.sin(1.1 * time) + 14.0 * np.sin(2.7 * time + 0.4)
+
+
+def test_what_reading_notices_is_said_once(tmp_path: Path) -> None:
+    """Tuning and fusing read the same rows: two rows that are exchanged are one line."""
+    time = np.arange(0.0, 20.0, 0.025)
+    measured = swings(time - 0.11) + np.random.default_rng(2).normal(0.0, 0.05, len(time))
+    columns = {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured}
+    order = np.arange(len(time))
+    order[[300, 301]] = 301, 300
+    write(tmp_path / "elbow.csv", {name: value[order] for name, value in columns.items()})
+    done = pumafuse("fuse", tmp_path / "elbow.csv", "-o", tmp_path / "fused")
+    lines = done.stderr.splitlines()
+    assert any("steps back" in line for line in lines)
+    assert len(set(lines)) == len(lines)
+
+
+@pytest.mark.parametrize("early", [0.05, 0.31])
+def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path: Path) -> None:
+    """Fuse and latency refuse it in one line; with the shift_s that this names its lag is the guess."""
+    time = np.arange(0.0, 30.0, 0.02)
+    measured = swings(time + early) + np.random.default_rng(4).normal(0.0, 0.02, len(time))
+    write(tmp_path / "wrist.csv", {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured})
+    line = refused("fuse", tmp_path / "wrist.csv", "-o", tmp_path / "fused")
+    assert "moves before its commands" in line and "shift_s" in line
+    folder = tmp_path / "folder"
+    pumafuse("init", tmp_path / "wrist.csv", "-o", folder)
+    assert "no lag can be told" in refused("latency", folder)
+    head, _, tail = (folder / "run.toml").read_text(encoding="utf-8").partition("[sensors.")
+    shift = re.search(r"shift_s = ([\d.]+)", line)
+    assert shift is not None
+    tail = tail.replace('time = "t_s"', f'time = {{ column = "t_s", {shift[0]} }}')
+    (folder / "run.toml").write_text(f"{head}[sensors.{tail}", encoding="utf-8")
+    told = json.loads(pumafuse("latency", folder, "--json").stdout)["axes"]["j"]
+    assert told["lag_ms"] == pytest.approx(90.0, abs=5.0)  # behind the held command: T/2 less than behind their path
+
+
+def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(tmp_path: Path) -> None:
+    """It is left out, and said to be."""
+    time, rng = np.arange(0.0, 30.0, 0.02), np.random.default_rng(6)
+    columns = {"t_s": time}
+    for axis, late, slower in (("a", 0.09, 1.0), ("b", -0.12, 0.83)):
+        columns |= {f"goal_{axis}_deg": swings(slower * time)}
+        columns |= {f"encoder_{axis}_deg": swings(slower * (time - late)) + rng.normal(0.0, 0.02, len(time))}
+    write(tmp_path / "two.csv", columns)
+    done = pumafuse("fuse", tmp_path / "two.csv", "-o", tmp_path / "fused")
+    assert "b: it moves 120 ms before its commands" in " ".join(done.stdout.split())
+    assert set(json.loads((tmp_path / "fused/summary.json").read_text(encoding="utf-8"))["axes"]) == {"a"}
 
 
 @pytest.mark.parametrize("command", ["init", "fuse"])

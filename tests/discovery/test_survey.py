@@ -28,6 +28,7 @@ from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.questions import decisions, questions
 from pumafuse.discovery.survey import Survey, survey
 from pumafuse.errors import RunError
+from pumafuse.units import wraps
 from refusals import one_line
 
 START = 1_790_000_000  # s
@@ -1077,3 +1078,59 @@ def test_a_reference_that_runs_ahead_of_the_commands_is_no_truth(tmp_path: Path)
     found = survey(tmp_path / "log.csv")
     assert found.run.reference is None
     assert any(one.startswith("reference is not used on x: it does not follow the commands") for one in asked(found))
+
+
+def test_what_repeats_the_commands_later_is_no_copy(tmp_path: Path) -> None:
+    """An ideal drive, its steps apart by 80 times its lag: nine in ten of its numbers are those of the commands."""
+    t = np.arange(0.0, 60.0, 0.01)
+    told = 0.3 * (np.floor(t / 4.0) % 2.0) + 0.1 * (np.floor(t / 4.0) % 3.0)
+    seen = np.interp(np.floor((t - 0.05) * 100.0 + 0.5) / 100.0, t, told)
+    write(tmp_path / "drive.csv", {"t_s": t, "target_x_m": told, "actual_x_m": np.round(seen, 6)})
+    found = survey(tmp_path / "drive.csv")
+    assert found.relations["actual", "x"].lag == pytest.approx(0.05 - 0.005, abs=0.01)
+    write(tmp_path / "drive.csv", {"t_s": t, "target_x_m": told, "actual_x_m": told})
+    with pytest.raises(RunError, match="the same numbers as the commands, at the same time"):
+        survey(tmp_path / "drive.csv")
+
+
+@pytest.mark.parametrize(("tick", "every"), [(1.0 / 64.0, 0.004), (0.05, 0.01)])
+def test_stamps_of_a_headerless_table_may_repeat(tick: float, every: float, tmp_path: Path) -> None:
+    """As a clock that ticks more slowly than rows are written; seconds are too coarse, and said to be."""
+    t = np.arange(0.0, 40.0, every)
+    for name, ticks in (("fine", np.floor(t / tick) * tick), ("coarse", np.floor(t))):
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack([ticks, path(t), path(t - LAG)]), "%.4f", ",")
+    (fine,) = parts_of(tmp_path / "fine.csv")
+    assert fine.clock is not None
+    assert fine.clock.stamp[-1] == pytest.approx(40e9, abs=1.1e9 * tick)
+    (coarse,) = parts_of(tmp_path / "coarse.csv")
+    assert coarse.clock is None
+    assert any("is no clock: 40 distinct stamps, one every 1 s" in note for note in coarse.notes)
+
+
+@pytest.mark.parametrize("restart", ["within a turn until then", "a turn less in motion", "a turn more at rest"])
+def test_an_angle_goes_on_over_a_restart_of_what_counts_its_turns(restart: str, tmp_path: Path) -> None:
+    """Over several turns in all; what was decided says it."""
+    t = np.arange(0.0, 50.0, 0.02)
+    rests = restart == "a turn more at rest"
+    u = 900.0 * np.sin(0.11 * np.clip(t, 0.0, 25.0)) if rests else 25.0 * t + 70.0 * np.sin(0.8 * t)
+    z = np.interp(t - LAG, t, u) + np.random.default_rng(3).normal(0.0, 0.04, len(t))
+    later = t > 29.0
+    seen = {
+        "within a turn until then": np.where(later, z, np.mod(z, 360.0)),
+        "a turn less in motion": z - 360.0 * later,
+        "a turn more at rest": z + 360.0 * later,
+    }[restart]
+    write(tmp_path / "turret.csv", {"t_s": t, "goal_az_deg": u, "encoder_az_deg": seen})
+    found = survey(tmp_path / "turret.csv")
+    one = found.relations["encoder", "az"]
+    assert one.lag == pytest.approx(LAG, abs=0.003) and abs(one.offset) < 0.01
+    assert any(what == "turns" and "encoder az" in words for what, words, _ in decisions(found))
+
+
+def test_whole_turns_that_are_commanded_and_a_fast_rotation_are_no_restart() -> None:
+    """Steps of exactly a turn from rest, over four; 335 deg from row to row; steps at random."""
+    rng, turn = np.random.default_rng(9), 2.0 * np.pi
+    steps = turn * np.repeat([0.0, 1.0, 2.0, 3.0, 4.0, 2.0, 1.0], 50)
+    fast = 0.93 * turn * np.arange(400.0)
+    wild = np.repeat(rng.uniform(-3.0, 3.0, 40) * turn, 20) + rng.normal(0.0, 1e-3, 800)
+    assert [len(wraps(one)) for one in (steps, fast, wild)] == [0, 0, 0]

@@ -5,6 +5,7 @@ A run is made by the model; then one thing is changed in what its sensor says, o
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -24,6 +25,7 @@ from pumafuse.fusion.causes import (
     together,
 )
 from pumafuse.fusion.consistency import Consistency, Finding, consistency, log_likelihood
+from pumafuse.fusion.summary import decode, encode
 from tuning_runs import with_sensors
 
 PERIOD, DELAY, TAU = 0.028, 0.060, 0.0425  # s
@@ -260,3 +262,21 @@ def test_parts_of_a_run_tell_together_what_the_whole_tells() -> None:
     assert (both.cause, both.sensor) == (whole.cause, whole.sensor)
     assert both.size == pytest.approx(whole.size, rel=0.05)
     assert both.gain == pytest.approx(whole.gain, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("late", "cause", "size"), [(LATENCY + 0.02, Cause.LAG, "shift_ms"), (LATENCY, Cause.NOISE, "factor")]
+)
+def test_the_causes_of_a_verdict_are_in_the_summary(late: float, cause: Cause, size: str) -> None:
+    """Each with its axis, whose fault it is, its words and its size, in the file's units and read again."""
+    known = config() if cause is Cause.LAG else config(sd=SD / 3.0)
+    summary = pf.summarise(pf.fuse(recorded(late=late), known))
+    written = json.loads(encode(summary))["axes"]["a"]["sensors"]["camera"]
+    first = written["causes"][0]
+    assert (first["axis"], first["sensor"], first["cause"]) == ("a", "camera", cause.value)
+    assert [one["words"] in written["verdict"] for one in written["causes"]] == [True] * len(written["causes"])
+    assert first[size] == pytest.approx({"shift_ms": 20.0, "factor": 3.0}[size], rel=0.15)
+    (again, *_), (found, *_) = (one.axes["a"].sensors["camera"].causes for one in (decode(encode(summary)), summary))
+    assert msgspec.structs.astuple(again) == pytest.approx(msgspec.structs.astuple(found))
+    right = pf.summarise(pf.fuse(recorded(), config()))
+    assert not right.axes["a"].sensors["camera"].causes

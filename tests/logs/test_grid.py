@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pumafuse.errors import RunError
-from pumafuse.logs.grid import assigned_ticks, regular_grid
+from pumafuse.logs.grid import assigned_ticks, regular_grid, ticks_of
 from refusals import one_line
 
 SECOND = 1_000_000_000
@@ -199,3 +199,15 @@ def test_more_stamps_than_ticks_about_them_are_no_row() -> None:
         )
     )
     assert "of 312 are stamped nearest to the tick of the one before" in text
+
+
+@pytest.mark.parametrize("period", [0.0033367, 1.0 / 60.0, 0.101])
+@pytest.mark.parametrize("jitter", [0.02, 0.15])
+def test_the_ticks_of_a_sensor_are_found_in_its_stamps(period: float, jitter: float) -> None:
+    """With one row in ten missing, as well as the jitter lets a straight line through the stamps tell it."""
+    rng = np.random.default_rng(7)
+    ticks = np.flatnonzero(rng.random(3000) < 0.9)
+    stamp = np.sort(grid_of(ticks + rng.normal(0.0, jitter, len(ticks)), period * SECOND))
+    stamp = stamp[np.append(True, np.diff(stamp) > 0)]
+    found = ticks_of(stamp)
+    assert abs(found / period - 1.0) * ticks[-1] < 8.0 * jitter / np.sqrt(len(ticks)) * np.sqrt(12.0)

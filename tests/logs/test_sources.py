@@ -730,3 +730,29 @@ def test_a_wrong_source_is_refused_in_one_line(tmp_path: Path, case: str) -> Non
     text = refusal(lambda: read(tmp_path, command, {**columns, **more}))
     assert all(words in text for words in named), text
     assert len(text) < 700
+
+
+def test_a_sensor_of_a_regular_clock_is_put_on_its_own_ticks(tmp_path: Path) -> None:
+    """Its stamps jitter by a sixth of its period, which nobody names; without ticks it is refused in one line."""
+    rng = np.random.default_rng(12)
+    ticks = np.flatnonzero(rng.random(900) < 0.95)
+    true = 17.0 + ticks / 72.0
+    stamps = {
+        "jitter": true + rng.normal(0.0, 1.0 / 72.0 / 6.0, len(ticks)),
+        "none": 17.0 + np.sort(rng.random(900) * 12),
+    }
+    (tmp_path / "host.csv").write_text("t_s,x_mm\n" + "".join(f"{t},{t}\n" for t in range(17, 30)), encoding="utf-8")
+    for name, stamp in stamps.items():
+        table = np.column_stack([stamp, rng.normal(0.0, 1.0, len(stamp))])
+        np.savetxt(tmp_path / "seen.csv", table, "%.9f", ",", header="t_s,x_mm", comments="")
+        described = (
+            '[command]\nfile = "host.csv"\ntime = "t_s"\nx = "x_mm"\n'
+            '[sensors.eye]\nfile = "seen.csv"\ntime = "t_s"\nclock = "regular"\nx = "x_mm"\n'
+        )
+        (tmp_path / "run.toml").write_text(described, encoding="utf-8")
+        if name == "none":
+            assert "do not come on ticks" in refusal(lambda: Run.read(tmp_path))
+            continue
+        got = Run.read(tmp_path).sensors["eye"].stamp
+        assert np.abs(np.diff(got) / GIGA - np.diff(true)).max() < 1e-5
+        assert np.abs(got / GIGA - true).max() < 4.0 / 72.0 / 6.0 / np.sqrt(len(ticks)) * 2.5  # slope and median

@@ -11,7 +11,8 @@ import typer
 
 from ..discovery.drafts import drafts
 from ..discovery.guesses import guess
-from ..discovery.survey import survey
+from ..discovery.survey import early, survey, too_early
+from ..errors import RunError
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Mode
@@ -50,6 +51,9 @@ def run(
     """
     results.check_writable(output, force, with_run=True)
     found = survey(log)
+    for name in found.run.sensors:
+        if by := early(found, name):
+            raise RunError(f"{log}: {too_early(name, max(by.values()))}; `pumafuse init {log}` writes one")
     arm, begins = guess(found)
     texts, here = drafts(found, arm, begins, output), Path()
     recorded = described(drafts(found, arm, begins, here)["run.toml"], here).between(*part)

@@ -16,7 +16,7 @@ from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates, Mode
 from ..fusion.offline import Engine, fuse
-from ..fusion.summary import Summary
+from ..fusion.summary import Summary, beaten
 from ..logs.run import Run
 from ..pieces.fusing import fuse_to
 from ..pieces.reading import needs_whole, rows_of
@@ -175,6 +175,8 @@ def show(summary: Summary) -> None:
     print_tables(skill_table([("", summary)], kind) for kind in KINDS)
     print_tables(score_table([(summary.run, summary, scores)], kind) for kind in KINDS)
     print_tables([orientation_table([(summary.run, summary.orientation)])])
+    for line in beaten(summary.axes):
+        typer.echo(line)
 
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:

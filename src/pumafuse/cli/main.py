@@ -415,7 +415,7 @@ def main() -> None:
     itself (sysexits.h: EX_SOFTWARE), 130 interrupted.
     """
     warnings.showwarning = _one_line
-    warnings.simplefilter("always", PumafuseWarning)
+    warnings.simplefilter("once", PumafuseWarning)  # what `fuse LOG` notices while tuning, it would say again
     # What is imported stays: looking through it time and again, and once more at the end, is a quarter of `fuse`.
     gc.set_threshold(10_000, 1_000)
     atexit.register(gc.freeze)

@@ -49,6 +49,7 @@ _FEWEST_ROWS = 10
 _UNIT = 1e-3  # from 1, of the length of a quaternion in a text
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
+_OF_TICK = 0.02  # of a tick, by which ticks of a clock differ: stamps of 15.6 ms that are written with 4 decimals
 _MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
 _OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
@@ -563,7 +564,20 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
         return None
     steps = np.diff(numbers)
     rises = len(steps) and (steps > 0.0).mean() >= _IN_ORDER and (steps != 1.0).any()
-    return _clock_of(table, first, stroke) if rises else None
+    return _clock_of(table, first, stroke) if rises or _ticks(steps) else None
+
+
+def _ticks(steps: FloatArray) -> bool:
+    """Whether steps from row to row are those of a clock that ticks more slowly than rows are written.
+
+    Then all ticks are about as long, with about as many rows in each: no position goes on like that.
+    """
+    place = np.flatnonzero(steps)
+    ticks, rows = steps[place], np.diff(place)
+    if len(rows) < _FEWEST_ROWS or ticks.min() <= 0.0:
+        return False
+    alike = (np.abs(ticks / np.median(ticks) - 1.0) < _OF_TICK).mean() >= _IN_ORDER
+    return bool(alike and (np.abs(rows - rows.mean()) <= 1.0).mean() >= _IN_ORDER)
 
 
 def _counted(table: Table, rate: float) -> Clock:
@@ -617,6 +631,7 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
         return "s", "default", ""
     middle, steps = float(np.median(known)), np.diff(known)
     interval = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+    stroke *= float((steps > 0.0).mean())  # in stamps: several rows may have one
     for unit, (low, high) in _EPOCHS.items():
         if low <= middle <= high and not span and interval <= _INTERVALS.get(unit, np.inf):
             return unit, "range", ""

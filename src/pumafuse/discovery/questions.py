@@ -35,6 +35,8 @@ def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
         if oriented := [one.attitude for one in streams if one.attitude]:
             bases = ", ".join(f"{', '.join(one.columns.columns)}: {one.basis}" for one in oriented)
             yield "orientations", bases, _sure([one.columns.columns[0] for one in oriented if one.doubt])
+        if turns := [f"{one.name} {axis}" for one in streams for axis in one.turns]:
+            yield "turns", f"{', '.join(turns)}: jumps by whole turns go on (turn_deg in run.toml)", "sure"
         who = ", ".join(f"{one.name} is a sensor" for one in roles.sensors)
         moved = [one.name for one in streams if "follow" in one.why]
         yield "who is who", f"{roles.command.part.label} is commanded, {who}", _sure(moved, "by how they move")

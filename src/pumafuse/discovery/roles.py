@@ -31,7 +31,7 @@ _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
 _NEAR = -0.5, 1.5  # s, from and to which lag a sensor is on the commands' clock
-_MOST_LAG, _GUESSED_LAG = 0.5, 0.1  # s, that an arm is late where its clock is shifted
+_MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that an arm is late where its clock is shifted
 _FEWEST = 20  # rows
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
 _MOST_APART = 40  # axes of a table that is taken apart by their names
@@ -173,7 +173,10 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         if stream.role is None and axes:
             late = _follows(command, matched) or _as_fast(command, matched)
             matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
-            why_not = "neither its name nor its motion says what it is: it does not follow the commands"
+            why_not = (
+                "neither its name nor its motion says what it is: it does not follow the commands, or moves before"
+                " them; if it measures their axes, say so in run.toml"
+            )
         if axes and matched.role:
             kept.append(matched)
         else:
@@ -266,7 +269,7 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
     known |= {"time zones are hours apart": hours} if hours else {}
     why, ahead = next(
         ((words, by) for words, by in known.items() if 0.0 <= late - by < _MOST_LAG),
-        ("the lag is a guess: nothing tells what of it is the clock's", late - _GUESSED_LAG),
+        ("the lag is a guess: nothing tells what of it is the clock's", late - GUESSED_LAG),
     )
     side = "ahead of" if ahead > 0.0 else "behind"
     doubt = (
@@ -459,13 +462,14 @@ def _as_fast(command: Stream, stream: Stream) -> str:
 
 
 def _copies(command: Stream, stream: Stream) -> bool:
-    """Whether a stream says again what is commanded just then."""
+    """Whether a stream says again what is commanded just then, also where that changes: one that is late does not."""
     told, source = command.source, stream.source
     order = np.argsort(told.stamp, kind="stable")
     place = np.searchsorted(told.stamp[order], source.stamp, side="right") - 1
     return all(
-        float(np.mean(np.isclose(value, told.values[axis][order][place], rtol=1e-9, atol=0.0))) > _COPY
+        float(np.mean(np.isclose(value, now, rtol=1e-9, atol=0.0)[np.append(True, np.diff(now) != 0.0)])) > _COPY
         for axis, value in source.values.items()
+        if len(now := told.values[axis][order][place])
     )
 
 

@@ -23,7 +23,7 @@ from .contents import Part, parts_of, period_of, without_clock
 from .following import Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
-from .roles import Roles, relations, roles_of
+from .roles import GUESSED_LAG, Roles, relations, roles_of
 from .sensors import REFERENCE
 
 FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
@@ -31,6 +31,7 @@ AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; l
 _SURELY = 0.9  # correlation of changes from which a lag is known well
 SOONER = 2e-3  # s: lags are known to 1 ms
 _Relations: TypeAlias = dict[tuple[str, str], Following]  # by the name of a source and the axis
+_OF_PERIOD = 0.1  # of an update period, to which they are where commands are far apart: a path between them is a guess
 _STEPS, _FINEST = 10, 1e-3  # of an update period; s
 
 
@@ -93,9 +94,10 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     aside = own_frames(run)
     run = _along_axes(run, aside)
     related = relations(run)
-    follow = any(abs(one.correlation) >= _SURELY for one in related.values())
-    why_not = {key: why for key, one in related.items() if follow and (why := _does_not_follow(one))}
-    roles = roles.without({key: why for key, why in why_not.items() if key[1] not in TURNING})
+    lags, least = [one.lag for one in related.values() if abs(one.correlation) >= _SURELY], least_lag(run)
+    surely = _SURELY if max(lags, default=0.0) < least else math.inf
+    bad = {key: why for key, one in related.items() if lags and (why := _does_not_follow(one, least, surely))}
+    roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
     kept = {(one.name, axis) for one in roles.sensors for axis in (*one.axes, *TURNING)}
     kept |= {(REFERENCE, axis) for axis in (*roles.reference.axes, *TURNING)} if roles.reference else set()
     related = {key: one for key, one in related.items() if key in kept}
@@ -139,13 +141,40 @@ def _without_turning(source: Source) -> Source:
     return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
-def _does_not_follow(one: Following) -> str:
-    """Why an axis of a sensor is left out where others follow; empty for one that follows."""
+def _does_not_follow(one: Following, least: float, surely: float) -> str:
+    """Why an axis of a sensor is left out where others follow; empty for one that follows.
+
+    Args:
+        one: How it follows.
+        least: The least lag that it may have [s].
+        surely: The correlation from which it may be earlier.
+    """
     if abs(one.correlation) < FOLLOWS:
         return f"it does not follow the commands (correlation {one.correlation:+.2f}): are columns exchanged?"
-    if one.lag < -AHEAD and abs(one.correlation) < _SURELY:
+    if one.lag < least and abs(one.correlation) < surely:
         return f"it moves {-one.lag * MS:.0f} ms before its commands (correlation {one.correlation:+.2f})"
     return ""
+
+
+def least_lag(run: Run) -> float:
+    """The least lag behind the path through a run's commands that an arm may have [s]: between them it is guessed."""
+    return -max(AHEAD, _OF_PERIOD * period_of(run.command))
+
+
+def early(found: Survey, name: str) -> dict[str, float]:
+    """By how much a source moves before its commands [s], for each of its axes that surely does."""
+    least = least_lag(found.run)
+    mine = {axis: one for (source, axis), one in found.relations.items() if source == name}
+    return {axis: -one.lag for axis, one in mine.items() if abs(one.correlation) >= _SURELY and one.lag < least}
+
+
+def too_early(name: str, by: float) -> str:
+    """What to say and to do where a source moves before its commands by so many seconds."""
+    return (
+        f"{name} is {by:.2g} s early: it moves before its commands, as no arm does, and no lag can be told. Are set"
+        " points and measurements exchanged, or stamped by two clocks? In run.toml exchange them, or add shift_s ="
+        f" {by + GUESSED_LAG:.3f} to the time of {name}: so it is {GUESSED_LAG * MS:.0f} ms late, which is a guess"
+    )
 
 
 def interpolation(found: Survey) -> float:
@@ -155,7 +184,7 @@ def interpolation(found: Survey) -> float:
     that follows this path sooner knows what is between: the log has samples of what a controller interpolates.
     """
     period = period_of(found.run.command)
-    margin = max(SOONER, 0.1 * period)
+    margin = max(SOONER, _OF_PERIOD * period)
     goes_on = -margin <= soonest(found) < 0.5 * period - margin
     return max(float(f"{period / _STEPS:.1g}"), _FINEST) if goes_on else 0.0
 

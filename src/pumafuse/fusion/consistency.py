@@ -258,7 +258,7 @@ def sentence(found: Consistency) -> str:
     digits = next(n for n in range(2, 17) if _beside([found.nis, low, high]) == _beside([found.nis, low, high], n))
     nis = f"NIS {found.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
     sd, lag = of_kind("sd_mm", found.kind), found.strongest_lag if len(found.correlation) else 0
-    causes = ", or ".join(_cause(one, found) for one in found.causes)
+    causes = ", or ".join(in_words(one, found) for one in found.causes)
     match found.finding:
         case Finding.REJECTED:
             return f"{nis}, but {found.rejected:.0%} were {_TOO_SMALL.format(sd=sd)}"
@@ -273,7 +273,7 @@ def sentence(found: Consistency) -> str:
             return f"{nis}: {causes or 'no one cause stands out'}"
 
 
-def _cause(one: Suspect, found: Consistency) -> str:
+def in_words(one: Suspect, found: Consistency) -> str:
     """A cause as a clause."""
     sd, drift, bias = (of_kind(key, found.kind) for key in ("sd_mm", "bias_drift_sd_mm", "bias_sd_mm"))
     maneuvers = of_kind("maneuver_drift_mm_rts_per_m_s", found.kind)

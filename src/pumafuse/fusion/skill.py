@@ -56,9 +56,19 @@ class Skill(msgspec.Struct, frozen=True, kw_only=True):
     filter: PredictionError
 
     @property
+    def best_other(self) -> tuple[str, float]:
+        """Of the simpler ways the one with the smallest RMS error, in words, and that error [m or rad]."""
+        ways = {
+            "the last measurement": self.last_held,
+            "a constant velocity": self.constant_velocity,
+            "the command through the arm alone": self.command_alone,
+        }
+        return min(((words, one.rms) for words, one in ways.items()), key=lambda way: way[1])
+
+    @property
     def of_best_other(self) -> float | None:
         """RMS of the filter's errors over the smallest of the others'; None where another makes no error."""
-        best = min(one.rms for one in (self.last_held, self.constant_velocity, self.command_alone))
+        best = self.best_other[1]
         return self.filter.rms / best if best > 0.0 else None
 
 

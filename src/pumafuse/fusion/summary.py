@@ -6,7 +6,7 @@ Names of keys are those for lengths; the file has those of each axis's kind: ``r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import version
 from typing import Any
@@ -17,12 +17,51 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray, IntArray
 from ..filter.outcome import Outcome
-from ..units import Kind, to_si
-from .causes import Evidence, evidence_of
-from .consistency import Consistency, chi_square_band, consistency, log_likelihood
+from ..units import SCREEN, Kind, to_si
+from .causes import Cause, Evidence, Suspect, evidence_of
+from .consistency import Consistency, chi_square_band, consistency, in_words, log_likelihood
 from .estimates import AxisEstimate, Bias, Estimates
 from .score import OrientationScore, ReferenceTrack, score, score_orientation, score_velocity
 from .skill import Skill, skill
+
+_BEATEN = 1.25  # times the RMS error of a simpler way, from which that is said: a bit less may be chance, or outliers
+
+
+class FoundCause(toml.Reported, frozen=True, kw_only=True):
+    """What explains that a sensor's innovations are not as expected; null what a cause has not.
+
+    Attributes:
+        axis: The axis.
+        sensor: Whose fault it is; empty: the arm's.
+        cause: A word of :class:`pumafuse.fusion.causes.Cause`.
+        words: As in the verdict.
+        factor: By what a noise is to be multiplied; also null beyond what was tried.
+        share: Of the position, or of a scale, by which it errs.
+        shift: By how much a latency or a lag is too small [s].
+        size: Of a constant or of play [m or rad].
+    """
+
+    axis: str
+    sensor: str
+    cause: str
+    words: str
+    factor: float | None = None
+    share: float | None = None
+    shift: float | None = msgspec.field(name="shift_ms", default=None)
+    size: float | None = msgspec.field(name="size_mm", default=None)
+
+
+_SIZE = {
+    Cause.NOISE: "factor",
+    Cause.PROCESS: "factor",
+    Cause.SCALE: "share",
+    Cause.POSITION: "share",
+    Cause.LATENCY: "shift",
+    Cause.LAG: "shift",
+    Cause.PLANT: "shift",
+    Cause.BIAS: "size",
+    Cause.PLAY: "size",
+}  # what the size of a cause means; others have none
 
 
 class SensorSummary(toml.Reported, frozen=True, kw_only=True):
@@ -39,6 +78,7 @@ class SensorSummary(toml.Reported, frozen=True, kw_only=True):
         correlation_band: White innovations' autocorrelations lie within ± this in 95 % of cases.
         whiteness_p: Ljung-Box p-value; small: the innovations are not white.
         verdict: In words, with the likely cause and the key to change.
+        causes: Those in it, the likeliest first; any of them may be the one.
         bias: The estimated bias in the log's coordinates [m or rad]; null where none is estimated.
         bias_sd: Its standard deviation.
         skill: How well its next measurement is predicted, by this filter and by simpler means; null with fewer than
@@ -54,6 +94,7 @@ class SensorSummary(toml.Reported, frozen=True, kw_only=True):
     correlation_band: float | None = None
     whiteness_p: float | None = None
     verdict: str = "nothing fused"
+    causes: list[FoundCause] = msgspec.field(default_factory=list[FoundCause])
     bias: float | None = msgspec.field(name="bias_mm", default=None)
     bias_sd: float | None = msgspec.field(name="bias_sd_mm", default=None)
     skill: Skill | None = None
@@ -250,6 +291,24 @@ def summary_of(est: Estimates, axes: dict[str, AxisSummary], orientation: Orient
     )
 
 
+def beaten(axes: Mapping[str, AxisSummary]) -> list[str]:
+    """A sentence on each sensor on an axis whose next measurement a simpler way predicts better than the filter."""
+    found = list[str]()
+    for axis, part in axes.items():
+        screen = SCREEN[part.kind]
+        for sensor, one in part.sensors.items():
+            if one.skill is None or (ratio := one.skill.of_best_other) is None or ratio < _BEATEN:
+                continue
+            words, least = one.skill.best_other
+            sizes = [f"{error * screen.scale:.3g}" for error in (least, one.skill.filter.rms)]
+            found.append(
+                f"{axis}: {words} predicts the next measurement of {sensor} better than the fused estimate (RMS"
+                f" {sizes[0]} against {sizes[1]} {screen.unit}): the model of arm or noise is wrong somewhere; look at"
+                " the verdict, and at --figures"
+            )
+    return found
+
+
 def score_axis(
     time: FloatArray, segment: IntArray, estimate: AxisEstimate, reference: ReferenceTrack, axis: str, period: float
 ) -> ScoreSummary | None:
@@ -306,10 +365,11 @@ def _sensor_summary(est: Estimates, sensor: str, axis: str, evidence: Callable[[
     bias = est.biases.get(sensor, {}).get(axis)
     first = 1 if bias is not None and len(fused.value) > 1 else 0  # the first measurement determines the bias
     rms = [float(np.sqrt(np.mean(values[first:] ** 2))) for values in (fused.innovation, fused.innovation_sd)]
-    return sensor_summary(measurements.counts(), found, rms[0], rms[1], bias, skill(est, measurements))
+    return sensor_summary(axis, measurements.counts(), found, rms[0], rms[1], bias, skill(est, measurements))
 
 
 def sensor_summary(
+    axis: str,
     outcomes: dict[str, int],
     found: Consistency,
     innovation_rms: float,
@@ -328,7 +388,14 @@ def sensor_summary(
         correlation_band=found.correlation_band,
         whiteness_p=found.whiteness,
         verdict=found.verdict,
+        causes=[_found_cause(axis, one, found) for one in found.causes],
         bias=None if bias is None else bias.value,
         bias_sd=None if bias is None else bias.sd,
         skill=skill,
     )
+
+
+def _found_cause(axis: str, one: Suspect, found: Consistency) -> FoundCause:
+    size = {_SIZE[one.cause]: one.size} if one.cause in _SIZE and 0.0 < abs(one.size) < math.inf else {}
+    words = in_words(one, found)
+    return FoundCause(axis=axis, sensor=one.sensor, cause=one.cause.value, words=words, **size)

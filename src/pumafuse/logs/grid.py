@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError
 
+COMMANDS = "commands"
 _MOST_LATE = 9  # a stamp's ticks are sought from this many before it ...
 _CHOICES = _MOST_LATE + 3  # ... to two after it
 _LATE, _LATE_COST, _LATER_COST = math.sqrt(0.5), 0.5, 0.01
@@ -19,10 +20,11 @@ _MOST_ASTRAY = 0.08  # share of stamps that may be more than half a period off t
 _LONGEST_QUEUE = 8  # commands that a stalled logger may stamp late in a row
 _LEAST_CLEAR = 0.2  # resultant of the stamps' phases: that of a Gaussian jitter of 0.29 T; 0 where there are no ticks
 _MOST_EARLY = 5.0  # standard deviations of the jitter; nothing but jitter stamps a command before it is given
+_ROUGHLY, _FIRST = 0.03, 32  # share by which the median interval may differ from a tick; rows that are looked at first
 _MOST_ASIDE = 0.01  # share of commands that the jitter may put on a free tick beside their own, unseen
 
 
-def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray, str | None]:
+def regular_grid(stamp: TimeArray, period: float, label: str, what: str = COMMANDS) -> tuple[TimeArray, str | None]:
     """The stamps moved to the controller's even ticks of T, with a note on drift and stamps off their ticks.
 
     Each command has a tick of its own, in the order of the stamps. Of all such assignments the one with the least sum
@@ -43,6 +45,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
         stamp: Strictly ascending stamps, int64 ns, (n,).
         period: T [s].
         label: The source, for messages.
+        what: What its rows are, for messages.
 
     Returns:
         The stamps on the grid, (n,), and a sentence on drift and stamps off their ticks, or None.
@@ -57,7 +60,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
     if ticks is None:
         shared = int(np.sum(np.diff(np.rint(place)) <= 0))
         fault = f"{shared} of {len(stamp)} are stamped nearest to the tick of the one before"
-        raise _refusal(fault, stamp, period, label)
+        raise _refusal(fault, stamp, period, label, what)
     notes: list[str] = []
     if len(stamp) >= _BLOCK:
         fit = cast(tuple[FloatArray, FloatArray], np.polyfit(ticks, since, 1, cov=True))
@@ -65,7 +68,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
         drift = slope / tick - 1.0
         if abs(slope - tick) > max(5.0 * error, 1.0 / np.ptp(ticks)):
             if abs(drift) > _MOST_DRIFT:
-                raise _refusal(f"on the nearest ticks they are {slope / 1e6:.4f} ms a tick", stamp, period, label)
+                raise _refusal(f"on the nearest ticks they are {slope / 1e6:.4f} ms a tick", stamp, period, label, what)
             tick = slope
             notes.append(f"the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it")
     residual = since - ticks * tick
@@ -74,20 +77,41 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
     late, early = int(np.sum(off > 0.5)), int(np.sum(off < -0.5))
     if doubt := _doubt(ticks, off):
         fault = f"{late + early} of {len(stamp)} are stamped more than half a period off their ticks, {doubt}"
-        raise _refusal(fault, stamp, period, label)
+        raise _refusal(fault, stamp, period, label, what)
     if late or early:
         how = "late: set back to their ticks" if not early else f"off their ticks, {early} of them early: put on them"
-        notes.append(f"{late + early} commands are stamped more than half a period {how}")
+        notes.append(f"{late + early} {what} are stamped more than half a period {how}")
     note = f"{label}: {'; '.join(notes)}" if notes else None
     return stamp[0] + np.rint(ticks * tick + offset).astype(np.int64), note
 
 
-def _refusal(fault: str, stamp: TimeArray, period: float, label: str) -> RunError:
+def ticks_of(stamp: TimeArray) -> float:
+    """The period [s] on which stamps that jitter come, by their periodogram: of a few rows first, then of more.
+
+    Args:
+        stamp: Strictly ascending stamps, int64 ns, (n,).
+    """
+    since = (stamp - stamp[0]).astype(np.float64)
+    tick, width, size = float(np.median(np.diff(since))), _ROUGHLY, _FIRST
+    while True:
+        some = since[:size]
+        count = max(some[-1] / tick, 1.0)
+        tried = tick * (1.0 + np.arange(-width, width, 0.1 / count))  # a tenth of a turn at the last row
+        clear = [abs(np.exp(2j * np.pi / one * some).mean()) for one in tried.tolist()]
+        tick = float(tried[int(np.argmax(clear))])
+        if size >= len(since):
+            slope = cast(FloatArray, np.polyfit(np.rint(_places(since, tick)), since, 1))[0]
+            return float(slope) / 1e9
+        width, size = 0.5 / count, 8 * size
+
+
+def _refusal(fault: str, stamp: TimeArray, period: float, label: str, what: str) -> RunError:
     """The error with the fault and the fix."""
+    advice = "check update_period_ms, or " if what == COMMANDS else ""
     median = float(np.median(np.diff(stamp))) / 1e6
     return RunError(
-        f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms: {fault} (their"
-        f" median interval is {median:.4f} ms); check update_period_ms, or use clock = 'stamps'"
+        f"{label}: clock = 'regular', but the {what} do not come on ticks of {period * 1e3:g} ms: {fault} (their"
+        f" median interval is {median:.4f} ms); {advice}use clock = 'stamps'"
     )
 
 

@@ -171,6 +171,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
         entity: Which part of a Rerun recording.
         where: Which of the rows: those in which each of these columns has this value.
         time: Their stamps.
+        clock: Whether these are used as they are (``stamps``), or even ticks fitted to them (``regular``).
         axes: For each axis its columns, which are added up.
         orientation: The columns of its orientation.
         joints: The columns of the joints of the ``[robot]``, which are a pose.
@@ -181,6 +182,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     entity: str = ""
     where: dict[str, bool | int | float | str] = {}
     time: Time
+    clock: Literal["stamps", "regular"] = "stamps"
     axes: dict[str, list[Column]]
     orientation: Orientation | None = None
     joints: dict[str, list[Column]] = {}
@@ -221,13 +223,11 @@ class CommandEntry(SourceEntry, frozen=True, kw_only=True):
     Attributes:
         start: The start level by axis [m or rad].
         kinds: The kinds of axes that its keys say.
-        clock: Whether the stamps are used as they are.
         interpolation: In which steps the controller goes on from one command to the next [s]; 0: it holds each.
     """
 
     start: dict[str, float] = {}
     kinds: dict[str, Kind] = {}
-    clock: Literal["stamps", "regular"] = "stamps"
     interpolation: NotNegative = msgspec.field(name="interpolation_ms", default=0.0)
 
 

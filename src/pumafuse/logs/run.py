@@ -24,6 +24,7 @@ from ..space.kinematics import Chain
 from ..units import AN, Kind, ending, nanoseconds, unwrapped
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
+from .grid import regular_grid, ticks_of
 
 if TYPE_CHECKING:
     from .entities import Recording
@@ -585,7 +586,8 @@ def of_tables(
         if entry.entity:
             found, note = found.on_timeline()
             notes.extend([] if note is None else [note])
-        return found.pivoted() if entry.has_own_rows else found
+        found = found.pivoted() if entry.has_own_rows else found
+        return _on_ticks(found, notes) if entry.clock == "regular" and entry is not listed.command else found
 
     sources = {name: source(name) for name in entries}
     together = {name: entry for name, entry in entries.items() if not entry.has_own_rows}
@@ -610,6 +612,23 @@ def of_tables(
         notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
     name, start, clock = listed.name or folder.resolve().name, listed.command.start, listed.command.clock
     return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
+
+
+def _on_ticks(source: Source, notes: list[str]) -> Source:
+    """A source on the even ticks of its own clock; those of the commands are of T, which is not known here.
+
+    Raises:
+        RunError: There are no such ticks.
+    """
+    known = source.stamp != NO_STAMP
+    distinct, place = np.unique(source.stamp[known], return_inverse=True)
+    if len(distinct) < _FEW_ROWS:
+        return source
+    grid, note = regular_grid(distinct, ticks_of(distinct), source.label, "rows")
+    notes.extend([] if note is None else [note])
+    stamp = source.stamp.copy()
+    stamp[known] = grid[place]
+    return replace(source, stamp=stamp)
 
 
 def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recording | None:

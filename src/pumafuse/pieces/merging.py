@@ -179,7 +179,7 @@ def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
         for each in ([part.innovation_rms for part in parts], [part.innovation_sd for part in parts])
     ]
     bias = digests[-1].est.biases.get(name, {}).get(axis)
-    return sensor_summary(outcomes, found, math.sqrt(squares[0]), math.sqrt(squares[1]), bias, skill)
+    return sensor_summary(axis, outcomes, found, math.sqrt(squares[0]), math.sqrt(squares[1]), bias, skill)
 
 
 def _consistency(

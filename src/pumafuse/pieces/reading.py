@@ -120,11 +120,11 @@ def rows_of(path: Path) -> int:
 def needs_whole(path: Path, config: FusionConfig) -> str | None:
     """What a run has that needs all of it in memory; None without anything.
 
-    A grid of ticks is fitted to all commands; whole turns about a base, and rows at a rate, are counted from the first
+    A grid of ticks is fitted to all rows; whole turns about a base, and rows at a rate, are counted from the first
     row on.
     """
     listed = None if path.suffix == ".parquet" else manifest.load(_manifest(path))
-    if listed is not None and listed.command.clock == "regular":
+    if listed is not None and any(entry.clock == "regular" for entry in listed.entries.values()):
         return "clock = 'regular'"
     if listed is not None and listed.command.interpolation:
         return "interpolation_ms"

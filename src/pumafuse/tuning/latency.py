@@ -19,7 +19,7 @@ from ..discovery.guesses import ArmGuess, AxisGuess, SensorGuess, guess
 from ..discovery.own_frames import own_frames
 from ..discovery.roles import relations
 from ..discovery.sensors import REFERENCE, Alignment, aligned
-from ..discovery.survey import SOONER, Survey, interpolation, soonest
+from ..discovery.survey import SOONER, Survey, early, interpolation, soonest, too_early
 from ..errors import PumafuseWarning, UnknownNameError
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor, Start
 from ..logs.axes import in_axes
@@ -251,8 +251,11 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     surveys = [Survey(Path(run.name), run, relations(run)) for run in sorted(every, key=_motion, reverse=True)]
     config = first_guess(surveys)
     trusted = _trusted(config, every, sensor)
+    sooner = {axis: by for one in surveys for axis, by in early(one, trusted).items()}
+    if sooner and not {axis for one in surveys for name, axis in one.relations if name == trusted} - set(sooner):
+        raise TuneError(f"{every[0].name}: {too_early(trusted, max(sooner.values()))}")
     likelihood = Likelihood(every, _with_right_stamps(config, trusted), [trusted])
-    moving = excited_axes(likelihood, likelihood.config)
+    moving = [axis for axis in excited_axes(likelihood, likelihood.config) if axis not in sooner]
     found = dict(zip(moving, in_threads(lambda axis: _search(likelihood, axis), moving), strict=True))
     lost = [axis for axis, search in found.items() if search.plain is None]
     config, lags = _arm(likelihood.config, {axis: found[axis] for axis in moving if axis not in lost}, trusted)
@@ -262,14 +265,11 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
             config = with_plain_arm(config, axis, one.plain.arm)
     best, sensors, said = _sensors(every, config, trusted)
     lags, clock = _with_courses(likelihood, config, lags)
-    still = [axis for axis in config.arm.axes if axis not in moving]
-    notes = [
-        *turned,
-        *likelihood.notes,
-        *said,
-        *(f"{axis}: does not move, or {trusted} does not measure it" for axis in still),
-    ]
+    still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
+    notes = [*turned, *likelihood.notes, *said]
+    notes += [f"{axis}: does not move, or {trusted} does not measure it" for axis in still]
     notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
+    notes += [f"{axis}: {too_early(trusted, by)}" for axis, by in sooner.items()]
     notes += [_SAMPLED.format(one.run.name, step * MS) for one in surveys if (step := interpolation(one))]
     notes += [_AHEAD_OF.format(one.run.name, -lag * MS) for one in surveys if (lag := soonest(one)) < -SOONER]
     summary = LatencySummary(

@@ -19,7 +19,7 @@ from ..units import MS, Kind
 from .identifiability import Correlation
 from .intervals import ConfidenceInterval, Distances, lag_slopes
 from .parameters import Parameter
-from .plain import Doubt
+from .plain import LONGEST, Doubt
 from .validation import Check, fused
 
 _FROM_PRIOR = 0.8  # of the prior's interval, from which the measurements say hardly anything
@@ -167,7 +167,7 @@ def fitted_lags(
         lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
         if axis in lost:
             continue
-        ends = [None if np.isinf(end) else end * MS for end in (lag - below, lag + above)]
+        ends = [end * MS if abs(end) <= LONGEST else None for end in (lag - below, lag + above)]
         found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
     return found
 
