@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from .errors import ConfigError, PumafuseError, PumafuseWarning, RunError, UnknownNameError
     from .filter.events import Events
     from .filter.outcome import Outcome
-    from .fusion.config import FusionConfig, Process, Sensor, Start
+    from .fusion.config import FusionConfig, Placement, Process, Sensor, Start, Tool
     from .fusion.estimates import AxisEstimate, Bias, Estimates, Measurements
     from .fusion.offline import fuse
     from .fusion.pose import Pose
@@ -33,11 +33,12 @@ if TYPE_CHECKING:
     from .live.estimator import EventLog, LiveEstimator
     from .live.health import Health, SensorHealth
     from .live.results import AxisNow, LiveEstimate, UpdateResult
-    from .logs.frames import Cylindrical, Rotated
+    from .logs.frames import Cylindrical, Placed, Rotated
     from .logs.run import Run, Source
     from .model.arm import ArmModel, AxisModel, Gain, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, Plant, SecondOrder
+    from .registration.register import Registered
     from .registration.runs import RegisteredSensor, Registrations, RegistrationSummary, register
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
@@ -55,7 +56,7 @@ _NAMES = {
     "errors": ["ConfigError", "PumafuseError", "PumafuseWarning", "RunError", "UnknownNameError"],
     "filter.events": ["Events"],
     "filter.outcome": ["Outcome"],
-    "fusion.config": ["FusionConfig", "Process", "Sensor", "Start"],
+    "fusion.config": ["FusionConfig", "Placement", "Process", "Sensor", "Start", "Tool"],
     "fusion.estimates": ["AxisEstimate", "Bias", "Estimates", "Measurements"],
     "fusion.offline": ["fuse"],
     "fusion.pose": ["Pose"],
@@ -78,11 +79,12 @@ _NAMES = {
     "live.estimator": ["EventLog", "LiveEstimator"],
     "live.health": ["Health", "SensorHealth"],
     "live.results": ["AxisNow", "LiveEstimate", "UpdateResult"],
-    "logs.frames": ["Cylindrical", "Rotated"],
+    "logs.frames": ["Cylindrical", "Placed", "Rotated"],
     "logs.run": ["Run", "Source"],
     "model.arm": ["ArmModel", "AxisModel", "Gain", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
     "model.plants": ["FirstOrder", "Plant", "SecondOrder"],
+    "registration.register": ["Registered"],
     "registration.runs": ["RegisteredSensor", "RegistrationSummary", "Registrations", "register"],
     "simulation.scenario": ["Scenario"],
     "simulation.simulate": ["Simulated", "simulate"],
@@ -103,14 +105,14 @@ __all__ = [
     "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
     "Events", "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification",
     "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "OrientationScore",
-    "Outcome", "PartLag", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile", "PumafuseError",
-    "PumafuseWarning", "ReferenceTrack", "RegisteredSensor", "RegistrationSummary", "Registrations", "Rotated",
-    "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor",
-    "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary",
-    "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary",
-    "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize", "error_figure", "fuse",
-    "fused_figure", "identify", "latency", "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune",
-    "validation_figure", "verify",
+    "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile",
+    "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor", "RegistrationSummary",
+    "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder",
+    "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start",
+    "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError",
+    "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize",
+    "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score", "simulate",
+    "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 

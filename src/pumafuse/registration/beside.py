@@ -60,7 +60,7 @@ def _compared(first: Motion, other: Motion) -> tuple[FloatArray, FloatArray]:
     smooth = despiked(first.position)
 
     def at(time: FloatArray) -> FloatArray:
-        return np.column_stack([np.interp(time, first.time, one) for one in smooth.T])
+        return np.column_stack([np.interp(time, first.time, smooth[:, axis]) for axis in range(3)])
 
     there = at(other.time)
     speed = (at(other.time + _SPEED) - at(other.time - _SPEED)) / (2.0 * _SPEED)

@@ -96,7 +96,6 @@ class Registration(msgspec.Struct, frozen=True, kw_only=True):
         marker: Tool from marker; likewise.
         position: The response of positions.
         rotation: That of orientations; None where it was taken to be that of positions.
-        latency: The sensor's [s], where the arm's lag was given.
         rms: What is left of positions [m].
         rms_rotation: What is left of orientations [rad]; None where they were not used.
         rows: How many measurements were looked at.
@@ -107,7 +106,6 @@ class Registration(msgspec.Struct, frozen=True, kw_only=True):
     marker: Registered | None = None
     position: Response | None = None
     rotation: Response | None = None
-    latency: Quantity | None = None
     rms: float | None = None
     rms_rotation: float | None = None
     rows: int = 0
@@ -120,7 +118,6 @@ def registered(
     *,
     marker: Place | None = None,
     fix_marker: bool = False,
-    arm_lag: float | None = None,
 ) -> Registration:
     """Frame, marker and lag of a sensor.
 
@@ -129,7 +126,6 @@ def registered(
         sensor: What the sensor told in its own frame and by the same clock, likewise.
         marker: Tool from marker as far as it is known: what motion does not tell stays so. None: zeros.
         fix_marker: Whether it stays as it is.
-        arm_lag: The arm's lag [s]; the sensor's latency is what is left.
     """
     both = [(a, _within(b, a.time)) for a, b in ((a.valid(), b.valid()) for a, b in zip(command, sensor, strict=True))]
     both = [(a, b) for a, b in both if len(b.time) >= _FEWEST]
@@ -141,7 +137,7 @@ def registered(
     if about.correlation < _FOLLOWS:
         return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
     seen = [_within(b, a.time, _SETTLED * max(about.lag, 0.0)) for a, b in both]
-    return _fitted(_begun(told, seen, about, marker or Place(), fix_marker), fix_marker, arm_lag)
+    return _fitted(_begun(told, seen, about, marker or Place(), fix_marker), fix_marker)
 
 
 def _within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
@@ -398,7 +394,7 @@ def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) ->
     return _Aligned(frame, share, excess, (rotation, float(np.sqrt(alone / half))))
 
 
-def _fitted(begin: _Begin, fix_marker: bool, arm_lag: float | None) -> Registration:
+def _fitted(begin: _Begin, fix_marker: bool) -> Registration:
     """The least squares over all, and what they do not tell."""
     found = begin.findings
     if any(one.prevents for one in found):
@@ -422,7 +418,7 @@ def _fitted(begin: _Begin, fix_marker: bool, arm_lag: float | None) -> Registrat
     turn = begin.attitude and not fix_marker
     fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
     lengths = [len(one.time) for one in sensor]
-    return _told(fit, begin, lengths, loose, blind, own, arm_lag)
+    return _told(fit, begin, lengths, loose, blind, own)
 
 
 def _about(path: FloatArray, rotation: FloatArray, attitude: bool) -> tuple[FloatArray, FloatArray]:
@@ -448,7 +444,6 @@ def _told(
     loose: FloatArray,
     blind: FloatArray,
     own: bool,
-    arm_lag: float | None,
 ) -> Registration:
     """The numbers with their intervals."""
     state = fit.state
@@ -462,16 +457,11 @@ def _told(
     told = [Quantity(one, (one - by, one + by)) for one, by in zip(values.tolist(), half.tolist(), strict=True)]
     position, rotation = (Response(lag=a, delay=b, time_constant=c) for a, b, c in (told[12:15], told[15:18]))
     noise = fit.off.rms()
-    latency = None
-    if arm_lag is not None:
-        low, high = position.lag.ci95
-        latency = Quantity(position.lag.value - arm_lag, (low - arm_lag, high - arm_lag))
     return Registration(
         frame=_registered(told[:6]),
         marker=_registered(told[6:12]),
         position=position,
         rotation=rotation if own else None,
-        latency=latency,
         rms=noise[0],
         rms_rotation=noise[1] if begin.attitude else None,
         rows=sum(lengths),

@@ -135,7 +135,8 @@ def register(
         raise UnknownNameError("--fix", "what is", unknown, FIXED)
     names = _sensors(every, config, sensor)
     lag = None if config is None else float(np.mean([config.arm.lag_of(axis) for axis in CARTESIAN]))
-    found = {name: _registered(every, name, config, lag, fixed=bool(list(fix))) for name in names}
+    fixed = bool(list(fix))
+    found = {name: _registered(every, name, config, fixed=fixed) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
     placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
     said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
@@ -180,15 +181,13 @@ def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | Non
     return names
 
 
-def _registered(
-    runs: Sequence[Run], name: str, config: FusionConfig | None, lag: float | None, *, fixed: bool
-) -> Registration:
+def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, fixed: bool) -> Registration:
     """The registration of one sensor by the runs that have it."""
     pairs = [(_motion(run.command), _motion(run.sensors[name])) for run in runs if name in run.sensors]
     marker = None if config is None or name not in config.sensors else config.sensors[name].marker
     known = None if marker is None else Place(marker.at, marker.rotation)
     command, sensor = [told for told, _ in pairs], [seen for _, seen in pairs]
-    return registered(command, sensor, marker=known, fix_marker=fixed, arm_lag=lag)
+    return registered(command, sensor, marker=known, fix_marker=fixed)
 
 
 def _motion(source: Source) -> Motion:
