@@ -49,8 +49,8 @@ WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, 
 SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
 _DOUBT = 20.0  # log-likelihood that a recovery at a bound must gain: mostly another model says the same
 _FORLORN = 8.0  # log-likelihood behind the best, from which a model or a dead time counts for nothing
-# update periods, by which a dead time may be on a wrong bump of the likelihood
-_TICKS = tuple(sign * share for share in (0.25, 0.5, 1.0) for sign in (-1.0, 1.0))
+# Update periods, by which a dead time may be on a wrong bump of the likelihood
+_TICKS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
 _SAME = 2e-4  # s, between dead times of maxima that are one
 _STEP = 0.7  # standard deviations, between dead times
 _LONGEST_STEP = 0.03  # s
