@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 import pumafuse as pf
+from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.roles import relations
 from pumafuse.discovery.survey import Survey
 from pumafuse.tuning import latency as module
@@ -102,8 +103,8 @@ def test_steps_jitter_and_scale_of_another_sensor_are_said() -> None:
     stamp = camera.stamp[0] + np.rint(1e9 * (valid - valid[0] + rng.normal(0.0, 0.015, len(valid)))).astype(np.int64)
     eye = replace(camera, stamp=stamp, values={"x": seen})
     run = replace(run, sensors={**run.sensors, "camera": later, "eye": eye})
-    config = module.first_guess([Survey(Path("log"), run, relations(run))])
-    config, sensors, notes = module._sensors([run], config, "tracker")
+    config = module.first_guess([guess(Survey(Path("log"), run, relations(run)))])
+    config, sensors, notes = module._sensors([run], config, "tracker", {})
     (step,) = sensors["camera"].steps
     assert (step.before, step.after) == pytest.approx((LATENCY, LATENCY + 0.06), abs=3e-3)
     assert step.time == pytest.approx(10.0, abs=1.0)

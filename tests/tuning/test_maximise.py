@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +11,7 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.tuning.likelihood import Derivatives, Likelihood
-from pumafuse.tuning.maximise import Point, derivatives, ignore, maximise, maximise_by_axis, point
+from pumafuse.tuning.maximise import Point, derivatives, maximise, point
 from pumafuse.tuning.parameters import Fit, Parameter, moved
 from pumafuse.tuning.steps import bounded_step
 from tuning_runs import (
@@ -73,10 +71,7 @@ def test_a_search_ends_at_a_maximum(seed: int, fit: Sequence[Fit]) -> None:
 
 
 def test_a_search_ends_early_only_where_it_cannot_be_worth_it() -> None:
-    """Half below the maximum, the end is the same to the bit; far above it, a few steps show that it is out of reach.
-
-    By axis as well, where each is compared with the same axis of another point.
-    """
+    """Half below the maximum, the end is the same to the bit; far above it, a few steps show it out of reach."""
     sim = outage(1)
     config = spoiled_arm(sim.config)
     likelihood = Likelihood([sim.run], config)
@@ -89,16 +84,6 @@ def test_a_search_ends_early_only_where_it_cannot_be_worth_it() -> None:
     left = maximise(likelihood, config, free, some.append, outcomes, worth=best.log_posterior + 1e5)
     assert len(some) < len(whole) // 2
     assert left.log_posterior == some[-1].log_posterior < best.log_posterior - 0.5
-    own = free_of(likelihood, config, ("noise",))
-    ungated = msgspec.structs.replace(
-        config, sensors={name: msgspec.structs.replace(one, gate=0.0) for name, one in config.sensors.items()}
-    )
-    alone = maximise_by_axis(likelihood, ungated, own, ignore, 0.1)
-    low = replace(alone, axes=alone.axes - 0.5)
-    assert np.array_equal(maximise_by_axis(likelihood, ungated, own, ignore, 0.1, beside=low).axes, alone.axes)
-    high = replace(alone, axes=alone.axes + np.array([1e5, *[-0.5] * (len(alone.axes) - 1)]))
-    mixed = maximise_by_axis(likelihood, ungated, own, ignore, 0.1, beside=high).axes
-    assert mixed[0] < alone.axes[0] - 0.5 and np.array_equal(mixed[1:], alone.axes[1:])
 
 
 @st.composite

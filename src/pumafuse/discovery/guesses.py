@@ -69,12 +69,19 @@ class ArmGuess:
     axes: Mapping[str, AxisGuess]
 
 
+class Pair(NamedTuple):
+    """A sensor beside another one."""
+
+    other: str
+    alignment: Alignment
+
+
 @dataclass(frozen=True)
 class SensorGuess:
     """A sensor: noise and biases by axis [m or rad], latency [s] and where it is from, scale, gate (0: none needed).
 
     ``latency_sd``: how far the latency of a row is from that [s]. ``turns``: whether it measures angles within a turn.
-    ``doubts``: what one latency does not say, in sentences.
+    ``doubts``: what one latency does not say, in sentences. ``pair``: what all that is from.
     """
 
     sd: Mapping[str, float]
@@ -86,13 +93,7 @@ class SensorGuess:
     turns: bool
     latency_sd: float = 0.0
     doubts: Sequence[str] = ()
-
-
-class _Pair(NamedTuple):
-    """A sensor beside another one."""
-
-    other: str
-    alignment: Alignment
+    pair: Pair | None = None
 
 
 def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
@@ -127,7 +128,7 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
 
 def _against_each_other(
     run: Run, relations: Mapping[tuple[str, str], Following]
-) -> tuple[str, dict[str, float], dict[str, _Pair]]:
+) -> tuple[str, dict[str, float], dict[str, Pair]]:
     """The source that is earliest, the reference if there is one; how much later each is [s]; each beside the densest.
 
     Without sensors that have no motion in common with the one that has the most rows.
@@ -139,7 +140,7 @@ def _against_each_other(
         return "", {}, {}
     base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
     every = {name: aligned([run], base, name) for name in lags if name != base}
-    pairs = {name: _Pair(base, one) for name, one in every.items() if one is not None}
+    pairs = {name: Pair(base, one) for name, one in every.items() if one is not None}
     later = {base: 0.0, **{name: one.alignment.latency for name, one in pairs.items() if not _hardly_earlier(one)}}
     first = base if base == REFERENCE else min(later, key=later.__getitem__)
     ahead = float(np.median(lags[first]))
@@ -148,7 +149,7 @@ def _against_each_other(
     return first, latencies, pairs
 
 
-def _hardly_earlier(pair: _Pair) -> bool:
+def _hardly_earlier(pair: Pair) -> bool:
     """Whether a sensor seems earlier than the densest one, but not surely: the time of all would be wrong by that."""
     return -_SURELY * pair.alignment.half < pair.alignment.latency < 0.0
 
@@ -180,7 +181,7 @@ def _sensor(
     latencies: Mapping[str, float],
     first: str,
     leads: Mapping[str, Mapping[str, Following]],
-    pair: _Pair | None,
+    pair: Pair | None,
 ) -> SensorGuess:
     noises = {} if pair is None else pair.alignment.sd
     relations = {axis: found.relations.get((name, axis)) for axis in found.run.sensors[name].values}
@@ -202,7 +203,8 @@ def _sensor(
     if pair is None:
         return known
     beside = pair.alignment
-    return replace(known, latency_sd=beside.unsteadiness, doubts=list(beside.doubts(name, pair.other)))
+    doubts = list(beside.doubts(name, pair.other))
+    return replace(known, latency_sd=beside.unsteadiness, doubts=doubts, pair=pair)
 
 
 def _noise(found: Survey, name: str, axis: str, one: Following, beside: float) -> float:

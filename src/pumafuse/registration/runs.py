@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from .. import toml
+from ..discovery.guesses import guess
 from ..discovery.roles import relations
 from ..discovery.survey import Survey
 from ..errors import ConfigError, PumafuseWarning, RunError, UnknownNameError
@@ -304,7 +305,7 @@ def _configuration(
     """A configuration to begin with: the arm that was found, and noise as it looks along the base's axes."""
     config = _placed(begun, found, latencies)
     placed = [in_base(run, config)[0] for run in runs]
-    guessed = first_guess([Survey(Path(run.name), run, relations(run)) for run in placed])
+    guessed = first_guess([guess(Survey(Path(run.name), run, relations(run))) for run in placed])
     sensors = {
         name: msgspec.structs.replace(
             guessed.sensors[name], latency=one.latency, frame=one.frame, marker=one.marker, scale=1.0, bias_sd=0.0

@@ -16,18 +16,27 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray
 from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
+from .parameters import QUICKEST, RECOVERY, RECOVERY_PRIOR
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
-from .posterior import GAINS, SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
+from .posterior import (
+    GAINS,
+    SHORTEST,
+    AxisPosterior,
+    Branch,
+    Entry,
+    GainKind,
+    Mixture,
+    Model,
+    Quantity,
+    chosen_model,
+    shared_delay,
+    sharing,
+)
 
-BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.3, 3.0)}  # recovery [s]
+BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": RECOVERY, "gain": (0.3, 3.0)}  # s, but ζ and K
 _USUAL_GAIN, _BEYOND = (0.7, 1.3), 1.25  # where it may be; where least squares find another, so many times that
 # A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
-# 95 % of what is believed of a recovery lies within its bounds.
-PRIORS = {
-    "gain": (1.0, 0.1),
-    "damping": (0.0, 0.7),
-    "recovery": (math.log(0.1), math.log(0.5 / 0.02) / (2.0 * 1.96)),
-}
+PRIORS = {"gain": (1.0, 0.1), "damping": (0.0, 0.7), "recovery": RECOVERY_PRIOR}
 _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each share of which is as likely
 _STARTS = 3  # maxima of the grid from which an arm is fitted
 _NEARLY = 40.0  # log-likelihood that a better noise may gain
@@ -36,19 +45,12 @@ _GATED = 2  # times: outliers widen the noise by which they are told
 _GATE = 6.0  # standard deviations, from which a measurement does not count
 _EARLIER, _DAMPED = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no dead time, ζ
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
-_WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
-_SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
-_QUICKEST = 2.0  # update periods, of a disturbance
+WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
+SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
 _DOUBT = 20.0  # log-likelihood that a recovery at a bound must gain: mostly another model says the same
 _FORLORN = 8.0  # log-likelihood behind the best, from which a model or a dead time counts for nothing
-_TICKS = (
-    -1.0,
-    -0.5,
-    -0.25,
-    0.25,
-    0.5,
-    1.0,
-)  # update periods, by which a dead time may be on a wrong bump of the likelihood
+# Update periods, by which a dead time may be on a wrong bump of the likelihood
+_TICKS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
 _SAME = 2e-4  # s, between dead times of maxima that are one
 _STEP = 0.7  # standard deviations, between dead times
 _LONGEST_STEP = 0.03  # s
@@ -227,10 +229,10 @@ class ArmSearch:
 
     def _likely_rest(self, arm: Arm, noise: Rest, least: Sequence[float], prior: float | None) -> Rest:
         """The most likely of what an arm leaves, after the penalty for its numbers."""
-        found = list(rests(self._measured, arm, noise, _QUICKEST * self._measured.period, least, prior))
+        found = list(rests(self._measured, arm, noise, QUICKEST * self._measured.period, least, prior))
         self.rests = [rest for rest, _ in found]
         dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
-        prices = [_WANDERS, dearer + _SMOOTHER, dearer]
+        prices = [WANDERS, dearer + SMOOTHER, dearer]
         return max(zip(found, prices, strict=True), key=lambda one: one[0][1] - one[1])[0][0]
 
     def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None) -> dict[Model, Fit]:
@@ -378,6 +380,43 @@ class ArmSearch:
             slope = np.array([(one[quantity] - mean) / _SLOPE for one in moved])
             sds[quantity] = math.sqrt(max(float(slope @ cov @ slope), 0.0)) if free else 0.0
         return Entry(fit.arm.delay, fit.arm, self._laplace(fit, names, inside), means, sds)
+
+
+class Chosen(NamedTuple):
+    """The likeliest arm of an axis, beside those of the others.
+
+    Attributes:
+        arm: The arm.
+        model: Of which order and kind of gain it is.
+        mixture: All that the axis may be, with what others say of a dead time that it shares.
+        shares: Whether it shares that.
+    """
+
+    arm: Arm
+    model: Model
+    mixture: Mixture
+    shares: bool
+
+
+def chosen_arms(
+    searched: Mapping[str, ArmSearch], delayed: Collection[str], one_delay: bool = False
+) -> tuple[dict[str, Chosen], float | None]:
+    """The likeliest arm of each axis, and the dead time that some of them share [s]; None: they do not.
+
+    Args:
+        searched: By axis.
+        delayed: The axes whose dead time is free.
+        one_delay: Whether these share one whatever the measurements say.
+    """
+    known = {axis: one.posterior for axis, one in searched.items() if axis in delayed}
+    shares = list(known) if one_delay else sharing(known)
+    delay, found = shared_delay([known[axis] for axis in shares]) if shares else None, dict[str, Chosen]()
+    for axis, search in searched.items():
+        mine = axis in shares
+        mixture = search.posterior.mixture([known[one] for one in shares if mine and one != axis])
+        model = chosen_model(mixture)
+        found[axis] = Chosen(search.arm(model, delay if mine else None), model, mixture, mine)
+    return found, delay
 
 
 def _quantities(arm: Arm) -> dict[Quantity, float]:

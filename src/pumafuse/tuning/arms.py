@@ -450,9 +450,9 @@ def _liveliest(one: Recording, most: int) -> Recording:
     return part._replace(given=given, command=command, start=start, value=part.value + one.start - start)
 
 
-def covariance(information: FloatArray) -> FloatArray:
-    """The covariance of coordinates; without information it is enormous."""
-    size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+def covariance(information: FloatArray, scale: float | Sequence[float] = 1.0) -> FloatArray:
+    """The covariance of coordinates, (k, k), a large change of which is ``scale``; without information enormous."""
+    size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12 / np.square(scale)))
     values, vectors = np.linalg.eigh(information * np.outer(size, size))
     return (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(size, size)
 

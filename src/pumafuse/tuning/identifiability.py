@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import PumafuseError
 from ..fusion.config import FusionConfig
+from . import arms
 from .likelihood import Likelihood
 from .maximise import Point, derivatives
 from .parameters import Parameter, smallest_sd
@@ -136,9 +137,7 @@ def few_measurements(likelihood: Likelihood, free: Sequence[Parameter]) -> list[
 
 def covariance(information: FloatArray, free: Sequence[Parameter]) -> FloatArray:
     """The covariance of the coordinates, (k, k), from the information (k, k); without information it is enormous."""
-    size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12 / np.square([one.scale for one in free])))
-    values, vectors = np.linalg.eigh(information * np.outer(size, size))
-    return (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(size, size)
+    return arms.covariance(information, [one.scale for one in free])
 
 
 def within_bounds(free: Sequence[Parameter], config: FusionConfig) -> list[Parameter]:

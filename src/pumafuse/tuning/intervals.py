@@ -15,8 +15,8 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..toml import Interval
 from .identifiability import covariance, within_bounds
-from .likelihood import Likelihood, Linearised, in_threads
-from .maximise import Ascent, Point, derivatives, maximise, point, with_priors
+from .likelihood import Likelihood, in_threads
+from .maximise import Point, derivatives, maximise, point
 from .parameters import Parameter, coordinates, moved, rounded
 
 Distances: TypeAlias = tuple[float, float]  # s; to the lower and upper end of an interval, infinite where it is open
@@ -87,7 +87,6 @@ class _View(NamedTuple):
         likelihood: The likelihood.
         outcomes: The outcomes of its components, which are repeated.
         free: The free parameters that are not at a bound. The prior of a shared one is the information of other axes.
-        linear: The innovations around the maximum, to first order in these.
         covariance: Of their coordinates, (k, k).
         top: The log-posterior of the maximum.
     """
@@ -95,7 +94,6 @@ class _View(NamedTuple):
     likelihood: Likelihood
     outcomes: Sequence[CodeArray]
     free: Sequence[Parameter]
-    linear: Linearised
     covariance: FloatArray
     top: float
 
@@ -170,9 +168,8 @@ def _of_shared(information: FloatArray, own: int) -> FloatArray:
 
 def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> _View:
     there = point(likelihood, best.config, free, outcomes)
-    linear = likelihood.linearised(best.config, free, there.outcomes)
-    cov = covariance(with_priors(linear, there, free).information, free)
-    return _View(likelihood, outcomes, free, linear, cov, there.log_posterior)
+    cov = covariance(derivatives(likelihood, there, free).information, free)
+    return _View(likelihood, outcomes, free, cov, there.log_posterior)
 
 
 class _End(NamedTuple):
@@ -196,11 +193,10 @@ def _end(view: _View, best: Point, one: Parameter, sign: float, drawn: bool) -> 
 
 
 class _Known(NamedTuple):
-    """A point of a profile: its drop, where the other coordinates are, and the innovations there to first order."""
+    """A point of a profile: its drop, and where the other coordinates are."""
 
     drop: float
     others: FloatArray
-    linear: Linearised
 
 
 class _Side:
@@ -217,17 +213,16 @@ class _Side:
         self._view, self._best, self._one, self._bound = view, best, one, one.at_bound(best.config)
         self._others = [other for other in view.free if other.key != one.key]
         self._every = [*view.free, *([] if self._bound is None else [one])]
-        slope, sd, near = np.zeros(len(self._others)), 1.0, view.linear
+        slope, sd = np.zeros(len(self._others)), 1.0
         for place, other in enumerate(view.free):
             if other.key == one.key:  # by regression, Cov(·, a) / Var a
-                near = view.linear.without(place)
                 slope = np.delete(view.covariance[:, place] / view.covariance[place, place], place)
                 sd = float(np.sqrt(view.covariance[place, place]))
         self._unit, self._start = sign * sd, one.at(best.config)
         self._slope = self._unit * slope
         self._vanishing = self._bound is not None and one.vanishes
         self._range = np.array([other.range for other in self._others]).reshape(-1, 2).T
-        self._known = {0.0: _Known(0.0, coordinates(best.config, self._others), near)}  # by distance
+        self._known = {0.0: _Known(0.0, coordinates(best.config, self._others))}  # by distance
         self._top = view.top + (0.0 if self._bound is None else one.log_prior(best.config))
         self.limit = self._distance(one.bounds[0 if sign < 0.0 else 1])
 
@@ -245,8 +240,12 @@ class _Side:
         if self._bound is not None:
             places = [0.5**n * self.limit for n in range(_HALVINGS + 1)]
             end = places[bisect_left(places, True, hi=_HALVINGS, key=lambda place: _root(self._drop(place)) < Z95)]
-        elif self.limit > Z95 and abs(self._drop(Z95) / (0.5 * Z95**2) - 1.0) < _SKEWED:
-            return Z95, False
+        elif self.limit > Z95:
+            drop = self._drop(Z95)
+            if abs(drop / (0.5 * Z95**2) - 1.0) < _SKEWED:
+                return Z95, False
+            end = min(max(Z95 / _root(drop), 1.0 / _FARTHER), _FARTHER) * Z95
+            end = min(end, self.limit)
         inner = 0.0
         while self._missing(end) < 0.0 and end < self.limit:
             if inner == 0.0 and self._may_be_none(end):
@@ -262,10 +261,9 @@ class _Side:
         distance = next((one for one in self._known if math.isclose(one, distance, rel_tol=_SAME)), distance)
         if distance not in self._known:
             inner = max(one for one in self._known if one < distance)
-            near = min(self._known, key=lambda one: abs(one - distance))
-            found = self._maximum(distance, self._expected(distance), self._known[near].linear)
+            found = self._maximum(distance, self._expected(distance))
             if _root(found.drop) > _FALLEN * Z95:  # another maximum, perhaps: the one inside goes on
-                beside = self._maximum(distance, self._known[inner].others, self._known[inner].linear)
+                beside = self._maximum(distance, self._known[inner].others)
                 found = min(found, beside, key=lambda one: one.drop)
             self._known[distance] = found
         return _root(self._known[distance].drop)
@@ -274,8 +272,7 @@ class _Side:
         """Whether a noise that has not dropped at a distance may be 0: on the way there its profile hardly changes."""
         if not self._one.vanishes or self._unit > 0.0:
             return False
-        _, others, near = self._known[distance]
-        found = self._maximum(self.limit, others, near)
+        found = self._maximum(self.limit, self._known[distance].others)
         if may_be := _root(found.drop) < Z95:
             self._known[self.limit] = found
         return may_be
@@ -327,12 +324,18 @@ class _Side:
         there = self._along(distance, self._known[0.0].others + distance * self._slope)
         return self._top - point(self._view.likelihood, there, self._every, self._view.outcomes).log_posterior
 
-    def _maximum(self, distance: float, others: FloatArray, near: Linearised) -> _Known:
-        """The maximum next to these other coordinates; ``near``: derivatives by them from nearby."""
-        ascent = Ascent(self._view.likelihood, self._others, self._view.outcomes, _TOLERANCE, near)
-        peak = ascent.maximum(self._along(distance, others), worth=self._top - _FAR_BELOW)
+    def _maximum(self, distance: float, others: FloatArray) -> _Known:
+        """The maximum next to these other coordinates."""
+        peak = maximise(
+            self._view.likelihood,
+            self._along(distance, others),
+            self._others,
+            outcomes=self._view.outcomes,
+            tolerance=_TOLERANCE,
+            worth=self._top - _FAR_BELOW,
+        )
         drop = self._top - peak.log_posterior - self._one.log_prior(peak.config)
-        return _Known(drop, coordinates(peak.config, self._others), ascent.linear or near)
+        return _Known(drop, coordinates(peak.config, self._others))
 
 
 def _root(drop: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import toml
 from ..arrays import FloatArray
-from ..discovery.guesses import ArmGuess, AxisGuess, SensorGuess, guess
+from ..discovery.guesses import ArmGuess, AxisGuess, Pair, SensorGuess, guess
 from ..discovery.own_frames import own_frames
 from ..discovery.roles import relations
 from ..discovery.sensors import REFERENCE, Alignment, aligned
@@ -28,7 +28,7 @@ from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..toml import Interval
 from ..units import MS
-from .arm_search import ArmSearch, Freedom
+from .arm_search import ArmSearch, Chosen, Freedom, chosen_arms
 from .arms import Arm, Rest
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
@@ -43,7 +43,7 @@ from .parameters import (
     with_shared_delay,
 )
 from .plain import Doubt, doubts, with_plain_arm
-from .posterior import Mixture, Model, Quantity, chosen_model, shared_delay, sharing
+from .posterior import Model, Quantity
 
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
 _HIGHEST = 700.0  # logarithm of what a number can be
@@ -249,7 +249,8 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     if turned and not any(run.sensors for run in every):
         raise TuneError("; ".join(turned))
     surveys = [Survey(Path(run.name), run, relations(run)) for run in sorted(every, key=_motion, reverse=True)]
-    config = first_guess(surveys)
+    guesses = [guess(one) for one in surveys]
+    config = first_guess(guesses)
     trusted = _trusted(config, every, sensor)
     sooner = {axis: by for one in surveys for axis, by in early(one, trusted).items()}
     if sooner and not {axis for one in surveys for name, axis in one.relations if name == trusted} - set(sooner):
@@ -263,7 +264,8 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
         lags[axis] = _doubted(lags[axis], one, one.sentence(config, axis))
         if one.refutes:
             config = with_plain_arm(config, axis, one.plain.arm)
-    best, sensors, said = _sensors(every, config, trusted)
+    known = {name: one.pair for _, each in guesses for name, one in each.items() if one.pair and len(every) == 1}
+    best, sensors, said = _sensors(every, config, trusted, known)
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
     notes = [*turned, *likelihood.notes, *said]
@@ -305,15 +307,14 @@ def _without(run: Run, names: Collection[str]) -> Run:
     return run if len(kept) == len(run.sensors) else replace(run, sensors=kept)
 
 
-def first_guess(surveys: Sequence[Survey]) -> FusionConfig:
+def first_guess(guesses: Sequence[tuple[ArmGuess, Mapping[str, SensorGuess]]]) -> FusionConfig:
     """A configuration by correlation: lags, noise and latencies of the runs, those with the most motion first.
 
     Raises:
         RunError: There are fewer than two commands.
     """
     arms, axes, sensors = list[ArmGuess](), dict[str, AxisGuess](), dict[str, SensorGuess]()
-    for survey in surveys:
-        arm, found = guess(survey)
+    for arm, found in guesses:
         arms.append(arm)
         axes = {**arm.axes, **axes}
         for name, one in found.items():
@@ -410,16 +411,12 @@ def _search(likelihood: Likelihood, axis: str) -> ArmSearch:
 
 def _arm(config: FusionConfig, found: Mapping[str, ArmSearch], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:
     """The arm of all axes with what it leaves, and the lag of each with its intervals."""
-    posteriors, lags = {axis: one.posterior for axis, one in found.items()}, dict[str, AxisLag]()
-    shares = sharing(posteriors)
-    delay = shared_delay([posteriors[axis] for axis in shares]) if shares else None
-    for axis, search in found.items():
-        mixture = search.posterior.mixture([posteriors[one] for one in shares if axis in shares and one != axis])
-        model = chosen_model(mixture)
-        arm = search.arm(model, delay if axis in shares else None)
-        arm = Arm(*(rounded(number) for number in arm))
-        config = with_rest(with_arm(config, axis, arm), axis, search.rest, [trusted])
-        lags[axis] = _axis_lag(search, arm, mixture, model, trusted, axis in shares)
+    (chosen, delay), lags = chosen_arms(found, found), dict[str, AxisLag]()
+    for axis, one in chosen.items():
+        arm = Arm(*(rounded(number) for number in one.arm))
+        config = with_rest(with_arm(config, axis, arm), axis, found[axis].rest, [trusted])
+        lags[axis] = _axis_lag(found[axis], one._replace(arm=arm), trusted)
+    shares = [axis for axis, one in chosen.items() if one.shares]
     return with_shared_delay(config, shares, rounded(delay)) if delay is not None else config, lags
 
 
@@ -447,7 +444,9 @@ def _notes(one: AxisLag, gains: tuple[float, float]) -> list[str]:
     return found
 
 
-def _axis_lag(search: ArmSearch, arm: Arm, mixture: Mixture, model: Model, trusted: str, shared: bool) -> AxisLag:
+def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str) -> AxisLag:
+    arm, model, mixture, shared = chosen
+
     def interval(quantity: Quantity, value: float, margin: float = _MARGIN) -> Interval:
         """Of the models like the chosen one; of a logarithm in the number itself."""
         log = quantity not in ("lag", "delay", "gain")
@@ -516,17 +515,20 @@ def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
 
 
 def _sensors(
-    runs: Sequence[Run], config: FusionConfig, trusted: str
+    runs: Sequence[Run], config: FusionConfig, trusted: str, known: Mapping[str, Pair]
 ) -> tuple[FusionConfig, dict[str, SensorLag], list[str]]:
     """The configuration with noise, latency and scale of the other sensors; these with intervals; what is to be said.
 
-    No arm is needed for it.
+    No arm is needed for it. ``known``: what was found for the first guess, beside some sensor.
     """
     found, notes = dict[str, SensorLag](), list[str]()
     for name, sensor in config.sensors.items():
-        one = None if name == trusted else aligned(runs, trusted, name)
+        if name == trusted:
+            continue
+        beside = known.get(name)
+        one = beside.alignment if beside and beside.other == trusted else aligned(runs, trusted, name)
         if one is None:
-            notes += [] if name == trusted else [_APART.format(name, trusted)]
+            notes.append(_APART.format(name, trusted))
             continue
         found[name] = _sensor_lag(one)
         notes += one.doubts(name, trusted)

@@ -36,8 +36,8 @@ from ..logs.run import Run
 from .arms import Measured, Recording
 from .parameters import Parameter, changed
 
-_LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of it, the rounding error 1e-11
-_STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
+_LOG_STEP = 1e-6  # of a logarithm: of a filter's number the truncation error is half of it, the rounding error 1e-10
+_STEP = 2e-5  # s, or of a gain or a scale, in which a filter's numbers are linear
 _PIECES = 20  # of a run, that a model which is right has independent scores in
 _SHIFT = 1e-4  # s, by which a lag is varied
 _SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
@@ -116,61 +116,6 @@ class _Linear(NamedTuple):
     S: FloatArray
     d_nu: FloatArray
     d_s: FloatArray
-
-    def moved(self, step: FloatArray, nu: FloatArray, sd: FloatArray) -> _Linear:
-        """After a ``step`` (p,) to where they are ``nu`` and ``sd`` squared.
-
-        The derivatives change by the least, each weighed by its information, that explains these (Broyden's update).
-        """
-        S = sd * sd
-        weight = (self.d_nu**2 @ (1.0 / self.S) + 0.5 * self.d_s**2 @ (1.0 / self.S**2)) * step
-        weight /= max(float(weight @ step), _SMALLEST**2)
-        return self._replace(
-            nu=nu,
-            S=S,
-            d_nu=self.d_nu + np.outer(weight, nu - self.nu - step @ self.d_nu),
-            d_s=self.d_s + np.outer(weight, S - self.S - step @ self.d_s),
-        )
-
-
-@dataclass(frozen=True)
-class Linearised:
-    """Innovations and variances around a configuration, to first order in k parameters, with the outcomes there.
-
-    Attributes:
-        parts: By axis and segment.
-        size: How many parameters there are.
-        exact: Whether the derivatives were computed here, not carried along from elsewhere.
-    """
-
-    parts: Sequence[_Linear]
-    size: int
-    exact: bool
-
-    def without(self, number: int) -> Linearised:
-        """Without one of the parameters."""
-        parts = [
-            part._replace(
-                mine=[one - (one > number) for one in part.mine if one != number],
-                **{name: getattr(part, name)[[one != number for one in part.mine]] for name in ("d_nu", "d_s")},
-            )
-            for part in self.parts
-        ]
-        return replace(self, parts=parts, size=self.size - 1)
-
-    def derivatives(self) -> Derivatives:
-        """Score and information."""
-        information = np.zeros((self.size, self.size))
-        scores = np.zeros((1 + max(part.whole for part in self.parts), self.size, _PIECES))
-        for part in self.parts:
-            d_nu, d_s = part.d_nu * (part.fused / np.sqrt(part.S)), part.d_s / part.S
-            r = part.nu / np.sqrt(part.S)
-            excess = np.where(part.fused, r * r - 1.0, -1.0)
-            begins = np.unique(np.arange(_PIECES) * len(r) // _PIECES)
-            score = np.add.reduceat(0.5 * d_s * excess - d_nu * r, begins, axis=1)
-            scores[part.whole, part.mine, : len(begins)] += score
-            information[np.ix_(part.mine, part.mine)] += d_nu @ d_nu.T + 0.5 * d_s @ d_s.T
-        return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
 
 
 @dataclass(frozen=True)
@@ -457,43 +402,31 @@ class Likelihood:
         self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]
     ) -> Derivatives:
         """Score and information of parameters while each component's outcome stays as it is."""
-        return self.linearised(config, parameters, outcomes).derivatives()
-
-    def linearised(
-        self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]
-    ) -> Linearised:
-        """Innovations and variances around a configuration while each component's outcome stays as it is."""
 
         def of(part: _Part) -> _Linear:
             return self._linear(part, outcomes, config, parameters)
 
-        return Linearised(in_threads(of, self._parts), len(parameters), exact=True)
-
-    def moved(self, linear: Linearised, step: FloatArray, results: Sequence[Results]) -> Linearised:
-        """The same a ``step`` of the coordinates (k,) away, where the innovations are those in ``results``.
-
-        Derivatives are not computed anew: they change as little as agrees with these innovations and their variances
-        (Broyden, "A class of methods for solving nonlinear simultaneous equations", Mathematics of Computation 19,
-        1965).
-        """
-        parts = [
-            one.moved(
-                step[one.mine], found.innovation[part.rows, part.column], found.innovation_sd[part.rows, part.column]
-            )
-            for part, one in zip(self._parts, linear.parts, strict=True)
-            if (found := results[part.whole])
-        ]
-        return replace(linear, parts=parts, exact=False)
+        k = len(parameters)
+        information, scores = np.zeros((k, k)), np.zeros((len(self._segments), k, _PIECES))
+        for part in in_threads(of, self._parts):
+            d_nu, d_s = part.d_nu * (part.fused / np.sqrt(part.S)), part.d_s / part.S
+            r = part.nu / np.sqrt(part.S)
+            excess = np.where(part.fused, r * r - 1.0, -1.0)
+            begins = np.unique(np.arange(_PIECES) * len(r) // _PIECES)
+            score = np.add.reduceat(0.5 * d_s * excess - d_nu * r, begins, axis=1)
+            scores[part.whole, part.mine, : len(begins)] += score
+            information[np.ix_(part.mine, part.mine)] += d_nu @ d_nu.T + 0.5 * d_s @ d_s.T
+        return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
 
     def _linear(
         self, part: _Part, outcomes: Sequence[CodeArray], config: FusionConfig, parameters: Sequence[Parameter]
     ) -> _Linear:
         outcome = outcomes[part.whole][part.rows, part.column]
         mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
-        beside = list[tuple[FusionConfig, FusionConfig, float]]()
+        beside = list[tuple[FusionConfig, float]]()
         for one in (parameters[number] for number in mine):
-            at, step = one.at(config), _LOG_STEP if one.log else _STEP
-            beside.append((one.move(config, at - step), one.move(config, at + step), 2.0 * step))
+            step = _LOG_STEP if one.log else _STEP
+            beside.append((one.move(config, one.at(config) + step), step))
         found, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
         nu, S = found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
         return _Linear(part.whole, mine, outcome != int(Outcome.REJECTED), nu, S, d_nu[:, :, 0], d_s[:, :, 0])

@@ -26,10 +26,10 @@ T = TypeVar("T")
 
 _replace = msgspec.structs.replace
 LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured one
-_RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
-_RECOVERY_PRIOR = (0.5 * math.log(_RECOVERY[0] * _RECOVERY[1]), math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96))
+RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
+RECOVERY_PRIOR = (0.5 * math.log(RECOVERY[0] * RECOVERY[1]), math.log(RECOVERY[1] / RECOVERY[0]) / (2.0 * 1.96))
 _SD_PRIOR = (0.0, math.log(1.5))  # about the configured number
-_QUICKEST = 2.0  # update periods, of a disturbance
+QUICKEST = 2.0  # update periods, of a disturbance
 _INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
 _TICK = 0.028  # s; a large change of a time, on any arm
 _DIGITS = 6  # of a number that is written
@@ -216,7 +216,7 @@ _TABLE = (
     _line("plant", "axes.{axis}.natural_frequency_rad_s", "arm.axes.{axis}.plant.natural_frequency", 0.5, 5e3),
     _line("plant", "axes.{axis}.damping", "arm.axes.{axis}.plant.damping", 0.05, 20.0),
     _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.5, 0.5, **_INTERCEPT),
-    _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *_RECOVERY, prior=_RECOVERY_PRIOR),
+    _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *RECOVERY, prior=RECOVERY_PRIOR),
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
     _line("scale", "sensors.{sensor}.scale", "sensors.{sensor}.scale", -0.5, 0.5, log=False, scale=0.1),
     _line("bias", "sensors.{sensor}.bias_drift_sd_mm", "sensors.{sensor}.bias_drift_sd", *SD_BOUNDS),
@@ -339,7 +339,7 @@ def with_drifts(config: FusionConfig, fixed: Sequence[str] = ()) -> FusionConfig
 
 def quickest(config: FusionConfig) -> float:
     """The shortest time of a disturbance [s] that is believed."""
-    return _QUICKEST * config.arm.update_period
+    return QUICKEST * config.arm.update_period
 
 
 def smallest_sd(config: FusionConfig, name: str) -> float:

@@ -7,7 +7,7 @@ is worth its numbers is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeAlias
 
 import msgspec
@@ -15,8 +15,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
-from ..model.plants import SecondOrder
-from .arm_search import ArmSearch, Freedom
+from .arm_search import SMOOTHER, WANDERS, ArmSearch, Freedom, chosen_arms
 from .arms import Arm, Rest
 from .identifiability import covariance
 from .likelihood import Likelihood, in_threads
@@ -32,18 +31,15 @@ from .parameters import (
     with_rest,
     with_shared_delay,
 )
-from .posterior import GAINS, GainKind, Mixture, Model, chosen_model, own_worth, shared_delay, sharing
+from .posterior import GAINS, GainKind, Mixture, Model, own_worth
 
 _ROUGHLY = 0.1  # tolerance in log-likelihood where maxima are only compared
 _STEP = 0.010  # s, between latencies that are tried: their maxima are as wide
-_WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
-_SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
 _WELL_KNOWN = 1.0 / 8.0  # of a logarithm: without it some ½ · 8² would be lost in log-likelihood
 _NARROWER, _WIDER = 0.6, 3.0  # times the gates
-_LEAST = 0.02  # of an axis's lag, that its plant has
 _NARROWEST = 3.0  # gate: below it rejecting good measurements pays
 _QUIET = 0.03  # share of what the rest is, that other noise begins with
-_KINDS = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")  # of a disturbance
+_KINDS = {"matern": "smooth (Matérn)", "ou": "rough (Ornstein-Uhlenbeck)"}  # of disturbances
 _WALKING = ("input_noise", "drift", "maneuver_noise", "maneuver_drift")  # noise without a disturbance
 _NAMES = {  # of an arm's coordinates, by the fields that they are in a configuration
     "delay": "delay",
@@ -94,14 +90,13 @@ def search(
         if one.fit == "latency":
             config = _nearest_latency(likelihood, config, one, free)
     found = list[Point]()
-    for model in _noise_models(likelihood, config, arms, free):
+    starts = _noise_models(likelihood, config, arms, free)
+    for start in starts if near is None else [*starts, config]:
         if found:  # an arm that is likeliest under one noise is near that under another
-            model = _with_arm_of(model, found[0].config, free)
-        found.append(_maximum(likelihood, model, free, notify))
-    best = _without_needless(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
-    if near is not None:  # what was found there may be the highest maximum here, too
-        peaks = [_maximum(likelihood, config, free, notify), point(likelihood, best, free(best))]
-        best = _best_by_axis(likelihood, peaks, [_penalised(likelihood, one, free(one.config)) for one in peaks])
+            start = _with_arm_of(start, found[0].config, free)
+        found.append(_maximum(likelihood, start, free, notify))
+    best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
+    best = _without_needless(likelihood, best, free, notify)
     best = _under_gates(likelihood, best, config, free, notify)
     return best, {axis: "; ".join(why) for axis, why in reasons.items() if why}, searched
 
@@ -111,14 +106,14 @@ def search(
 
 def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom | None:
     """What of an axis's arm the free parameters leave open; None: nothing."""
-    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if _is_second(config, axis) else 1.0, 0.1))
+    given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
+    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if given.damping else 1.0, 0.1))
     here, there = ({one.path[-1] for one in free(at) if one.axis == axis} for at in (config, other))
     if any(one.fit == "delay" for one in free(config) if one.axis in (None, axis)):
         here.add("delay")
     plants = {"natural_frequency", "damping"}, {"time_constant"}
     whole = any(plant <= here for plant in plants) and any(plant <= there for plant in plants)
     gains: Sequence[GainKind] = ("given",)
-    given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
     if "intercept" in here and "gain_recovery" in there:
         here, gains, given = here | {"gain_recovery"}, GAINS, given._replace(gain=1.0, recovery=0.0, slope=0.0)
     elif "intercept" in here:
@@ -127,10 +122,6 @@ def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom | None:
     names = {_NAMES[field] for field in here if field in _NAMES}
     order = 2 if given.damping else 1
     return Freedom(given, names, (1, 2) if whole else (order,), gains) if names else None
-
-
-def _is_second(config: FusionConfig, axis: str) -> bool:
-    return isinstance(config.arm.axes[axis].plant, SecondOrder)
 
 
 def _arm_search(
@@ -168,18 +159,15 @@ def _with_arms(
 ) -> FusionConfig:
     """The configuration with the likeliest arm of each axis; one delay for those that share it."""
     delayed = {axis: one.posterior for axis, one in searched.items() if "delay" in freedoms[axis].free}
-    shares = list(delayed) if one_delay else sharing(delayed)
-    delay = shared_delay([delayed[axis] for axis in shares]) if shares else None
+    found, delay = chosen_arms(searched, delayed, one_delay)
+    shares = [axis for axis, one in found.items() if one.shares]
     worth = {} if one_delay else own_worth(delayed, shares)
-    for axis, search in searched.items():
-        mine = axis in shares
-        mixture = search.posterior.mixture([delayed[one] for one in shares if mine and one != axis])
-        model = chosen_model(mixture)
-        config = with_arm(config, axis, search.arm(model, delay if mine else None))
-        reasons[axis] += _why(freedoms[axis], mixture, model)
+    for axis, one in found.items():
+        config = with_arm(config, axis, one.arm)
+        reasons[axis] += _why(freedoms[axis], one.mixture, one.model)
         if len(delayed) > 1 and axis in delayed:
             gain = f" (own {worth[axis]:+.1f})" if axis in worth else ""
-            reasons[axis].append(f"delay: {'shared' if mine else 'its own'}{gain}")
+            reasons[axis].append(f"delay: {'shared' if one.shares else 'its own'}{gain}")
     return config if delay is None else with_shared_delay(config, shares, delay)
 
 
@@ -214,7 +202,7 @@ def _noise_models(
     Noise that is not free stays as it is.
     """
     models = list[FusionConfig]()
-    for number in range(len(_KINDS)):
+    for number in range(3):
         model = config
         for axis, search in arms.items():
             model = with_rest(model, axis, search.rests[number], search.sensors)
@@ -256,31 +244,35 @@ def _with_quiet(config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeO
     return config
 
 
-def _maximum(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> Point:
-    """The maximum next to a configuration, each component being rejected for itself: first of what all axes share.
+def _maximum(
+    likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify, times: float | None = None
+) -> Point:
+    """The maximum next to a configuration, each component being rejected for itself, by way of gates as wide as that.
 
-    Gates make the likelihood jump: outliers that narrow gates reject are explained by noise where gates are wide. So it
-    is looked for from both sides, where any are rejected.
+    Gates make the likelihood jump: outliers that narrow gates reject are explained by noise where gates are wide. By
+    default gates are narrower first.
     """
-
-    def below(at: FusionConfig, times: float, axes: Collection[str]) -> Point:
-        for gates in (times, 1.0) if gated else (1.0,):
-            at = with_gates(at, config, gates)
-            if shared := [one for one in free(at) if one.axis is None]:
-                at = maximise(likelihood, at, shared, notify, tolerance=_ROUGHLY).config
-            found = maximise_by_axis(likelihood, at, [one for one in free(at) if one.axis in axes], notify, _ROUGHLY)
-            at = found.config
-        if any(one.axis is None and one.sensor is not None for one in free(at)):  # which trades with noise
-            at = maximise(likelihood, at, free(at), notify, tolerance=_ROUGHLY).config
-        return point(likelihood, at, [one for one in free(at) if one.axis is not None])
-
+    times = _narrower(config) if times is None else times
     gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())
-    found = below(config, _narrower(config), likelihood.sensors.keys())
-    if rejecting := likelihood.rejecting(found.results):
-        peaks = [found, below(config, _WIDER, rejecting)]
-        best = _best_by_axis(likelihood, peaks, [peak.axes for peak in peaks])
-        found = point(likelihood, best, [one for one in free(best) if one.axis is not None])
-    return found
+    at = config
+    for wider in (times, 1.0) if gated else (1.0,):
+        at = with_gates(at, config, wider)
+        if shared := [one for one in free(at) if one.axis is None]:
+            at = maximise(likelihood, at, shared, notify, tolerance=_ROUGHLY).config
+        own = [one for one in free(at) if one.axis is not None]
+        at = maximise_by_axis(likelihood, at, own, notify, _ROUGHLY).config
+    if any(one.axis is None and one.sensor is not None for one in free(at)):  # which trades with noise
+        at = maximise(likelihood, at, free(at), notify, tolerance=_ROUGHLY).config
+    return point(likelihood, at, [one for one in free(at) if one.axis is not None])
+
+
+def _from_wider_gates(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
+    """The higher maximum of each axis, this one or that reached by way of wider gates, where any are rejected."""
+    found = point(likelihood, config, [one for one in free(config) if one.axis is not None])
+    if not likelihood.rejecting(found.results):
+        return config
+    peaks = [found, _maximum(likelihood, config, free, notify, _WIDER)]
+    return _best_by_axis(likelihood, peaks, [peak.axes for peak in peaks])
 
 
 def _narrower(config: FusionConfig) -> float:
@@ -294,7 +286,7 @@ def _under_gates(
 ) -> Point:
     """The highest of the maxima under the gates as given.
 
-    Where whole rows are rejected it is looked for from narrower and wider gates, and an update period of delay away.
+    Where whole rows are rejected it is looked for from narrower and wider gates.
     """
     found = maximise_with_gates(likelihood, with_gates(best, given), free(best), notify)
     whole = any(sensor.gates_rows(given.arm) for sensor in given.sensors.values())
@@ -304,25 +296,10 @@ def _under_gates(
         maximise(likelihood, with_gates(found.config, given, times), free(best), tolerance=_ROUGHLY).config
         for times in (_narrower(given), _WIDER)
     ]
-    plants, delays = (
-        {str(one.axis) for one in free(best) if one.axis and one.fit == fit} for fit in ("plant", "delay")
-    )
-    both = sorted(plants & delays)
-    starts += [_ticks_away(found.config, both, ticks) for ticks in (-1.0, 1.0) if both]
     for start in starts:
         other = maximise_with_gates(likelihood, with_gates(start, given), free(best), notify)
         found = max(found, other, key=lambda one: one.log_posterior)
     return found
-
-
-def _ticks_away(config: FusionConfig, axes: Sequence[str], ticks: float) -> FusionConfig:
-    """The configuration with delays of axes so many update periods longer, and as much less lag."""
-    for axis in axes:
-        arm = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
-        delay = max(arm.delay + ticks * config.arm.update_period, 0.0)
-        lag = max(arm.lag + arm.delay - delay, _LEAST * arm.total)
-        config = with_arm(config, axis, arm._replace(delay=delay, lag=lag))
-    return config
 
 
 def _likeliest(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf, reasons: Reasons) -> FusionConfig:
@@ -332,18 +309,27 @@ def _likeliest(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf, rea
         for peak, score in zip(peaks, scores, strict=True):
             process = peak.config.process[axis]
             if process.disturbance_sd == 0.0:
-                score[number] -= _WANDERS
+                score[number] -= WANDERS
             elif process.disturbance_kind == "matern":
-                score[number] -= _SMOOTHER
-        mine = [float(score[number]) for score in scores]
-        if len(peaks) > 1 and axis in likelihood.sensors:
-            chosen, gain = int(np.argmax(mine)), max(mine[1:]) - mine[0]
+                score[number] -= SMOOTHER
+        kinds = [_kind(peak.config, axis) for peak in peaks]
+        if len(set(kinds)) > 1 and axis in likelihood.sensors:
+            mine = dict[str, float]()
+            for kind, score in zip(kinds, scores, strict=True):
+                mine[kind] = max(float(score[number]), mine.get(kind, -np.inf))
+            gain = max(mine[kind] for kind in mine if kind != "none") - mine.get("none", -np.inf)
             why = f"(one {gain:+.1f})"
             if np.isinf(gain):
-                soon = 1e3 * quickest(peaks[chosen].config)
+                soon = 1e3 * quickest(peaks[0].config)
                 why = f"(one would be forgotten within {soon:.0f} ms, too soon for an arm)"
-            reasons[axis].append(f"disturbance: {_KINDS[chosen]} {why}")
+            reasons[axis].append(f"disturbance: {max(mine, key=lambda kind: mine[kind])} {why}")
     return _best_by_axis(likelihood, peaks, scores)
+
+
+def _kind(config: FusionConfig, axis: str) -> str:
+    """What disturbance an axis has, in words."""
+    process = config.process[axis]
+    return "none" if process.disturbance_sd == 0.0 else _KINDS[process.disturbance_kind]
 
 
 def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
