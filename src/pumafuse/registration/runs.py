@@ -16,7 +16,7 @@ from ..discovery.guesses import guess
 from ..discovery.roles import relations
 from ..discovery.survey import Survey
 from ..errors import ConfigError, PumafuseWarning, RunError, UnknownNameError
-from ..fusion.config import SD_BOUNDS, FusionConfig, Placement, Sensor, Tool
+from ..fusion.config import SD_BOUNDS, FusionConfig, Placement, Sensor, Start, Tool
 from ..fusion.placing import in_base, with_tool
 from ..logs.axes import reference_orientation
 from ..logs.clock import without_strays
@@ -36,6 +36,7 @@ from .register import Place, Quantity, Registered, Registration, Response, regis
 FIXED = ("marker",)  # what can be left as it is
 _DIGITS = 6  # of m and rad in a configuration: a micrometre
 _SHORTEST = 1e-3  # s, of a plant
+_NO_EVIDENCE = 3.0  # times what the arm may be off: commands and sensors share it, and do not bear each other out
 
 
 class RegisteredSensor(msgspec.Struct, frozen=True, kw_only=True):
@@ -265,17 +266,41 @@ def _rounded(vector: Vector) -> Vector:
 
 
 def _placed(config: FusionConfig, found: Mapping[str, Registration], latencies: Mapping[str, Quantity]) -> FusionConfig:
-    """The configuration with frame, marker and latency of sensors."""
+    """The configuration with frame, marker, latency and bias of sensors."""
+    constants, count = _constants(config.arm, found), sum(one.frame is not None for one in found.values())
     sensors = {
         name: msgspec.structs.replace(
             config.sensors[name],
             frame=_placement(one.frame),
             marker=_placement(one.marker),
             latency=round(latencies[name].value, _DIGITS),
+            bias_sd=_biases(config.sensors[name], constants, count) if one.frame is not None else 0.0,
         )
         for name, one in found.items()
     }
     return msgspec.structs.replace(config, sensors={**config.sensors, **sensors})
+
+
+def _constants(arm: ArmModel, found: Mapping[str, Registration]) -> dict[str, float]:
+    """How far off the arm itself may be by a constant [m or rad], of each axis.
+
+    A registration follows the commanded poses, and so has a constant error of the arm's kinematics in it, which no
+    motion shows. It is taken to be as large as what changes with the pose, which is what registrations leave.
+    """
+    placed = [one for one in found.values() if one.frame is not None]
+    left: dict[Kind, float] = {
+        "length": max((one.rms or 0.0 for one in placed), default=0.0),
+        "angle": max((one.rms_rotation or 0.0 for one in placed), default=0.0),
+    }
+    return {axis: left[arm.axes[axis].kind] for axis in (*CARTESIAN, *TURNING) if axis in arm.axes}
+
+
+def _biases(sensor: Sensor, constants: Mapping[str, float], count: int) -> dict[str, float]:
+    """How far off one of several sensors may be in the base [m or rad], where no bias is configured.
+
+    They share what the arm is off, while the filter takes their biases to be independent: so each has √n times as much.
+    """
+    return {axis: sensor.bias_sd_of(axis) or float(f"{one * count**0.5:.2g}") for axis, one in constants.items()}
 
 
 def _arm(runs: Sequence[Run], found: Mapping[str, Registration]) -> FusionConfig:
@@ -308,15 +333,26 @@ def _configuration(
     guessed = first_guess([guess(Survey(Path(run.name), run, relations(run))) for run in placed])
     sensors = {
         name: msgspec.structs.replace(
-            guessed.sensors[name], latency=one.latency, frame=one.frame, marker=one.marker, scale=1.0, bias_sd=0.0
+            guessed.sensors[name],
+            latency=one.latency,
+            frame=one.frame,
+            marker=one.marker,
+            scale=1.0,
+            bias_sd=one.bias_sd,
         )
         for name, one in config.sensors.items()
         if name in guessed.sensors
     }
     sensors = {**guessed.sensors, **sensors}
+    constants = _constants(guessed.arm, found)
+    offsets = {
+        axis: max(guessed.start.offset_sd_of(axis), _NO_EVIDENCE * constants.get(axis, 0.0))
+        for axis in guessed.arm.axes
+    }
     known = {axis: one for axis, one in begun.arm.axes.items() if axis in guessed.arm.axes}
     arm = msgspec.structs.replace(guessed.arm, delay=begun.arm.delay, axes={**guessed.arm.axes, **known})
-    return msgspec.structs.replace(guessed, arm=arm, tool=config.tool, sensors=sensors)
+    start = Start(offset_sd=offsets)
+    return msgspec.structs.replace(guessed, arm=arm, tool=config.tool, sensors=sensors, start=start)
 
 
 def _axis(kind: Kind, response: Response) -> AxisModel:
