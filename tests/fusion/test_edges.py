@@ -159,7 +159,7 @@ def test_a_reference_s_own_noise_scales_like_a_measurement_s():
     est = quiet(run, pf.FusionConfig(arm=ARM))
     np.testing.assert_allclose(est.reference.sd["tangential"], 1e-3 * 0.5 / x)
     np.testing.assert_allclose(est.reference.sd["radial"], 1e-3)
-    table = results.reference_table(est.reference, ARM)
+    table = results.reference_table(est.reference, est.config)
     np.testing.assert_allclose(table["tangential.position_sd_mm"], 0.5 / x)
     np.testing.assert_allclose(table["radial.position_sd_mm"], 1.0)
 

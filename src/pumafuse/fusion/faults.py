@@ -46,6 +46,7 @@ _STRAIGHTER = 0.7  # of the misfit along its axes: turned back a sensor must lea
 _ALIGNED = 0.8  # cosine of the angle from which on axes still follow their commands
 _EXCHANGED = 0.99  # cosine within which each axis is another one, or against one: columns or signs, no frame
 _HARDLY = 1e-3  # of the motion along its main direction, below which other directions tell nothing of a turn
+_MOVE = 1e9  # ns, of the moves that are compared: less is noise, over more noise wanders
 _PARTS = 8  # of a run, each of which is left out once: as the angle scatters then, so uncertain it is
 
 _Cause: TypeAlias = Literal["unit", "columns", "sign", "clock", "frame", "nothing"]
@@ -463,9 +464,9 @@ def _turned_frames(segment: Segment, config: FusionConfig, given: _Given, tracki
         angle, along, back = turned
         lengths = f"{_digits(back * MM, 2)} mm instead of {_digits(along * MM, 2)} mm"
         sentence = (
-            f"sensor '{name}' looks turned by {angle * DEG:.1f}° against {', '.join(axes)}: turned back, it is"
-            f" within {lengths} of where the commands lead; `pumafuse register` finds how it stands, which is its frame"
-            " in fusion.toml"
+            f"sensor '{name}' looks turned by {angle * DEG:.1f}° against {', '.join(axes)}: turned back, its moves of a"
+            f" second are within {lengths} of those commanded; `pumafuse register` finds how it stands, which is its"
+            " frame in fusion.toml"
         )
         found.append(Fault((name,), tuple(axes), "frame", angle, sentence, False, math.cos(angle) < _ALIGNED))
     return found
@@ -478,10 +479,10 @@ def _turned_frame(
     given: Mapping[str, tuple[TimeArray, FloatArray]],
     axes: Sequence[str],
 ) -> tuple[float, float, float] | None:
-    """By how much a sensor is turned [rad], and how far it is from the response as it is and turned back, RMS [m].
+    """By how much a sensor is turned [rad], and how far its moves are from the response's as it is and turned back [m].
 
-    None where it is not turned surely. Where the response is late, or its noise wanders, is no turn: the speed of the
-    response and a constant are fitted beside it.
+    None where it is not turned surely. Moves of a second are compared, as noise that wanders is no turn. Where the
+    response is late is none either: its speed and a constant are fitted beside it.
     """
     sensor = config.sensors[name]
     stamp = reduce(np.intersect1d, (given[axis][0] for axis in axes))
@@ -498,7 +499,11 @@ def _turned_frame(
     for column, axis in enumerate(axes):
         led[order, column] = _led(segment, config, axis, every[order])
     led, before = np.split(led, 2)
-    parts = np.arange(len(valid)) * _PARTS // len(valid)
+    over = round(_MOVE / max(float(np.median(np.diff(valid))), 1.0))
+    if not 1 <= over < len(valid) // _PARTS:
+        return None
+    value, led, before = (one[over:] - one[:-over] for one in (value, led, before))
+    parts = np.arange(len(value)) * _PARTS // len(value)
     turn, along, back = _turn(value, led, led - before)
     angle = angle_of(turn)
     exchanged = math.cos(angle) < _ALIGNED and bool((np.abs(turn).max(axis=0) > _EXCHANGED).all())
