@@ -485,7 +485,7 @@ def _turned_frame(
     response is late is none either: its speed and a constant are fitted beside it.
     """
     sensor = config.sensors[name]
-    stamp = reduce(np.intersect1d, (given[axis][0] for axis in axes))
+    stamp = reduce(_common, (given[axis][0] for axis in axes))
     stamp = stamp[:: 1 + len(stamp) // _ENOUGH]
     if len(stamp) < _FEW:
         return None
@@ -517,6 +517,12 @@ def _turned_frame(
     )
     scatter = math.sqrt((_PARTS - 1) / _PARTS * float(others @ others))
     return None if angle < _SURELY * scatter else (angle, along, back)
+
+
+def _common(first: TimeArray, other: TimeArray) -> TimeArray:
+    """The stamps that are in both, once each; both are ascending, and not empty (``intersect1d`` imports numpy.ma)."""
+    beside = other[np.searchsorted(other, first).clip(max=len(other) - 1)]
+    return first[(beside == first) & (np.diff(first, prepend=first[:1] - 1) > 0)]
 
 
 def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatArray, float, float]:
