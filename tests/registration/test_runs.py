@@ -90,6 +90,28 @@ def test_a_marker_that_is_fixed_stays(tmp_path: Path, registered: Path) -> None:
     assert before["mocap"] == after["mocap"]
 
 
+def test_latencies_that_are_known_leave_the_delay_of_the_arm(tmp_path: Path, registered: Path) -> None:
+    """With ``--fix latency`` sensors stay as late as configured, and the arm is as much earlier as they are later."""
+    before = pf.FusionConfig.load(registered / "fusion.toml")
+    text = (registered / "fusion.toml").read_text()
+    for name, latency in (("mocap", 12.0), ("tracker", 5.0)):
+        now = before.sensors[name].latency * 1e3
+        text = text.replace(f"latency_ms = {now:g}\n", f"latency_ms = {latency}\n") if now else text
+    text = text.replace("latency_ms = 0.0\n", "latency_ms = 5.0\n")
+    (tmp_path / "fusion.toml").write_text(text)
+    (tmp_path / "arm.toml").write_text((registered / "arm.toml").read_text())
+    done = pumafuse(
+        "register", RUNS / "inspect1", "-c", tmp_path / "fusion.toml", "--fix", "latency", "-o", tmp_path / "out"
+    )
+    assert done.returncode == 0, done.stderr
+    after = pf.FusionConfig.load(tmp_path / "out" / "fusion.toml")
+    assert [after.sensors[name].latency for name in ("mocap", "tracker")] == [0.012, 0.005]
+    told = json.loads((tmp_path / "out" / "registration.json").read_text())["sensors"]
+    lags = [told["mocap"]["lag_ms"] - 12.0, told["tracker"]["lag_ms"] - 5.0]
+    assert np.mean([after.arm.lag_of(axis) for axis in "xyz"]) * 1e3 == pytest.approx(np.mean(lags), abs=0.01)
+    assert after.arm.delay < before.arm.delay
+
+
 BAD = {
     "an unknown sensor": (("--sensor", "camera"), "unknown sensor 'camera'"),
     "nothing to fix": (("--fix", "frame"), "--fix"),

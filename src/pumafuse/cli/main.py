@@ -135,7 +135,7 @@ def register(
         Option("--config", "-c", metavar="FUSION.TOML", help="Arm and sensors; default: found in the runs."),
     ] = None,
     sensor: Annotated[str | None, Option(metavar="NAME", help="Which one; default: each that gives x, y, z.")] = None,
-    fix: Annotated[str | None, Option(metavar="marker", help="What stays as configured.")] = None,
+    fix: Annotated[str | None, Option(metavar="marker,latency", help="What stays as configured.")] = None,
     output: Annotated[
         Path | None, Option("--output", "-o", metavar="DIR", help="Where fusion.toml and arm.toml go.")
     ] = None,

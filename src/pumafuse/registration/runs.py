@@ -33,7 +33,7 @@ from .findings import Vector
 from .motion import Motion
 from .register import Place, Quantity, Registered, Registration, Response, registered
 
-FIXED = ("marker",)  # what can be left as it is
+FIXED = ("marker", "latency")  # what can be left as it is
 _DIGITS = 6  # of m and rad in a configuration: a micrometre
 _SHORTEST = 1e-3  # s, of a plant
 _NO_EVIDENCE = 3.0  # times what the arm may be off: commands and sensors share it, and do not bear each other out
@@ -120,7 +120,7 @@ def register(
         config: Arm and sensors, whose markers are where the search begins; the arm's lag is believed. None: the arm is
             found, too, and the earliest sensor is taken to have no latency.
         sensor: The one to register; None: each that gives x, y and z.
-        fix: ``marker``: it stays as configured.
+        fix: ``marker``: it stays as configured. ``latency``: likewise, and the arm's delay is what they leave.
         along_base: Sensors that measure along the base's axes, and are only compared.
 
     Returns:
@@ -133,19 +133,24 @@ def register(
         PumafuseError: No sensor can be registered; says why.
     """
     every = [without_strays(run) for run in ([runs] if isinstance(runs, Run) else runs)]
-    if unknown := next((one for one in fix if one not in FIXED), None):
-        raise UnknownNameError("--fix", "what is", unknown, FIXED)
+    fixed = list(fix)
+    if unknown := next((one for one in fixed if one not in FIXED), None):
+        raise UnknownNameError("--fix", "number", unknown, FIXED)
+    if fixed and config is None:
+        raise ConfigError(f"--fix {fixed[0]}: as configured where? Give a configuration (-c)")
     names = _sensors(every, config, sensor)
-    lag = None if config is None else float(np.mean([config.arm.lag_of(axis) for axis in CARTESIAN]))
-    fixed = bool(list(fix))
-    found = {name: _registered(every, name, config, fixed=fixed) for name in names}
+    found = {name: _registered(every, name, config, fixed="marker" in fixed) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
     placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
     said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
     if not placed:
         raise RunError("; ".join(note for notes in said.values() for note in notes))
     begun = _arm(every, placed) if config is None else with_tool(config, every[0])
-    latencies = _latencies(every, placed, begun, lag)
+    if "latency" in fixed:
+        begun = _as_late(begun, placed)
+        latencies = {name: _exactly(begun.sensors[name].latency) for name in placed}
+    else:
+        latencies = _latencies(every, placed, begun, None if config is None else _lag(config.arm))
     details = {name: _details(one, latencies.get(name), said[name]) for name, one in found.items()}
     config = _configuration(every, placed, latencies, begun) if config is None else _placed(begun, placed, latencies)
     for notes in said.values():
@@ -206,8 +211,8 @@ def _latencies(
     """
     lags = {name: one.position.lag for name, one in found.items() if one.position is not None}
     surest = min(lags, key=lambda name: lags[name].ci95[1] - lags[name].ci95[0])
-    beside = {surest: Quantity(0.0, (0.0, 0.0))}
-    seen = _placed(config, found, {name: Quantity(0.0, (0.0, 0.0)) for name in found})
+    beside = {surest: _exactly(0.0)}
+    seen = _placed(config, found, {name: _exactly(0.0) for name in found})
     in_space = [in_base(run, seen)[0] for run in runs]
     for name in lags.keys() - {surest}:
         both = [run for run in in_space if {name, surest} <= run.sensors.keys()]
@@ -221,6 +226,34 @@ def _latencies(
         name: Quantity(one.value + lags[surest].value - lag, (one.ci95[0] + low, one.ci95[1] + high))
         for name, one in beside.items()
     }
+
+
+def _lag(arm: ArmModel) -> float:
+    """The lag of positions in space [s]."""
+    return float(np.mean([arm.lag_of(axis) for axis in CARTESIAN]))
+
+
+def _as_late(config: FusionConfig, found: Mapping[str, Registration]) -> FusionConfig:
+    """The configuration whose arm is as late as sensors of known latencies saw it: by its delays."""
+    lags = [one.position.lag.value - config.sensors[name].latency for name, one in found.items() if one.position]
+    later = float(np.mean(lags)) - _lag(config.arm)
+
+    def moved(delay: float) -> float:
+        return round(max(delay + later, 0.0), _DIGITS)
+
+    arm = msgspec.structs.replace(
+        config.arm,
+        delay=moved(config.arm.delay),
+        axes={
+            name: axis if axis.delay is None else msgspec.structs.replace(axis, delay=moved(axis.delay))
+            for name, axis in config.arm.axes.items()
+        },
+    )
+    return msgspec.structs.replace(config, arm=arm)
+
+
+def _exactly(value: float) -> Quantity:
+    return Quantity(value, (value, value))
 
 
 def _shifted(one: Quantity, by: float) -> Quantity:
