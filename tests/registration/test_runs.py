@@ -74,8 +74,7 @@ def test_another_run_of_the_set_up_is_fused_by_it(registered: Path, sensor: str)
         scatter = float(np.std((estimate.position - known)[settled]))
         inside = np.abs(estimate.position - known)[settled] < 1.96 * estimate.position_sd[settled]
         assert inside.mean() > 0.9, axis  # what no motion shows of the arm's kinematics is in the error bars
-        if sensor == "mocap" or not axis.startswith("r"):  # the tracker sees no turn
-            assert scatter < (np.radians(0.3) if axis.startswith("r") else 0.6e-3), axis
+        assert scatter < (np.radians(0.3) if axis.startswith("r") else 0.6e-3), axis
 
 
 def test_a_marker_that_is_fixed_stays(tmp_path: Path, registered: Path) -> None:

@@ -338,14 +338,11 @@ def _biases(sensor: Sensor, constants: Mapping[str, float], count: int) -> dict[
 
 def _arm(runs: Sequence[Run], found: Mapping[str, Registration]) -> FusionConfig:
     """The arm as the earliest sensor saw it answer."""
-    first = min(found.values(), key=lambda one: one.position.lag.value if one.position else np.inf)
-    response, turning = first.position, first.rotation or first.position
-    assert response is not None
-    assert turning is not None
-    tool = reference_orientation(runs[0])
-    axes = {axis: _axis("length", response) for axis in CARTESIAN}
+    positions = [one.position for one in found.values() if one.position is not None]
+    response, tool = min(positions, key=lambda one: one.lag.value), reference_orientation(runs[0])
+    axes = {axis: AxisModel(plant=_plant(response)) for axis in CARTESIAN}
     if tool is not None:
-        axes |= {axis: _axis("angle", turning) for axis in TURNING}
+        axes |= {axis: _turning(found.values(), response) for axis in TURNING}
     period = float(np.median(np.diff(runs[0].command.stamp))) / 1e9
     arm = ArmModel(
         name="registered",
@@ -388,5 +385,14 @@ def _configuration(
     return msgspec.structs.replace(guessed, arm=arm, tool=config.tool, sensors=sensors, start=start)
 
 
-def _axis(kind: Kind, response: Response) -> AxisModel:
-    return AxisModel(kind=kind, plant=FirstOrder(time_constant=max(response.time_constant.value, _SHORTEST)))
+def _turning(found: Iterable[Registration], earliest: Response) -> AxisModel:
+    """How the tool turns: as a sensor saw that tells orientations, less what it is later; else as it moves."""
+    for one in found:
+        if one.rotation is not None and one.position is not None:
+            delay = one.rotation.delay.value - (one.position.lag.value - earliest.lag.value)
+            return AxisModel(kind="angle", plant=_plant(one.rotation), delay=max(round(delay, _DIGITS), 0.0))
+    return AxisModel(kind="angle", plant=_plant(earliest))
+
+
+def _plant(response: Response) -> FirstOrder:
+    return FirstOrder(time_constant=max(response.time_constant.value, _SHORTEST))
