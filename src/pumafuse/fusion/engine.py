@@ -114,7 +114,7 @@ def linearised(
     segment: Segment,
     config: FusionConfig,
     outcome: CodeArray,
-    beside: Sequence[tuple[FusionConfig, float]],
+    beside: Sequence[tuple[FusionConfig, FusionConfig, float]],
 ) -> tuple[Results, FloatArray, FloatArray]:
     """The same, with derivatives by k parameters; by ``measurement_rows``.
 
@@ -122,7 +122,7 @@ def linearised(
         segment: The events.
         config: Arm, noise and sensors.
         outcome: What became of each measurement, (m, A), to be repeated.
-        beside: For each parameter the configuration where it is a little larger, and by how much.
+        beside: For each parameter the configuration a little below and above, and how far these are apart.
 
     Returns:
         Innovations; derivatives of ν and of S, (k, m, A) each.
@@ -131,8 +131,8 @@ def linearised(
     results = _undecided(events)
     results.outcome[place] = outcome
     model = _certain_model(segment, config)
-    slopes = [_slope(model, _certain_model(segment, larger), width) for larger, width in beside]
-    d_nu, d_s = linearise(model, slopes, segment.origin, events, results)
+    ends = [(_certain_model(segment, low), _certain_model(segment, high), width) for low, high, width in beside]
+    d_nu, d_s = linearise(model, [_slope(*each) for each in ends], segment.origin, events, results)
     return results.rows(place), d_nu[:, place], d_s[:, place]
 
 

@@ -36,8 +36,8 @@ from ..logs.run import Run
 from .arms import Measured, Recording
 from .parameters import Parameter, changed
 
-_LOG_STEP = 1e-6  # of a logarithm: of a filter's number the truncation error is half of it, the rounding error 1e-10
-_STEP = 2e-5  # s, or of a gain or a scale, in which a filter's numbers are linear
+_LOG_STEP = 1e-4  # of a logarithm: the truncation error is a sixth of its square, the rounding error 1e-11
+_STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
 _PIECES = 20  # of a run, that a model which is right has independent scores in
 _SHIFT = 1e-4  # s, by which a lag is varied
 _SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
@@ -423,10 +423,10 @@ class Likelihood:
     ) -> _Linear:
         outcome = outcomes[part.whole][part.rows, part.column]
         mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
-        beside = list[tuple[FusionConfig, float]]()
+        beside = list[tuple[FusionConfig, FusionConfig, float]]()
         for one in (parameters[number] for number in mine):
-            step = _LOG_STEP if one.log else _STEP
-            beside.append((one.move(config, one.at(config) + step), step))
+            at, step = one.at(config), _LOG_STEP if one.log else _STEP
+            beside.append((one.move(config, at - step), one.move(config, at + step), 2.0 * step))
         found, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
         nu, S = found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
         return _Linear(part.whole, mine, outcome != int(Outcome.REJECTED), nu, S, d_nu[:, :, 0], d_s[:, :, 0])
