@@ -68,14 +68,15 @@ def show(found: RegistrationSummary) -> None:
 
 def _show(name: str, one: RegisteredSensor) -> None:
     """Print what was found of one sensor."""
-    if one.frame is None or one.marker is None or one.lag is None or one.latency is None:
+    if one.frame is None or one.marker is None or one.lag is None:
         typer.echo(f"{name}: not registered")
         return
     turned = "" if one.angular_rms is None else f" and {one.angular_rms * DEG:.3g}°"
     typer.echo(f"{name}: {one.rows} measurements; left over {(one.rms or 0.0) * MM:.3g} mm{turned} RMS")
     rows = [*_places("frame", one.frame), *_places("marker", one.marker)]
     rows.append(["lag, ms", f"{one.lag * MS:.2f}", _limits(one.lag_ci95, MS, ".2f")])
-    rows.append(["latency_ms", f"{one.latency * MS:.2f}", _limits(one.latency_ci95, MS, ".2f")])
+    if one.latency is not None:
+        rows.append(["latency_ms", f"{one.latency * MS:.2f}", _limits(one.latency_ci95, MS, ".2f")])
     print_tables([table(["number", "found", "95 % interval"], rows)])
 
 
@@ -96,4 +97,6 @@ def _places(what: str, found: Registered) -> list[list[str]]:
 def _limits(interval: Interval | None, scale: float, form: str) -> str:
     if interval is None or abs(interval[0]) == float("inf"):
         return "the motion does not tell"
+    if interval[0] == interval[1]:
+        return "fixed"
     return " to ".join(format(end * scale, form) for end in interval)

@@ -19,19 +19,22 @@ from .start import despiked
 _SPEED = 0.05  # s, over which a velocity is taken
 _ROUNDS = 10  # of the weights
 _FEWEST = 60  # rows
+_UNKNOWN = 0.05  # s, of half an interval
 
 
-def later(first: Sequence[Motion], other: Sequence[Motion]) -> Quantity | None:
+def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) -> Quantity | None:
     """By how much the stamps of one sensor's rows are later than those of another's [s], with its 95 % interval.
 
     Args:
         first: What one sensor tells of the tool in the base's frame, one entry a run.
         other: What the other one tells of it, likewise.
+        about: By how much, roughly [s].
 
     Returns:
-        None where they have too little in common, or nothing moves.
+        None where they have too little in common, or nothing moves, or it is not known to 50 ms.
     """
-    pairs = [_compared(a.valid(), b.valid()) for a, b in zip(first, other, strict=True)]
+    shifted = [one._replace(time=one.time - about) for one in other]
+    pairs = [_compared(a.valid(), b.valid()) for a, b in zip(first, shifted, strict=True)]
     pairs = [pair for pair in pairs if len(pair[0]) >= _FEWEST]
     if not pairs:
         return None
@@ -48,7 +51,7 @@ def later(first: Sequence[Motion], other: Sequence[Motion]) -> Quantity | None:
         energy = float(np.sum(weight[:, None] * speed**2))
     influence = -np.sum(weight[:, None] * speed * (apart + late * speed), axis=1) / energy
     half = float(half_widths(influence[:, None], [len(pair[0]) for pair in pairs])[0])
-    return Quantity(late, (late - half, late + half))
+    return None if half > _UNKNOWN else Quantity(about + late, (about + late - half, about + late + half))
 
 
 def _compared(first: Motion, other: Motion) -> tuple[FloatArray, FloatArray]:

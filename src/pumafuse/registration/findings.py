@@ -17,6 +17,7 @@ class Finding(enum.Enum):
 
     SHORT = "short"  # too few rows, or too little time
     UNRELATED = "unrelated"  # the sensor does not move as the tool does
+    UNEXPLAINED = "unexplained"  # it moves with the tool, and no frame explains how
     MIRRORED = "mirrored"  # the sensor's axes are left-handed
     LINE = "line"  # the motion does not tell how the sensor is turned about an axis of the base
     PLANE = "plane"  # the motion does not tell whether the sensor's axes are right-handed
@@ -42,8 +43,8 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         finding: What it is.
-        size: SHORT: how long [s]; UNRELATED: correlation of speeds; SCALE: the base's lengths over the sensor's;
-            ATTITUDE: the angle between the frames [rad].
+        size: SHORT: how long [s]; UNRELATED: correlation of speeds; UNEXPLAINED: share of the motion; SCALE: the base's
+            lengths over the sensor's; ATTITUDE: the angle between the frames [rad].
         axis: LINE: in the base; ONE_AXIS: on the tool.
         source: READING: whose, command or sensor.
         reading: READING: how it follows.
@@ -60,7 +61,7 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def prevents(self) -> bool:
         """Whether nothing is registered then."""
-        return self.finding in (Finding.SHORT, Finding.UNRELATED, Finding.MIRRORED)
+        return self.finding in (Finding.SHORT, Finding.UNRELATED, Finding.UNEXPLAINED, Finding.MIRRORED)
 
     def sentence(self, sensor: str) -> str:
         """What to know of a sensor, and what to do."""
@@ -72,6 +73,13 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
                 )
             case Finding.UNRELATED:
                 what = f"does not move with the tool (correlation of speeds {size:+.2f}): is it of this run and clock?"
+            case Finding.UNEXPLAINED:
+                why = (
+                    "the commands tell no orientation (run.toml), by which alone one knows where its marker is"
+                    if self.source == "command"
+                    else "are units, the order and the unit of orientations right, of the commands, too (run.toml)?"
+                )
+                what = f"moves with the tool, and no frame explains how: {100.0 * size:.0f} % are left; {why}"
             case Finding.MIRRORED:
                 what = (
                     "has left-handed axes beside the commands': is a sign wrong, or are two axes exchanged (run.toml)?"

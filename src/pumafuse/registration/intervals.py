@@ -16,6 +16,7 @@ from scipy.special import stdtrit
 from ..arrays import FloatArray
 
 _WINDOW = 5.0  # autocorrelation times: beyond them exp(-5) is left
+_FITTED = 17.0  # numbers at most: they take as many degrees of freedom, here half of them at most
 _LEVEL = 0.975  # both sides 95 %
 
 

@@ -23,9 +23,11 @@ _SETTLED = 6.0  # rough lags after the first command: how the arm moved before i
 _AT_LEAST, _FEWEST = 5.0, 60  # s and rows of a sensor beside commands
 _ROWS, _COARSE = 8000, 1000  # that are looked at, evenly, in the end and to begin with
 _DEAD = 0.6  # of the lag, to begin with
-_FOLLOWS = 0.3  # correlation of speeds
+_FOLLOWS, _MOVES = 0.3, 0.8  # correlation of speeds: it may follow; it surely moves with the tool
 _LEFT = 0.5  # of what a sensor saw, which no frame explains: it does not move with the tool
-_WELL = 0.1  # likewise: a frame explains it
+_WELL = 0.03  # likewise: a frame explains it
+_ANOTHER = 3.0  # times as far as commanded: another unit
+_UNEXPLAINED = 0.05  # likewise, beyond its noise: arms leave 1 % of a motion, a tool that turns untold 10
 _AS_IT_IS = np.eye(3)
 _AROUND = Rotation.create_group("T").as_matrix()  # all around, 60 degrees apart at most from the next
 _TURNS = np.radians(0.5)  # of the tool, root mean square: arms err by as much in orientation
@@ -39,6 +41,7 @@ _CLEARER = 0.5  # times as much is left by the right reading
 _SURELY = 0.1  # likewise, of orientations that follow as they are
 _LEVER = 0.15  # m: arms err by 0.5 mm and 0.2 degrees
 _TILT = 0.05  # of a number per step in a direction that nothing tells: less is told
+_OF_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
 _UNIT = 0.05  # tolerance of a factor between units
 _OTHER = 0.02  # from which a scale is named: arms' own kinematics are wrong by a tenth of that
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "m": 1.0}  # in m
@@ -187,6 +190,9 @@ class _Begin(NamedTuple):
 
 def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Place, fix_marker: bool) -> _Begin:
     """Unit, handedness and reading of orientations, from positions alone at first."""
+    ahead = about.scale if np.isfinite(about.scale) and abs(np.log(about.scale)) > np.log(_ANOTHER) else 1.0
+    sensor = [one._replace(position=ahead * one.position) for one in sensor]
+    about = about._replace(scale=about.scale / ahead)
     few, found = _thinned(sensor, _COARSE), list[Found]()
     mean = np.concatenate([despiked(one.position) for one in few]).mean(axis=0)
     seen = np.concatenate([despiked(one.position) for one in few]) - mean
@@ -199,13 +205,17 @@ def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Pl
     state = proper.state
     none = _Begin(command, sensor, mean, False, other < _EITHER * left, state, found)
     if min(left, other) > _LEFT * spread:
-        found.append(Found(finding=Finding.UNRELATED, size=about.correlation))
+        moves = about.correlation > _MOVES
+        what = Finding.UNEXPLAINED if moves else Finding.UNRELATED
+        found += _unit_named(about.scale * ahead) if moves else []
+        found.append(Found(finding=what, size=min(left, other) / spread if moves else about.correlation))
     elif other < _MIRROR * left:
         found.append(Found(finding=Finding.MIRRORED))
     if any(one.prevents for one in found):
         return none
-    factor, unit_found = _unit_of(proper, [len(one.time) for one in few])
+    factor, unit_found = _unit_of(proper, [len(one.time) for one in few], ahead)
     found += unit_found
+    factor /= ahead
     sensor = [one._replace(position=factor * one.position) for one in sensor]
     state = state._replace(scale=1.0)
     whole = none._replace(sensor=sensor, mean=factor * mean, state=state)
@@ -219,17 +229,22 @@ def _told_as(command: list[Motion], begin: Callable[..., Fit], spread: float) ->
 
     Where the path alone does not tell how the sensor is turned, its marker may: then it begins from turns all around.
     """
+
+    def left(fit: Fit) -> float:
+        return fit.left() / fit.state.scale
+
     fit = begin(command)
-    if fit.left() < _WELL * spread * fit.state.scale:
+    if left(fit) < _WELL * spread:
         return command, fit, []
+    fit = min((fit, *(begin(command, first=turn) for turn in _AROUND)), key=left)
     if command[0].quaternion is not None:
-        for reading in (Reading.INVERSE, Reading.W_FIRST, Reading.W_LAST):
-            other, _ = _read_as(command, [], "command", reading)
-            then = begin(other)
-            if then.left() < _WELL * spread * then.state.scale:
-                return other, then, [Found(finding=Finding.READING, source="command", reading=reading)]
-    fits = [fit, *(begin(command, first=turn) for turn in _AROUND)]
-    return command, min(fits, key=lambda one: one.left() / one.state.scale), []
+        readings = (Reading.INVERSE, Reading.W_FIRST, Reading.W_LAST)
+        others = {one: _read_as(command, [], "command", one)[0] for one in readings}
+        fits = {one: begin(other) for one, other in others.items()}
+        best = min(fits, key=lambda one: left(fits[one]))
+        if left(fits[best]) < _CLEARER * left(fit):
+            return others[best], fits[best], [Found(finding=Finding.READING, source="command", reading=best)]
+    return command, fit, []
 
 
 def _coarse(
@@ -302,17 +317,22 @@ def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, 
     return np.hstack(columns)
 
 
-def _unit_of(fit: Fit, lengths: Sequence[int]) -> tuple[float, list[Found]]:
-    """By what to multiply a sensor's lengths, and that they need it."""
-    scale = fit.state.scale
+def _unit_of(fit: Fit, lengths: Sequence[int], ahead: float) -> tuple[float, list[Found]]:
+    """By what to multiply a sensor's lengths, and that they need it; they are multiplied ``ahead`` already."""
+    scale = fit.state.scale * ahead
     wide = float(half_widths(fit.influence[:, SCALE], lengths)[0])
     if abs(np.log(scale)) < max(_OTHER, wide):
         return 1.0, []
+    found = _unit_named(scale) or [Found(finding=Finding.SCALE, size=scale)]
+    return found[0].size or scale, found
+
+
+def _unit_named(scale: float) -> list[Found]:
+    """That lengths are of another unit, where a scale is that of two units."""
     for (name, one), (read_as, other) in product(_UNITS.items(), _UNITS.items()):
-        if name != read_as and abs(np.log(scale * other / one)) < _UNIT:
-            unit = f"in {name}, read as {read_as}"
-            return one / other, [Found(finding=Finding.SCALE, size=one / other, unit=unit)]
-    return scale, [Found(finding=Finding.SCALE, size=scale)]
+        if name != read_as and scale > 0.0 and abs(np.log(scale * other / one)) < _UNIT:
+            return [Found(finding=Finding.SCALE, size=one / other, unit=f"in {name}, read as {read_as}")]
+    return []
 
 
 def _with_attitude(begin: _Begin, about: Rough, marker: Place, fix_marker: bool) -> _Begin:
@@ -418,7 +438,19 @@ def _fitted(begin: _Begin, fix_marker: bool) -> Registration:
     turn = begin.attitude and not fix_marker
     fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
     lengths = [len(one.time) for one in sensor]
+    spread = float(np.std(rows.centred))
+    if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > (_UNEXPLAINED * spread) ** 2:
+        said = [one for one in found if one.finding is Finding.SCALE and one.unit]
+        told_less = begin.command[0].quaternion is None and begin.sensor[0].quaternion is not None
+        share = Found(finding=Finding.UNEXPLAINED, size=fit.left() / spread, source="command" if told_less else None)
+        return Registration(findings=(*said, share))
     return _told(fit, begin, lengths, loose, blind, own)
+
+
+def _jitter(sensor: Sequence[Motion]) -> float:
+    """The noise of positions from one row to the next [m], by the median of second differences, all axes together."""
+    change = np.concatenate([np.diff(one.position, 2, axis=0) for one in sensor])
+    return float(np.sqrt(np.mean(np.median(np.abs(change), axis=0) ** 2 / (6.0 * _OF_NORMAL**2))))
 
 
 def _about(path: FloatArray, rotation: FloatArray, attitude: bool) -> tuple[FloatArray, FloatArray]:

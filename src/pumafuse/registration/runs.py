@@ -29,7 +29,7 @@ from ..toml import Interval
 from ..tuning.latency import first_guess
 from ..units import Kind, seconds
 from .beside import later
-from .findings import Vector
+from .findings import Finding, Vector
 from .motion import Motion
 from .register import Place, Quantity, Registered, Registration, Response, registered
 
@@ -148,7 +148,7 @@ def register(
     begun = _arm(every, placed) if config is None else with_tool(config, every[0])
     if "latency" in fixed:
         begun = _as_late(begun, placed)
-        latencies = {name: _exactly(begun.sensors[name].latency) for name in placed}
+        latencies = {name: _exactly(begun.sensors[name].latency) for name in placed if not _as_read(placed[name])}
     else:
         latencies = _latencies(every, placed, begun, None if config is None else _lag(config.arm))
     details = {name: _details(one, latencies.get(name), said[name]) for name, one in found.items()}
@@ -184,7 +184,8 @@ def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | Non
         if any(name in run.sensors and set(CARTESIAN) <= run.sensors[name].values.keys() for run in runs)
     ]
     if not names:
-        raise RunError(f"no sensor gives x, y and z, by which it could be registered; there are: {', '.join(every)}")
+        others = f"are: {', '.join(every)}" if every else "is none"
+        raise RunError(f"no sensor gives x, y and z, by which it could be registered; there {others}")
     return names
 
 
@@ -199,6 +200,7 @@ def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, 
 
 def _motion(source: Source) -> Motion:
     position = np.column_stack([source.values[axis] for axis in CARTESIAN])
+    position = np.where((position == 0.0).all(axis=1, keepdims=True), np.nan, position)  # a sensor that is lost
     return Motion(seconds(source.stamp), position, source.orientation)
 
 
@@ -209,14 +211,17 @@ def _latencies(
 
     Where the arm's lag is not known, the earliest sensor has none.
     """
-    lags = {name: one.position.lag for name, one in found.items() if one.position is not None}
+    lags = {name: one.position.lag for name, one in found.items() if one.position is not None and not _as_read(one)}
+    if not lags:
+        return {}
     surest = min(lags, key=lambda name: lags[name].ci95[1] - lags[name].ci95[0])
     beside = {surest: _exactly(0.0)}
-    seen = _placed(config, found, {name: _exactly(0.0) for name in found})
+    seen = _placed(config, found, {})
     in_space = [in_base(run, seen)[0] for run in runs]
     for name in lags.keys() - {surest}:
         both = [run for run in in_space if {name, surest} <= run.sensors.keys()]
-        told = later([_motion(run.sensors[surest]) for run in both], [_motion(run.sensors[name]) for run in both])
+        one, other = ([_of_tool(run.sensors[which]) for run in both] for which in (surest, name))
+        told = later(one, other, lags[name].value - lags[surest].value)
         beside[name] = told or _shifted(lags[name], -lags[surest].value)
     if lag is None:
         earliest = min(one.value for one in beside.values())
@@ -226,6 +231,20 @@ def _latencies(
         name: Quantity(one.value + lags[surest].value - lag, (one.ci95[0] + low, one.ci95[1] + high))
         for name, one in beside.items()
     }
+
+
+def _as_read(one: Registration) -> bool:
+    """Whether a sensor's rows had to be read otherwise than run.toml says, which is to be mended first."""
+    return any(found.finding in (Finding.SCALE, Finding.READING, Finding.ATTITUDE) for found in one.findings)
+
+
+def _of_tool(source: Source) -> Motion:
+    """What a placed sensor tells of the tool; a row of which the orientation is missing tells nothing."""
+    motion = _motion(source)
+    untold = [np.isnan(source.values[axis]) for axis in TURNING if axis in source.values]
+    if untold:
+        motion = motion._replace(position=np.where(np.any(untold, axis=0)[:, None], np.nan, motion.position))
+    return motion
 
 
 def _lag(arm: ArmModel) -> float:
@@ -306,7 +325,7 @@ def _placed(config: FusionConfig, found: Mapping[str, Registration], latencies: 
             config.sensors[name],
             frame=_placement(one.frame),
             marker=_placement(one.marker),
-            latency=round(latencies[name].value, _DIGITS),
+            latency=round(latencies[name].value, _DIGITS) if name in latencies else config.sensors[name].latency,
             bias_sd=_biases(config.sensors[name], constants, count) if one.frame is not None else 0.0,
         )
         for name, one in found.items()
