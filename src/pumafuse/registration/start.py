@@ -21,6 +21,7 @@ _FEWEST = 100  # ticks that are compared
 _QUIET = 0.99  # quantile at which speeds are cut off: a jump must not decide
 _FAST = 0.8  # quantile of speeds
 _STANDS = 1e-9  # m
+_MOVED = 1e-3  # m, within a window
 _OUTLIER = 5  # rows of a running median
 _APART = (0.09, 0.21, 0.37)  # of all rows: between orientations that are compared
 _HALF_TURN = 2.6  # rad, beyond which the axis of a rotation may point either way
@@ -55,8 +56,8 @@ def rough(command: Sequence[Motion], sensor: Sequence[Motion]) -> Rough:
                     left, right = _beside(pairs, lag)
                     alike = _correlation(left, right)
                     if alike > best.correlation:
-                        scale = _ratio(left, right) if by == of == 0 else np.nan
-                        best = Rough(lag * _TICK, scale, alike)
+                        lengths = [(a[0], b[0], at) for a, b, at in zip(told, seen, starts, strict=True)]
+                        best = Rough(lag * _TICK, _ratio(*_beside(lengths, lag)), alike)
     return best
 
 
@@ -96,8 +97,10 @@ def _beside(pairs: Sequence[tuple[FloatArray, FloatArray, int]], lag: int) -> tu
 
 
 def _ratio(told: FloatArray, seen: FloatArray) -> float:
-    """Of two speeds where the tool is fast."""
+    """Of two speeds where the tool is fast; NaN where it keeps its place."""
     fast = told >= np.quantile(told, _FAST)
+    if median(told[fast]) < _MOVED:
+        return np.nan
     return median(told[fast]) / max(median(seen[fast]), _STANDS)
 
 
