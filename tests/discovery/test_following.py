@@ -123,3 +123,13 @@ def test_what_cannot_be_compared_has_no_relation() -> None:
     assert following((stamped(t), still), (stamped(t), u)) is None
     assert following((stamped(t)[:0], u[:0]), (stamped(t), u)) is None
     assert following((stamped(t), np.full(len(t), np.nan)), (stamped(t), u)) is None
+
+
+def test_a_command_that_is_constant_but_for_rounding_leads_nothing() -> None:
+    """The mean of 0.05 is not 0.05 to the last digit; what is left of it is no motion."""
+    time = np.arange(0, 20_000_000_000, 20_000_000)
+    rng = np.random.default_rng(3)
+    for level in (0.05, 0.08, -1e-3, 0.0):
+        constant, noise = np.full(len(time), level), level + rng.normal(0.0, 1e-4, len(time))
+        assert following((time, constant), (time, noise)) is None
+        assert following((time, noise), (time, constant)) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
+from setups import Setup
 
 RUNS = Path(__file__).parents[2] / "examples" / "pose-virtual"
 TRUE = {  # of the simulation that the runs are from: how each sensor is turned [deg], what it sees [mm]
@@ -134,3 +136,58 @@ def test_commands_without_a_position_register_nothing() -> None:
     run = pf.Run.from_arrays(time, {"pan": np.sin(time)}, {"camera": (time, {"pan": np.sin(time)})})
     with pytest.raises(pf.RunError, match=r"beside commands in x, y and z; there are only pan"):
         pf.register(run)
+
+
+def recorded(change: Callable[[np.ndarray], np.ndarray], *, told: bool = True) -> pf.Run:
+    """A simulated set-up whose sensor's positions are changed; ``told``: whether the commands have an orientation."""
+    command, sensor = Setup(4).run()
+    turns = {"orientation": command.quaternion} if told else {}
+    told_axes = dict(zip("xyz", command.position.T, strict=True)) | turns
+    seen = dict(zip("xyz", change(sensor.position).T, strict=True)) | {"orientation": sensor.quaternion}
+    return pf.Run.from_arrays(command.time, told_axes, {"camera": (sensor.time, seen)})
+
+
+def as_it_is(position: np.ndarray) -> np.ndarray:
+    return position
+
+
+def lost(position: np.ndarray) -> np.ndarray:
+    """Zeros in every tenth row, as a sensor writes them that lost its target."""
+    found = position.copy()
+    found[::10] = 0.0
+    return found
+
+
+def held(position: np.ndarray) -> np.ndarray:
+    """Each value three times, as of a sensor that is slower than its rows."""
+    return position[np.arange(len(position)) // 3 * 3]
+
+
+@pytest.mark.parametrize("change", [lost, held])
+def test_rows_that_are_no_news_change_no_frame(change: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Zeros of a lost sensor are missing, and a value that is repeated counts once: within 1 mm and 0.1°."""
+    whole, found = (pf.register(recorded(one)).config.sensors["camera"].frame for one in (as_it_is, change))
+    assert whole is not None
+    assert found is not None
+    np.testing.assert_allclose(found.at, whole.at, atol=1e-3)
+    np.testing.assert_allclose(found.rotation, whole.rotation, atol=np.radians(0.1))
+
+
+def test_what_no_frame_explains_is_refused() -> None:
+    """Commands without an orientation, of a tool that turns with a marker far from its point: said, not guessed."""
+    with pytest.raises(pf.RunError, match=r"no frame explains how: .* the commands tell no orientation"):
+        pf.register(recorded(as_it_is, told=False))
+
+
+def test_a_motion_along_one_axis_is_registered_as_far_as_it_tells() -> None:
+    """Commands that never change on two axes are no fault, and numbers that the motion does not tell say so."""
+    time, rng = np.arange(0.0, 20.0, 0.02), np.random.default_rng(5)
+    seen = np.arange(0.2, 20.0, 0.01)
+    told = {"x": 0.1 * np.sin(time), "y": np.full(len(time), 0.05), "z": np.full(len(time), 0.08)}
+    values = [0.1 * np.sin(seen - 0.1), np.full(len(seen), 0.05), np.full(len(seen), 0.08)]
+    noisy = {axis: value + rng.normal(0.0, 1e-4, len(seen)) for axis, value in zip("xyz", values, strict=True)}
+    run = pf.Run.from_arrays(time, told, {"camera": (seen, noisy)})
+    with pytest.warns(pf.PumafuseWarning, match="motion along|does not turn|do not tell"):
+        found = pf.register(run).details.sensors["camera"]
+    assert "line" in found.findings
+    assert found.lag == pytest.approx(0.09, abs=1e-3)  # 0.1 s behind the path, half a period less behind held commands

@@ -12,6 +12,7 @@ from rich.console import Console
 from .. import folders
 from ..fusion.config import FusionConfig
 from ..logs.run import Run
+from ..registration.findings import AS_READ
 from ..registration.register import Registered
 from ..registration.runs import RegisteredSensor, RegistrationSummary, register
 from ..toml import Interval
@@ -20,6 +21,7 @@ from .tables import print_tables, table
 
 SUMMARY = "registration.json"
 _OURS = frozenset({SUMMARY, "fusion.toml", "arm.toml"})
+_MENDED = {one.value for one in AS_READ}  # findings after which run.toml is to be mended
 _NOT_ALL = 3  # exit code: some sensor was not registered
 
 
@@ -55,7 +57,9 @@ def run(
         show(found.details)
         if output is not None:
             folder = shlex.quote(str(output))
-            typer.echo(f"written to {output}\nnext: pumafuse fuse RUN -c {folder}/fusion.toml -o DIR")
+            first = any(_MENDED.intersection(one.findings) for one in found.details.sensors.values())
+            after = "mend run.toml as said above, and register anew" if first else None
+            typer.echo(f"written to {output}\nnext: {after or f'pumafuse fuse RUN -c {folder}/fusion.toml -o DIR'}")
     if any(one.frame is None for one in found.details.sensors.values()):
         raise typer.Exit(_NOT_ALL)
 
@@ -98,5 +102,5 @@ def _limits(interval: Interval | None, scale: float, form: str) -> str:
     if interval is None or abs(interval[0]) == float("inf"):
         return "the motion does not tell"
     if interval[0] == interval[1]:
-        return "fixed"
+        return "taken, not found"
     return " to ".join(format(end * scale, form) for end in interval)

@@ -20,6 +20,7 @@ _FEWEST = 20
 _WHOLE = 0.01  # from a whole number, of steps
 _OUTLYING = 8.0  # sds
 _APART = 5.0  # times as far off as its neighbours are: at the start or the turn of a motion it is three times
+_ROUNDING = 1e-12  # of a value
 _MOST_OUTLYING = 0.05  # of the changes: each outlier is in two, and of few measurements some are more than a clip takes
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
@@ -61,7 +62,7 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     (t, u), (s, z) = known(*leader, origin), known(*follower, origin)
     inside = (s > t[0] if len(t) else s > np.inf) & (s < t[-1] if len(t) else False)
     s, z = s[inside], z[inside]
-    if len(t) < _FEWEST or len(s) < _FEWEST:
+    if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
         return None
     candidates = [one for span in _SPANS if (one := _at_span(t, u, s, z, span)) is not None]
 
@@ -82,6 +83,11 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
         misfit=_robust_sd(rest(best)),
         outliers=float(isolated(z).mean()),
     )
+
+
+def _stands(value: FloatArray) -> bool:
+    """Whether a signal moves by no more than what rounding makes of its mean."""
+    return float(np.ptp(value)) <= _ROUNDING * float(np.abs(value).max())
 
 
 def _without_few(rest: FloatArray, motion: FloatArray) -> BoolArray:

@@ -29,6 +29,9 @@ class Finding(enum.Enum):
     ATTITUDE_UNRELATED = "attitude-unrelated"  # orientations follow in no way
 
 
+AS_READ = (Finding.SCALE, Finding.READING, Finding.ATTITUDE)  # rows were read otherwise than run.toml says
+
+
 class Reading(enum.Enum):
     """How the four numbers of an orientation are to be read."""
 

@@ -26,6 +26,7 @@ _DEAD = 0.6  # of the lag, to begin with
 _FOLLOWS, _MOVES = 0.3, 0.8  # correlation of speeds: it may follow; it surely moves with the tool
 _LEFT = 0.5  # of what a sensor saw, which no frame explains: it does not move with the tool
 _WELL = 0.03  # likewise: a frame explains it
+_ODD = 0.025  # likewise, where lengths differ by what is no unit
 _ANOTHER = 3.0  # times as far as commanded: another unit
 _UNEXPLAINED = 0.05  # likewise, beyond its noise: arms leave 1 % of a motion, a tool that turns untold 10
 _AS_IT_IS = np.eye(3)
@@ -206,9 +207,10 @@ def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Pl
     none = _Begin(command, sensor, mean, False, other < _EITHER * left, state, found)
     if min(left, other) > _LEFT * spread:
         moves = about.correlation > _MOVES
-        what = Finding.UNEXPLAINED if moves else Finding.UNRELATED
-        found += _unit_named(about.scale * ahead) if moves else []
-        found.append(Found(finding=what, size=min(left, other) / spread if moves else about.correlation))
+        if moves:
+            found += [*_unit_named(about.scale * ahead), _unexplained(command, sensor, min(left, other) / spread)]
+        else:
+            found.append(Found(finding=Finding.UNRELATED, size=about.correlation))
     elif other < _MIRROR * left:
         found.append(Found(finding=Finding.MIRRORED))
     if any(one.prevents for one in found):
@@ -439,12 +441,18 @@ def _fitted(begin: _Begin, fix_marker: bool) -> Registration:
     fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
     lengths = [len(one.time) for one in sensor]
     spread = float(np.std(rows.centred))
-    if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > (_UNEXPLAINED * spread) ** 2:
+    odd = any(one.finding is Finding.SCALE and not one.unit for one in found)
+    most = (_ODD if odd else _UNEXPLAINED) * spread
+    if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > most**2:
         said = [one for one in found if one.finding is Finding.SCALE and one.unit]
-        told_less = begin.command[0].quaternion is None and begin.sensor[0].quaternion is not None
-        share = Found(finding=Finding.UNEXPLAINED, size=fit.left() / spread, source="command" if told_less else None)
-        return Registration(findings=(*said, share))
+        return Registration(findings=(*said, _unexplained(begin.command, begin.sensor, fit.left() / spread)))
     return _told(fit, begin, lengths, loose, blind, own)
+
+
+def _unexplained(command: Sequence[Motion], sensor: Sequence[Motion], share: float) -> Found:
+    """That no frame explains a share of the motion, and whether it may be as the commands tell no orientation."""
+    told_less = command[0].quaternion is None and sensor[0].quaternion is not None
+    return Found(finding=Finding.UNEXPLAINED, size=share, source="command" if told_less else None)
 
 
 def _jitter(sensor: Sequence[Motion]) -> float:

@@ -29,7 +29,7 @@ from ..toml import Interval
 from ..tuning.latency import first_guess
 from ..units import Kind, seconds
 from .beside import later
-from .findings import Finding, Vector
+from .findings import AS_READ, Vector
 from .motion import Motion
 from .register import Place, Quantity, Registered, Registration, Response, registered
 
@@ -191,7 +191,7 @@ def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | Non
 
 def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, fixed: bool) -> Registration:
     """The registration of one sensor by the runs that have it."""
-    pairs = [(_motion(run.command), _motion(run.sensors[name])) for run in runs if name in run.sensors]
+    pairs = [(_motion(run.command), _measured(run.sensors[name])) for run in runs if name in run.sensors]
     marker = None if config is None or name not in config.sensors else config.sensors[name].marker
     known = None if marker is None else Place(marker.at, marker.rotation)
     command, sensor = [told for told, _ in pairs], [seen for _, seen in pairs]
@@ -200,7 +200,6 @@ def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, 
 
 def _motion(source: Source) -> Motion:
     position = np.column_stack([source.values[axis] for axis in CARTESIAN])
-    position = np.where((position == 0.0).all(axis=1, keepdims=True), np.nan, position)  # a sensor that is lost
     return Motion(seconds(source.stamp), position, source.orientation)
 
 
@@ -235,12 +234,12 @@ def _latencies(
 
 def _as_read(one: Registration) -> bool:
     """Whether a sensor's rows had to be read otherwise than run.toml says, which is to be mended first."""
-    return any(found.finding in (Finding.SCALE, Finding.READING, Finding.ATTITUDE) for found in one.findings)
+    return any(found.finding in AS_READ for found in one.findings)
 
 
 def _of_tool(source: Source) -> Motion:
     """What a placed sensor tells of the tool; a row of which the orientation is missing tells nothing."""
-    motion = _motion(source)
+    motion = _measured(source)
     untold = [np.isnan(source.values[axis]) for axis in TURNING if axis in source.values]
     if untold:
         motion = motion._replace(position=np.where(np.any(untold, axis=0)[:, None], np.nan, motion.position))
@@ -282,6 +281,14 @@ def _shifted(one: Quantity, by: float) -> Quantity:
 def _without_place(one: Registration) -> Registration:
     """The same of a sensor that stands where the robot does."""
     return msgspec.structs.replace(one, frame=None, marker=None)
+
+
+def _measured(source: Source) -> Motion:
+    """What a sensor tells, without what is no news: values that it repeats, and zeros, as it writes them when lost."""
+    motion = _motion(source)
+    again = (np.diff(motion.position, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+    lost = (motion.position == 0.0).all(axis=1)
+    return motion._replace(position=np.where((again | lost)[:, None], np.nan, motion.position))
 
 
 def _details(one: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:
