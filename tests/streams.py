@@ -143,6 +143,21 @@ def axes_of(draw: st.DrawFn) -> pf.ArmModel:
     return pf.ArmModel(name="any", update_period=0.028, delay=0.06, axes={"radial": one(), "vertical": one()})
 
 
+def fused_in_any_order(
+    run: pf.Run, offline: pf.Estimates, live: pf.LiveEstimator, longest: float
+) -> dict[str, dict[str, int]]:
+    """Hold a stream with events up to ``longest`` late [s], a tenth twice, to the offline result; its outcomes."""
+    events = events_of(run)
+    arrivals = delayed(events, longest, seed=5, twice=0.1) if longest else events
+    assert differences(live, arrivals, offline, longest + 0.25) == []
+    expected = {
+        sensor: {outcome: count for outcome, count in counts.items() if outcome != "duplicate"}
+        for sensor, counts in outcomes_of(offline).items()
+    }
+    assert counted(live, "duplicate") == expected
+    return expected
+
+
 @st.composite
 def any_stream(draw: st.DrawFn) -> tuple[pf.FusionConfig, pf.Run, int]:
     """A configuration, a run of commands and measurements at any times, and a seed for the order in which they come.

@@ -16,7 +16,7 @@ import tomli_w
 from .errors import ConfigError, PumafuseError, suggestion
 from .units import AN, KINDS, Kind, as_length, ending, from_si, in_unit, of_kind, to_si
 
-_MOST_TEXT = 16 << 20  # characters; what is longer, a device perhaps, is no configuration
+MOST_TEXT = 16 << 20  # characters; what is longer, a device perhaps, is no configuration
 _BOUND = re.compile(r"Expected `(?:float|int)` (>=|<=|>|<) (\S+)")
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -44,9 +44,18 @@ def read(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: The file is absent, is not text, is not TOML, or has a number that is not finite.
     """
+    return parsed(text_of(path), str(path))
+
+
+def text_of(path: Path) -> str:
+    """The text of a file that describes something, one character more than it may have at most.
+
+    Raises:
+        ConfigError: The file is absent, or is not text.
+    """
     try:
         with path.open(encoding="utf-8") as file:
-            return parsed(file.read(_MOST_TEXT + 1), str(path))
+            return file.read(MOST_TEXT + 1)
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: not a text file in UTF-8") from None
     except FileNotFoundError:
@@ -70,8 +79,8 @@ def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
     try:
         if not isinstance(source, str):
             return to_si(_plain(source, ""))
-        if len(source) > _MOST_TEXT:
-            raise ConfigError(f"more than {_MOST_TEXT >> 20} MB: no configuration")
+        if len(source) > MOST_TEXT:
+            raise ConfigError(f"more than {MOST_TEXT >> 20} MB: no configuration")
         return to_si(tomllib.loads(source, parse_float=Decimal))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{where}: not valid TOML: {error}") from None

@@ -12,7 +12,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.run import Source
-from streams import counted, delayed, differences, events_of, feed, outcomes_of
+from streams import counted, delayed, differences, events_of, feed, fused_in_any_order, outcomes_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -36,14 +36,7 @@ def test_in_any_order(name: str, longest: float) -> None:
     run, config = recorded(name)
     offline = pf.fuse(run, config)
     live = pf.LiveEstimator(config, start=run.start)
-    events = events_of(run)
-    arrivals = delayed(events, longest, seed=5, twice=0.1) if longest else events
-    assert differences(live, arrivals, offline, longest + 0.25) == []
-    expected = {
-        sensor: {outcome: count for outcome, count in counts.items() if outcome != "duplicate"}
-        for sensor, counts in outcomes_of(offline).items()
-    }
-    assert counted(live, "duplicate") == expected
+    fused_in_any_order(run, offline, live, longest)
 
 
 @pytest.mark.parametrize("name", ["scan1", "panel-vision", "cylindrical-cartesian"])

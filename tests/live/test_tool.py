@@ -20,7 +20,7 @@ from pumafuse.live.sources import replayed
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import BadLine, Event, LineDecoder
 from pumafuse.logs.frames import Rotated
-from streams import counted, delayed, differences, events_of, feed, outcomes_of
+from streams import delayed, differences, events_of, feed, fused_in_any_order
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 LENGTH = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04), gain=pf.Gain(slope=0.001))
@@ -117,14 +117,7 @@ def test_in_a_frame_of_the_arm(longest: float) -> None:
 def test_in_any_order(longest: float) -> None:
     """Each event up to 1.2 s late, a tenth twice: the offline estimates, also of what the commands place."""
     offline, live = pf.fuse(RUN, KNOWN), pf.LiveEstimator(KNOWN)
-    events = events_of(RUN)
-    arrivals = delayed(events, longest, seed=5, twice=0.1) if longest else events
-    assert differences(live, arrivals, offline, longest + 0.25) == []
-    expected = {
-        sensor: {outcome: count for outcome, count in counts.items() if outcome != "duplicate"}
-        for sensor, counts in outcomes_of(offline).items()
-    }
-    assert counted(live, "duplicate") == expected
+    expected = fused_in_any_order(RUN, offline, live, longest)
     for sensor in ("mocap", "tracker", "camera"):
         assert expected[sensor]["fused"] > 400
         assert expected[sensor]["rejected"] < 40

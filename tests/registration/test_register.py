@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pumafuse.fusion.config import Placement
 from pumafuse.registration.findings import Finding, Reading
 from pumafuse.registration.motion import Motion
-from pumafuse.registration.register import Place, Registered, Registration, registered
+from pumafuse.registration.register import Registered, Registration, registered
 from setups import Setup, answer
 
 DATA = Path(__file__).parent / "data"
@@ -246,7 +247,7 @@ def test_a_marker_that_is_known_stays() -> None:
     """Fixed it is as given; beside a tool that does not turn as well, and the frame's place is right then."""
     setup = Setup(2, axes=STILL)
     command, sensor = setup.run()
-    place = Place(tuple(setup.marker.tolist()))
+    place = Placement(at=tuple(setup.marker.tolist()))
     for fix in (True, False):
         found = registered([command], [sensor], marker=place, fix_marker=fix)
         assert found.marker is not None and found.frame is not None

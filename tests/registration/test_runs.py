@@ -59,6 +59,9 @@ def test_what_is_written_as_json_is_what_is_configured(registered: Path) -> None
             assert low < value < high
         low, high = one["lag_ms_ci95"]
         assert low < one["lag_ms"] < high
+        assert one["latency_ms"] == pytest.approx(config.sensors[name].latency * 1e3, abs=1e-3)
+        assert 0.1 < one["rms_mm"] < 2.0  # the arm's kinematics are 0.5 mm and 0.2° wrong
+    assert 0.05 < told["sensors"]["mocap"]["rms_deg"] < 0.5
 
 
 @pytest.mark.parametrize("sensor", ["mocap", "tracker"])

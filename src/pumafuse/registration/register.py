@@ -12,11 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray
+from ..fusion.config import Placement
+from ..space.rotations import crossed, left_jacobian
 from ..toml import Interval
 from .findings import Finding, Found, Reading, Vector
 from .intervals import half_widths
 from .motion import Answer, Motion, Plant
-from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, crossed, fitted
+from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, fitted
 from .start import Rough, aligned_turns, despiked, kabsch, read, rough, unit
 
 _SETTLED = 6.0  # rough lags after the first command: how the arm moved before is forgotten
@@ -46,13 +48,6 @@ _OF_NORMAL = 0.6745  # median of the absolute value of a standard normal variabl
 _UNIT = 0.05  # tolerance of a factor between units
 _OTHER = 0.02  # from which a scale is named: arms' own kinematics are wrong by a tenth of that
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "m": 1.0}  # in m
-
-
-class Place(NamedTuple):
-    """A place and an orientation in another frame: where [m], and a rotation vector [rad]."""
-
-    at: Vector = (0.0, 0.0, 0.0)
-    rotation: Vector = (0.0, 0.0, 0.0)
 
 
 class Quantity(NamedTuple):
@@ -120,7 +115,7 @@ def registered(
     command: Sequence[Motion],
     sensor: Sequence[Motion],
     *,
-    marker: Place | None = None,
+    marker: Placement | None = None,
     fix_marker: bool = False,
 ) -> Registration:
     """Frame, marker and lag of a sensor.
@@ -141,7 +136,7 @@ def registered(
     if about.correlation < _FOLLOWS:
         return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
     seen = [_within(b, a.time, _SETTLED * max(about.lag, 0.0)) for a, b in both]
-    return _fitted(_begun(told, seen, about, marker or Place(), fix_marker), fix_marker)
+    return _fitted(_begun(told, seen, about, marker or Placement(), fix_marker), fix_marker)
 
 
 def _within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
@@ -189,7 +184,7 @@ class _Begin(NamedTuple):
     findings: list[Found]
 
 
-def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Place, fix_marker: bool) -> _Begin:
+def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Placement, fix_marker: bool) -> _Begin:
     """Unit, handedness and reading of orientations, from positions alone at first."""
     ahead = about.scale if np.isfinite(about.scale) and abs(np.log(about.scale)) > np.log(_ANOTHER) else 1.0
     sensor = [one._replace(position=ahead * one.position) for one in sensor]
@@ -254,7 +249,7 @@ def _coarse(
     sensor: list[Motion],
     mean: FloatArray,
     about: Rough,
-    marker: Place,
+    marker: Placement,
     fix_marker: bool,
     sign: float = 1.0,
     first: FloatArray = _AS_IT_IS,
@@ -337,7 +332,7 @@ def _unit_named(scale: float) -> list[Found]:
     return []
 
 
-def _with_attitude(begin: _Begin, about: Rough, marker: Place, fix_marker: bool) -> _Begin:
+def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: bool) -> _Begin:
     """With the sensor's orientations, where they follow; read otherwise where they follow then."""
     few = _thinned(begin.sensor, _COARSE)
     told = ("sensor", Reading.AS_TOLD)
@@ -529,16 +524,8 @@ def _numbers(state: State, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     slopes[0:3, ROTATION] = crossed(middle[None])[0]
     for first, matrix, where in ((3, state.rotation, ROTATION), (9, state.turn, TURN)):
         values[first : first + 3] = Rotation.from_matrix(matrix).as_rotvec()
-        slopes[first : first + 3, where] = _of_vector(values[first : first + 3])
+        slopes[first : first + 3, where] = np.linalg.inv(left_jacobian(values[None, first : first + 3])[0])
     for first, plant, where in ((12, state.position, POSITION), (15, state.angle, ANGLE)):
         values[first : first + 3] = plant.lag, plant.delay, plant.time_constant
         slopes[first : first + 3, where] = [[1.0, plant.time_constant], [1.0, 0.0], [0.0, plant.time_constant]]
     return values, slopes
-
-
-def _of_vector(vector: FloatArray) -> FloatArray:
-    """How a rotation vector changes with a small rotation from the left, (3, 3): the inverse of its left Jacobian."""
-    angle = float(np.linalg.norm(vector))
-    cross = crossed(vector[None])[0]
-    rest = 1.0 / 12.0 if angle < 1e-3 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
-    return np.eye(3) - 0.5 * cross + rest * cross @ cross

@@ -31,7 +31,7 @@ from ..units import Kind, seconds
 from .beside import later
 from .findings import AS_READ, Vector
 from .motion import Motion
-from .register import Place, Quantity, Registered, Registration, Response, registered
+from .register import Quantity, Registered, Registration, Response, registered
 
 FIXED = ("marker", "latency")  # what can be left as it is
 _DIGITS = 6  # of m and rad in a configuration: a micrometre
@@ -193,9 +193,8 @@ def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, 
     """The registration of one sensor by the runs that have it."""
     pairs = [(_motion(run.command), _measured(run.sensors[name])) for run in runs if name in run.sensors]
     marker = None if config is None or name not in config.sensors else config.sensors[name].marker
-    known = None if marker is None else Place(marker.at, marker.rotation)
     command, sensor = [told for told, _ in pairs], [seen for _, seen in pairs]
-    return registered(command, sensor, marker=known, fix_marker=fixed)
+    return registered(command, sensor, marker=marker, fix_marker=fixed)
 
 
 def _motion(source: Source) -> Motion:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray, median
+from ..space.rotations import crossed
 from .motion import Answer, Plant, Poses
 
 ROTATION, CENTRE, MARKER, TURN, SCALE, POSITION, ANGLE = (
@@ -226,11 +227,6 @@ def _slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
     angle[:, :, TURN] = state.rotation @ rows.turned @ state.turn.T
     angle[:, :, ANGLE] = np.stack(turned, axis=-1)
     return [place, angle]
-
-
-def crossed(vectors: FloatArray) -> FloatArray:
-    """The matrices that take w to v × w, (n, 3, 3)."""
-    return np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2)
 
 
 def _inverse(information: FloatArray) -> FloatArray:

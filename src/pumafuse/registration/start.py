@@ -10,6 +10,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray, median
+from ..space.rotations import nearest
 from .findings import Reading
 from .motion import Motion
 
@@ -114,13 +115,8 @@ def _correlation(one: FloatArray, other: FloatArray) -> float:
 
 
 def kabsch(to: FloatArray, of: FloatArray) -> tuple[FloatArray, float]:
-    """The rotation that takes one set of vectors nearest to another, and the sum of squares that it leaves.
-
-    scipy's warns where the answer is one of several; here that one does.
-    """
-    left, _, right = np.linalg.svd(to.T @ of)
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ flip @ right
+    """The rotation that takes one set of vectors nearest to another, and the sum of squares that it leaves."""
+    rotation = nearest(to.T @ of)
     return rotation, float(np.sum((to - of @ rotation.T) ** 2))
 
 

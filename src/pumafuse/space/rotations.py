@@ -138,6 +138,11 @@ def aligning(first: FloatArray, second: FloatArray) -> tuple[FloatArray, float]:
     return rotation, float(np.sum(rotation * matrix)) / power if power > 0.0 else 0.0
 
 
+def crossed(vectors: FloatArray) -> FloatArray:
+    """The matrices that take w to v × w, (n, 3) → (n, 3, 3)."""
+    return np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2)
+
+
 def left_jacobian(vector: FloatArray) -> FloatArray:
     """J of Exp(θ + δ) ≈ Exp(J δ) Exp(θ), (n, 3) → (n, 3, 3): how small changes of θ turn the tool.
 
@@ -148,9 +153,7 @@ def left_jacobian(vector: FloatArray) -> FloatArray:
     safe = np.where(small, 1.0, angle)
     one = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)[:, None, None]
     two = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)[:, None, None]
-    cross = np.zeros((len(vector), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = vector
-    cross[:, [1, 2, 0], [2, 0, 1]] = -vector
+    cross = crossed(vector)
     return np.eye(3) + one * cross + two * (cross @ cross)
 
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError
+from ..toml import MOST_TEXT, text_of
 from ..units import Kind
 
 MOST = 1e9  # m, rad, or a factor: what is larger is no size of a robot, and would overflow
-_MOST_TEXT = 16 << 20  # characters; a humanoid's URDF has 1 MB
 _KINDS: dict[str, Kind | None] = {"revolute": "angle", "continuous": "angle", "prismatic": "length", "fixed": None}
 
 
@@ -133,17 +133,9 @@ def read(path: Path) -> Urdf:
 
 
 def _root(path: Path) -> Element:
-    try:
-        with path.open(encoding="utf-8") as file:
-            text = file.read(_MOST_TEXT + 1)
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: not a URDF: not a text file in UTF-8") from None
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    if len(text) > _MOST_TEXT:
-        raise ConfigError(f"{path}: more than {_MOST_TEXT >> 20} MB: no URDF")
+    text = text_of(path)
+    if len(text) > MOST_TEXT:
+        raise ConfigError(f"{path}: more than {MOST_TEXT >> 20} MB: no URDF")
     if "<!DOCTYPE" in text:  # there alone entities are declared, which made of one another fill any memory
         raise ConfigError(f"{path}: it has a DOCTYPE, which a URDF does not need: remove it")
     try:

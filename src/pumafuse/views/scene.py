@@ -65,7 +65,7 @@ def views(est: Estimates) -> list[rrb.Spatial3DView]:
     frames = [known.frame for name in est.measurements.sensors if (known := est.config.sensors.get(name))]
     sensors = [np.array([frame.at]) for frame in frames if frame is not None]
     larger = _enlargement(est.pose, _axes_length(path))
-    name = f"tool [mm]; where it is with 95 %, {larger:.0f} times as large"
+    name = "tool [mm]; where it is with 95 %" + (f", {larger:.0f} times as large" if larger > 1.0 else "")
     near, far = (["$origin/**", f"- /path/{other}/**"] for other in ("sensors", "tool/markers"))
     found = [rrb.Spatial3DView(origin="/path", contents=near, name=name, eye_controls=_eye(path))]
     if sensors:
