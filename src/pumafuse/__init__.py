@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
     from .simulation.true_arm import TrueAxis
-    from .space.kinematics import Chain, Joints
+    from .space.kinematics import Joints
     from .tuning.identifiability import TuneError
     from .tuning.intervals import Profile
     from .tuning.latency import AxisLag, Latency, LatencySummary, PartLag, SensorLag, latency
@@ -90,7 +90,7 @@ _NAMES = {
     "simulation.scenario": ["Scenario"],
     "simulation.simulate": ["Simulated", "simulate"],
     "simulation.true_arm": ["TrueAxis"],
-    "space.kinematics": ["Chain", "Joints"],
+    "space.kinematics": ["Joints"],
     "tuning.identifiability": ["TuneError"],
     "tuning.intervals": ["Profile"],
     "tuning.latency": ["AxisLag", "Latency", "LatencySummary", "PartLag", "SensorLag", "latency"],
@@ -104,12 +104,12 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
-    "Bias", "Chain", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
+    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
     "Events", "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification",
-    "Joint", "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "OrientationScore",
-    "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile",
-    "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor", "RegistrationSummary",
-    "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder",
+    "Joint", "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
+    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process",
+    "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
+    "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder",
     "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start",
     "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError",
     "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize",
