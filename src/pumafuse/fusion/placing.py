@@ -46,8 +46,7 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
             no orientation in a row of a piece.
         ConfigError: The tool's orientation is needed and nothing tells it.
     """
-    run = without_strays(run)
-    run = replace(run, command=run.command.delayed(config.arm.later))
+    run = without_strays(run).heeding(config.arm)
     config = with_tool(config, run)
     tool = config.tool.reference if config.tool else None
     of_tool = {

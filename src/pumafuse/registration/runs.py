@@ -137,15 +137,16 @@ def register(
         PumafuseError: No sensor can be registered; says why.
     """
     every = [without_strays(run) for run in ([runs] if isinstance(runs, Run) else runs)]
-    every = every if config is None else [_delayed(run, config.arm.later) for run in every]
     fixed = list(fix)
     if unknown := next((one for one in fixed if one not in FIXED), None):
         raise UnknownNameError("--fix", "number", unknown, FIXED)
     if fixed and config is None:
         raise ConfigError(f"--fix {fixed[0]}: as configured where? Give a configuration (-c)")
     names = _sensors(every, config, sensor)
-    joints = _joints(every, names) if config is None else {}
-    every = [_delayed(run, {name: joint.later for name, joint in joints.items()}) for run in every]
+    joints = _joints(every, names) if config is None else config.arm.joints
+    config = config and _with_joints(config, {})  # they are heeded in the commands from here on
+    later = {name: joint.later for name, joint in joints.items()}
+    every = [replace(run, command=run.command.delayed(later)) for run in every]
     found = {name: _registered(every, name, config, fixed="marker" in fixed) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
     placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
@@ -163,16 +164,13 @@ def register(
     for notes in said.values():
         for note in notes:
             warnings.warn(note, PumafuseWarning, stacklevel=2)
-    if joints:
-        config = msgspec.structs.replace(config, arm=msgspec.structs.replace(config.arm, joints=joints))
-    runs_named = [run.name for run in every]
-    summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=runs_named, sensors=details, joints=joints)
-    return Registrations(config, summary)
+    named = [run.name for run in every]
+    summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=named, sensors=details, joints=joints)
+    return Registrations(_with_joints(config, joints), summary)
 
 
-def _delayed(run: Run, later: Later) -> Run:
-    """The run with joints told later."""
-    return replace(run, command=run.command.delayed(later))
+def _with_joints(config: FusionConfig, joints: dict[str, Joint]) -> FusionConfig:
+    return msgspec.structs.replace(config, arm=msgspec.structs.replace(config.arm, joints=joints))
 
 
 def _joints(runs: Sequence[Run], names: Sequence[str]) -> dict[str, Joint]:
