@@ -21,8 +21,8 @@ ROTATION, CENTRE, MARKER, TURN, SCALE, POSITION, ANGLE = (
     slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 13), slice(13, 15), slice(15, 17)
 )  # fmt: skip  # of a step: delay and log τ in the last two
 SIZE = 17
-_CAUCHY = 3.0  # standard deviations from which a row counts half
-_MEDIAN = 1.5382  # of the length of three standard normal deviates
+CAUCHY = 3.0  # standard deviations from which a row counts half
+MEDIAN = 1.5382  # of the length of three standard normal deviates
 _LEAST = 1e-9  # m or rad: rounding
 _STEPS = 50  # at most
 _HALVED = 6  # times that a step which leads up is halved
@@ -99,7 +99,7 @@ class Off(NamedTuple):
 
     def noise(self) -> FloatArray:
         """The standard deviation of each block, by the median."""
-        return np.array([max(median(_length(one)) / _MEDIAN, _LEAST) for one in self.blocks])
+        return np.array([max(median(_length(one)) / MEDIAN, _LEAST) for one in self.blocks])
 
     def rms(self) -> list[float]:
         """Of each block, over rows that are within ten medians."""
@@ -110,7 +110,7 @@ class Off(NamedTuple):
     def cost(self, noise: FloatArray) -> float:
         """Cauchy's sum."""
         pairs = zip(self.blocks, noise.tolist(), strict=True)
-        return float(sum(np.log1p((_length(one) / (_CAUCHY * sd)) ** 2).sum() for one, sd in pairs))
+        return float(sum(np.log1p((_length(one) / (CAUCHY * sd)) ** 2).sum() for one, sd in pairs))
 
 
 class Fit(NamedTuple):
@@ -144,7 +144,7 @@ def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
         noise = off.noise()
         information, score = _normal(rows, state, off, noise, free, expected=False)
         total = score.sum(axis=0)
-        step = -_inverse(information) @ total
+        step = -inverse(information) @ total
         if -(total @ step) < _ENOUGH * len(score):
             break
         better = _better(rows, state, free @ step, off.cost(noise), noise)
@@ -157,7 +157,7 @@ def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
 def influence(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArray:
     """By how much each row moves each number of a step, (n, 17), at the least squares; their sum leads there."""
     information, score = _normal(rows, state, off, off.noise(), free, expected=True)
-    return -score @ _inverse(information) @ free.T
+    return -score @ inverse(information) @ free.T
 
 
 def residual(rows: Rows, state: State) -> Off:
@@ -199,7 +199,7 @@ def _normal(
     information, score = 0.0, 0.0
     for slope, one, sd in zip(_slopes(rows, state, off.poses), off.blocks, noise.tolist(), strict=True):
         inner = slope @ free
-        far = (_length(one) / (_CAUCHY * sd)) ** 2
+        far = (_length(one) / (CAUCHY * sd)) ** 2
         weight = 1.0 / ((1.0 + far) * sd**2)
         curved = weight * (1.0 - 2.0 / 3.0 * far / (1.0 + far)) if expected else weight
         flat = inner.reshape(-1, inner.shape[-1])
@@ -229,8 +229,8 @@ def _slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
     return [place, angle]
 
 
-def _inverse(information: FloatArray) -> FloatArray:
-    """Of a matrix whose numbers have units of their own; what rows do not tell does not move."""
+def inverse(information: FloatArray) -> FloatArray:
+    """The inverse of a matrix whose numbers have units of their own; what rows do not tell does not move."""
     size = np.sqrt(np.maximum(np.diag(information), 1e-300))
     return np.linalg.pinv(information / np.outer(size, size), rcond=_SINGULAR, hermitian=True) / np.outer(size, size)
 
