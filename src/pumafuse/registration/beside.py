@@ -12,10 +12,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import BoolArray, FloatArray, median
-from .intervals import half_widths
+from .intervals import blocks, inverse
 from .motion import Motion
 from .register import Quantity
-from .solve import CAUCHY, MEDIAN, inverse
+from .solve import MEDIAN, curvature, weights
 from .start import despiked
 
 _SPEED = 0.05  # s, over which a velocity is taken
@@ -43,28 +43,18 @@ def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) 
     if not pairs:
         return None
     late, weight = about, np.ones(sum(len(b.time) for _, b in pairs))
-    influence = np.zeros(len(weight))
+    half = np.inf
     for _ in range(_ROUNDS):
         parts = [path.beside(b, late) for path, b in pairs]
         apart, slope = (np.concatenate(part) for part in zip(*parts, strict=True))
-        step, influence, off = _least_squares(apart, slope, weight)
-        late += step
-        weight = 1.0 / (1.0 + (off / max(CAUCHY / MEDIAN * median(off), _ROUNDING)) ** 2)
-    half = float(half_widths(influence[:, None], [len(b.time) for _, b in pairs])[0])
+        told = blocks(slope, apart, weight, weight)
+        step = inverse(told.information.sum(axis=0)) @ told.score.sum(axis=0)
+        left = apart - slope @ step
+        half = float(blocks(slope, left, curvature(weight), weight).half_widths(np.eye(len(step))[-1:])[0])
+        late += float(step[-1])
+        far = np.linalg.norm(left, axis=1)
+        weight = weights(far, max(median(far) / MEDIAN, _ROUNDING))
     return Quantity(late, (late - half, late + half)) if 0.0 < half < _UNKNOWN else None
-
-
-def _least_squares(apart: FloatArray, slope: FloatArray, weight: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """The last number by least squares, what each row does to it, and how far rows are off [m], (n,)."""
-
-    def information(weight: FloatArray) -> FloatArray:
-        return np.tensordot(weight[:, None, None] * slope, slope, ((0, 1), (0, 1)))
-
-    numbers = inverse(information(weight)) @ np.einsum("n,nik,ni->k", weight, slope, apart)
-    left = apart - slope @ numbers
-    curved = weight * (1.0 + 2.0 * weight) / 3.0  # Cauchy's, the mean over the directions in which a row is off
-    influence = np.einsum("n,nik,ni->nk", weight, slope, left) @ inverse(information(curved))[:, -1]
-    return float(numbers[-1]), influence, np.linalg.norm(left, axis=1)
 
 
 class _Path:

@@ -16,7 +16,6 @@ from ..fusion.config import Placement
 from ..space.rotations import crossed, left_jacobian
 from ..toml import Interval
 from .findings import Finding, Found, Reading, Vector
-from .intervals import half_widths
 from .motion import Answer, Motion, Plant
 from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, fitted
 from .start import Rough, aligned_turns, despiked, kabsch, read, rough, unit
@@ -210,7 +209,7 @@ def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Pl
         found.append(Found(finding=Finding.MIRRORED))
     if any(one.prevents for one in found):
         return none
-    factor, unit_found = _unit_of(proper, [len(one.time) for one in few], ahead)
+    factor, unit_found = _unit_of(proper, ahead)
     found += unit_found
     factor /= ahead
     sensor = [one._replace(position=factor * one.position) for one in sensor]
@@ -314,10 +313,10 @@ def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, 
     return np.hstack(columns)
 
 
-def _unit_of(fit: Fit, lengths: Sequence[int], ahead: float) -> tuple[float, list[Found]]:
+def _unit_of(fit: Fit, ahead: float) -> tuple[float, list[Found]]:
     """By what to multiply a sensor's lengths, and that they need it; they are multiplied ``ahead`` already."""
     scale = fit.state.scale * ahead
-    wide = float(half_widths(fit.influence[:, SCALE], lengths)[0])
+    wide = float(fit.half_widths(np.eye(SIZE)[SCALE])[0])
     if abs(np.log(scale)) < max(_OTHER, wide):
         return 1.0, []
     found = _unit_named(scale) or [Found(finding=Finding.SCALE, size=scale)]
@@ -434,14 +433,13 @@ def _fitted(begin: _Begin, fix_marker: bool) -> Registration:
     own = begin.attitude and len(told.T) > 0
     turn = begin.attitude and not fix_marker
     fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
-    lengths = [len(one.time) for one in sensor]
     spread = float(np.std(rows.centred))
     odd = any(one.finding is Finding.SCALE and not one.unit for one in found)
     most = (_ODD if odd else _UNEXPLAINED) * spread
     if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > most**2:
         said = [one for one in found if one.finding is Finding.SCALE and one.unit]
         return Registration(findings=(*said, _unexplained(begin.command, begin.sensor, fit.left() / spread)))
-    return _told(fit, begin, lengths, loose, blind, own)
+    return _told(fit, begin, loose, blind, own)
 
 
 def _unexplained(command: Sequence[Motion], sensor: Sequence[Motion], share: float) -> Found:
@@ -475,7 +473,6 @@ def _vector(of: FloatArray) -> Vector:
 def _told(
     fit: Fit,
     begin: _Begin,
-    lengths: Sequence[int],
     loose: FloatArray,
     blind: FloatArray,
     own: bool,
@@ -483,7 +480,7 @@ def _told(
     """The numbers with their intervals."""
     state = fit.state
     values, slopes = _numbers(state, begin.mean)
-    half = half_widths(fit.influence @ slopes.T, lengths)
+    half = fit.half_widths(slopes)
     lost = np.zeros((SIZE, loose.shape[1] + blind.shape[1]))
     lost[ROTATION, : loose.shape[1]], lost[MARKER, loose.shape[1] :] = loose, blind
     half[(np.abs(slopes @ lost) > _TILT).any(axis=1)] = np.inf
@@ -499,7 +496,7 @@ def _told(
         rotation=rotation if own else None,
         rms=noise[0],
         rms_rotation=noise[1] if begin.attitude else None,
-        rows=sum(lengths),
+        rows=len(fit.off.blocks[0]),
         findings=tuple(begin.findings),
     )
 
