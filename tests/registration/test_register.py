@@ -264,6 +264,21 @@ def test_positions_that_are_turned_without_the_attitude_are_named() -> None:
         assert np.degrees(found.findings[0].size or 0.0) == pytest.approx(90.0, abs=3.0)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("orientation", [True, False])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1])
+def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: bool) -> None:
+    """Where what is seen goes far and the tool point hardly: no lengths are of another unit, and all is found."""
+    for seed in range(12):
+        setup = Setup(seed, directions=share * np.eye(3), orientation=orientation, shared=True)
+        found = registered(*([one] for one in setup.run()))
+        assert found.frame is not None and found.marker is not None and found.position is not None, seed
+        assert Finding.SCALE not in [one.finding for one in found.findings]
+        assert degrees(found.frame, setup.frame) < 0.05
+        np.testing.assert_allclose(found.marker.at, setup.marker, atol=3e-4)
+        assert found.position.lag.value == pytest.approx(setup.lags[0], abs=1e-3)
+
+
 def test_a_marker_that_is_known_stays() -> None:
     """Fixed it is as given; beside a tool that does not turn as well, and the frame's place is right then."""
     setup = Setup(2, axes=STILL)

@@ -238,7 +238,7 @@ def _told_as(command: list[Motion], begin: Callable[..., Fit], spread: float) ->
         others = {one: _read_as(command, [], "command", one)[0] for one in readings}
         fits = {one: begin(other) for one, other in others.items()}
         best = min(fits, key=lambda one: left(fits[one]))
-        if left(fits[best]) < _CLEARER * left(fit):
+        if left(fits[best]) < min(_CLEARER * left(fit), _LEFT * spread):
             return others[best], fits[best], [Found(finding=Finding.READING, source="command", reading=best)]
     return command, fit, []
 
@@ -271,13 +271,14 @@ def _coarse(
     known = np.array(marker.at)
     path = poses.position + poses.rotation @ known
     seen = np.concatenate([despiked(one.position) for one in sensor]) - mean
-    scale = about.scale if np.isfinite(about.scale) else 1.0
+    moves = bool(np.std(path, axis=0).max() > _BESIDE)  # else a scale is one of the marker
+    scale = about.scale if moves and np.isfinite(about.scale) else 1.0
     rotation = kabsch(unit(path), unit(seen * [1.0, 1.0, sign]))[0]
     turn = Rotation.from_rotvec(marker.rotation).as_matrix()
     markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
-    moves = bool(np.std(path, axis=0).max() > _BESIDE)  # else a scale is one of the marker
-    free = _free(np.eye(3), markers, turn=False, scale=moves, own=False)
-    return fitted(rows, State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant), free)
+    begin = State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant)
+    held, free = (_free(np.eye(3), markers, turn=False, scale=one, own=False) for one in (False, moves))
+    return fitted(rows, fitted(rows, begin, held).state, free)  # a free scale makes all small first
 
 
 def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -430,7 +431,8 @@ def _fitted(begin: _Begin, fix_marker: bool) -> Registration:
         found.append(Found(finding=Finding.LINE, axis=_vector(loose[:, 0])))
     elif begin.either and not (begin.attitude and told.shape[1]):
         found.append(Found(finding=Finding.PLANE))
-    own = begin.attitude and len(told.T) > 0
+    moves = bool(np.std(poses.position, axis=0).max() > _BESIDE)
+    own = begin.attitude and len(told.T) > 0 and moves  # else nothing tells the lag of positions
     turn = begin.attitude and not fix_marker
     fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
     spread = float(np.std(rows.centred))

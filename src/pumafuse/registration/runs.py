@@ -23,6 +23,7 @@ from ..logs.axes import reference_orientation
 from ..logs.clock import without_strays
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run, Source
+from ..logs.screening import lost
 from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..space.rotations import TURNING
@@ -312,8 +313,7 @@ def _measured(source: Source) -> Motion:
     """What a sensor tells, without what is no news: values that it repeats, and zeros, as it writes them when lost."""
     motion = _motion(source)
     again = (np.diff(motion.position, axis=0, prepend=np.nan) == 0.0).all(axis=1)
-    lost = (motion.position == 0.0).all(axis=1)
-    return motion._replace(position=np.where((again | lost)[:, None], np.nan, motion.position))
+    return motion._replace(position=np.where((again | lost(motion.position))[:, None], np.nan, motion.position))
 
 
 def _details(one: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:
