@@ -266,9 +266,9 @@ def test_positions_that_are_turned_without_the_attitude_are_named() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("orientation", [True, False])
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("share", [0.0, 0.01])
 def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: bool) -> None:
-    """Where what is seen goes far and the tool point hardly: no lengths are of another unit, and all is found."""
+    """What is seen goes far and the tool point by 0 or 1 mm: no lengths are of another unit, and all is found."""
     for seed in range(12):
         setup = Setup(seed, directions=share * np.eye(3), orientation=orientation, shared=True)
         found = registered(*([one] for one in setup.run()))
