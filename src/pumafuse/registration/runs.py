@@ -40,6 +40,7 @@ from .register import Quantity, Registered, Registration, Response, registered
 FIXED = ("marker", "latency")  # what can be left as it is
 _DIGITS = 6  # of m and rad in a configuration: a micrometre
 _SHORTEST = 1e-3  # s, of a plant
+_SUREST = 1e-5  # s, of half the interval of a lag: no stamps are finer
 _NO_EVIDENCE = 3.0  # times what the arm may be off: commands and sensors share it, and do not bear each other out
 
 
@@ -261,7 +262,7 @@ def _latencies(
     lags = {name: one.position.lag for name, one in found.items() if one.position is not None and not _as_read(one)}
     if not lags:
         return {}
-    best = min(lags, key=lambda name: (found[name].rms_rotation is None, _width(lags[name])))
+    best = min(lags, key=lambda name: (found[name].rms_rotation is None, lags[name].half))
     beside, placed = {best: _exactly(0.0)}, _placed(config, found, {})
     for name in lags.keys() - {best}:
         both = [run for run in runs if {name, best} <= run.sensors.keys()]
@@ -271,7 +272,7 @@ def _latencies(
     if lag is None:
         first, known = min(beside, key=lambda name: beside[name].value), _exactly(0.0)
     else:
-        first = min(lags, key=lambda name: _width(lags[name]))
+        first = min(lags, key=lambda name: lags[name].half)
         known = _sum(lags[first], -lag)
     return {
         name: known if name == first else _sum(one, known.value - beside[first].value, beside[first], known)
@@ -318,9 +319,14 @@ def _lag(arm: ArmModel) -> float:
 
 
 def _as_late(config: FusionConfig, found: Mapping[str, Registration]) -> FusionConfig:
-    """The configuration whose arm is as late as sensors of known latencies saw it: by its delays."""
-    lags = [one.position.lag.value - config.sensors[name].latency for name, one in found.items() if one.position]
-    later = float(np.mean(lags)) - _lag(config.arm)
+    """The configuration whose arm is as late as sensors of known latencies saw it: by its delays.
+
+    Each counts as its lag is sure.
+    """
+    lags = {name: one.position.lag for name, one in found.items() if one.position}
+    of_arm = [lag.value - config.sensors[name].latency for name, lag in lags.items()]
+    weight = [max(lag.half, _SUREST) ** -2 for lag in lags.values()]
+    later = float(np.average(of_arm, weights=weight)) - _lag(config.arm)
 
     def moved(delay: float) -> float:
         return round(max(delay + later, 0.0), _DIGITS)
@@ -340,13 +346,9 @@ def _exactly(value: float) -> Quantity:
     return Quantity(value, (value, value))
 
 
-def _width(one: Quantity) -> float:
-    return one.ci95[1] - one.ci95[0]
-
-
 def _sum(one: Quantity, by: float, *unsure: Quantity) -> Quantity:
     """A number moved by another one, which is as unsure as some others are together."""
-    value, half = one.value + by, 0.5 * sum(map(_width, (one, *unsure)))
+    value, half = one.value + by, sum(each.half for each in (one, *unsure))
     return Quantity(value, (value - half, value + half))
 
 
@@ -455,7 +457,7 @@ def _configuration(
     runs: Sequence[Run], found: Mapping[str, Registration], latencies: Mapping[str, Quantity], begun: FusionConfig
 ) -> FusionConfig:
     """A configuration to begin with: the arm that was found, and noise as it looks along the base's axes."""
-    config = _placed(begun, found, latencies)
+    config = _as_late(_placed(begun, found, latencies), found)
     placed = [in_base(run, config)[0] for run in runs]
     guessed = first_guess([guess(Survey(Path(run.name), run, relations(run))) for run in placed])
     sensors = {
@@ -476,8 +478,8 @@ def _configuration(
         axis: max(guessed.start.offset_sd_of(axis), _NO_EVIDENCE * constants.get(axis, 0.0))
         for axis in guessed.arm.axes
     }
-    known = {axis: one for axis, one in begun.arm.axes.items() if axis in guessed.arm.axes}
-    arm = msgspec.structs.replace(guessed.arm, delay=begun.arm.delay, axes={**guessed.arm.axes, **known})
+    known = {axis: one for axis, one in config.arm.axes.items() if axis in guessed.arm.axes}
+    arm = msgspec.structs.replace(guessed.arm, delay=config.arm.delay, axes={**guessed.arm.axes, **known})
     start = Start(offset_sd=offsets)
     return msgspec.structs.replace(guessed, arm=arm, tool=config.tool, sensors=sensors, start=start)
 
