@@ -28,9 +28,9 @@ from ..fusion.placing import in_base
 from ..logs.entities import Recording
 from ..logs.frames import in_space
 from ..logs.run import Run
-from ..units import KINDS, Screen, seconds
+from ..units import Screen, seconds
 from . import colours, styles
-from .scene import send_scene, views
+from .scene import by_kind, send_scene, views
 from .sink import Sink
 
 _OPENING_S = 4.0
@@ -239,12 +239,10 @@ def _of_turning(
     whole: tuple[float, float],
 ) -> rrb.Container:
     """The scene and outcomes on the left; on the right tabs of axes, those of rotations beside those of positions."""
-    kinds = est.config.arm.kind_of
     measured = [axis for axis in est.axes if axis in _measured(est)]
 
     def tab(plots: Sequence[rrb.View], axes: Iterable[str], name: str) -> rrb.Container:
-        sides = [[plot for plot, axis in zip(plots, axes, strict=True) if kinds[axis] == kind] for kind in KINDS]
-        return rrb.Horizontal(*(rrb.Vertical(*side) for side in sides if side), name=name)
+        return by_kind(dict(zip(axes, plots, strict=True)), est.config.arm.kind_of, name)
 
     left, tabs = list[rrb.View | rrb.Container](views(est)), [tab(positions, est.axes, "positions")]
     shares = [5.0, 3.0][: len(left)]
