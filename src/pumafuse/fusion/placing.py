@@ -41,11 +41,13 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
         orientation of the run where it had none.
 
     Raises:
+        UnknownNameError: The arm has a joint that the commands have not.
         RunError: See :func:`pumafuse.logs.axes.in_axes`; or a sensor in a frame of its own does not give x, y and z, or
             no orientation in a row of a piece.
         ConfigError: The tool's orientation is needed and nothing tells it.
     """
     run = without_strays(run)
+    run = replace(run, command=run.command.delayed(config.arm.later))
     config = with_tool(config, run)
     tool = config.tool.reference if config.tool else None
     of_tool = {

@@ -20,7 +20,7 @@ from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, I
 from ..errors import RunError, UnknownNameError, counted
 from ..model.arm import CANONICAL_AXES
 from ..space import rotations
-from ..space.kinematics import Chain
+from ..space.kinematics import Chain, Joints
 from ..units import AN, Kind, ending, nanoseconds, unwrapped
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
@@ -56,6 +56,7 @@ class Source:
         orientation: That of each row as logged, a quaternion x, y, z, w, NaN where it has none, (rows, 4); None where
             the source tells none. :func:`pumafuse.logs.axes.in_axes` makes axes of it.
         stray: Rows of commands of which a value is left out, as nobody sent it, (rows,); (0,) where none is.
+        joints: Where the joints are of which x, y, z and the orientation are the pose; None where none are told.
     """
 
     stamp: TimeArray
@@ -66,6 +67,7 @@ class Source:
     apart: bool = False
     orientation: FloatArray | None = None
     stray: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    joints: Joints | None = None
 
     def sd_of(self, axis: str) -> float:
         """Standard deviation of the noise of a reference on one axis [m or rad]."""
@@ -94,6 +96,31 @@ class Source:
         if self.orientation is not None:
             known.append(~np.isnan(self.orientation[:, 0]))
         return np.any(known, axis=0)
+
+    def posed(self, joints: Joints) -> Source:
+        """The source with the pose of the tip to which joints move their chain."""
+        position, orientation = joints.chain.pose(joints.values)
+        values = dict(self.values) | dict(zip(CARTESIAN, position.T.copy(), strict=True))
+        return replace(self, values=values, orientation=orientation, joints=joints)
+
+    def delayed(self, later: Mapping[str, float]) -> Source:
+        """The pose as if joints had been told later, each by its own time [s], on the line from value to value.
+
+        Raises:
+            UnknownNameError: The chain has no joint of such a name.
+        """
+        if self.joints is None or not any(later.values()):
+            return self
+        told, names = self.joints.values.copy(), self.joints.chain.joints
+        if unknown := next((name for name in later if name not in names), None):
+            raise UnknownNameError(f"{self.label}: joints of the arm", "joint", unknown, names)
+        known = np.flatnonzero(np.isfinite(told).all(axis=1) & (self.stamp != NO_STAMP))
+        known = known[np.argsort(self.stamp[known], kind="stable")]
+        time = (self.stamp[known] - self.stamp[known[:1]]) / 1e9
+        for name, by in later.items():
+            column = names.index(name)
+            told[known, column] = np.interp(time - by, time, told[known, column])
+        return self.posed(Joints(self.joints.chain, told))
 
     def ordered(self, axis: str) -> IntArray:
         """The rows that have a stamp and a value of an axis, by stamp, (n,)."""
@@ -179,6 +206,9 @@ class Source:
 
         stamp = self.stamp[row] + np.rint(share * np.append(gap, 0.0)[row]).astype(np.int64)
         values = {axis: between(value) for axis, value in self.values.items()}
+        if self.joints is not None:
+            told = np.column_stack([between(value) for value in self.joints.values.T])
+            return replace(self, stamp=stamp, values=values).posed(Joints(self.joints.chain, told))
         turned = None if self.orientation is None else rotations.between(self.orientation, row, share)
         return replace(self, stamp=stamp, values=values, orientation=turned)
 
@@ -205,8 +235,16 @@ class Source:
         spread = {axis: value[chosen] for axis, value in self.spread.items()}
         stray = self.stray[chosen] if len(self.stray) else self.stray
         turned = None if self.orientation is None else self.orientation[chosen]
-        stamp = self.stamp[chosen]
-        return replace(self, stamp=stamp, values=values, spread=spread, stray=stray, orientation=turned)
+        joints = None if self.joints is None else Joints(self.joints.chain, self.joints.values[chosen])
+        return replace(
+            self,
+            stamp=self.stamp[chosen],
+            values=values,
+            spread=spread,
+            stray=stray,
+            orientation=turned,
+            joints=joints,
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -738,9 +776,8 @@ def _posed(
             if column.kind not in (kind, None):
                 raise RunError(f"{table.path}: column '{column.column}' is no {kind}, which joint '{joint}' moves by")
         values.append(np.sum([_own(table, one, table.numbers(one.column, one.ending)[0]) for one in joints[joint]], 0))
-    position, orientation = chain.pose(np.column_stack(values))
     units |= dict.fromkeys(CARTESIAN, "length")
-    return replace(source, values=dict(zip(CARTESIAN, position.T.copy(), strict=True)), orientation=orientation)
+    return source.posed(Joints(chain, np.column_stack(values)))
 
 
 def _own(table: tables.Table, column: manifest.Column, numbers: FloatArray) -> FloatArray:

@@ -81,6 +81,18 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return delay + self.plant.lag + gain_error * (self.gain_recovery or 0.0)
 
 
+class Joint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A joint of an arm that is commanded in joints and whose axes are those of its tool.
+
+    Attributes:
+        later: By how much it answers later than the joint that answers first [s].
+        later_ci95: Its 95 % interval, if it was fitted.
+    """
+
+    later: Delay = msgspec.field(name="later_ms", default=0.0)
+    later_ci95: Interval | None = msgspec.field(name="later_ms_ci95", default=None)
+
+
 class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Limits within which the model was found to hold; beyond them pumafuse warns and goes on.
 
@@ -131,6 +143,8 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         update_period: T [s], the time between commands.
         delay: Td [s], from the command to the plant's input.
         axes: One model for each axis.
+        joints: The joints by which the tool is commanded and that do not all answer alike; the axes answer as the first
+            of them does.
         delay_ci95: Its 95 % interval [s], if it was fitted.
         validity: Limits beyond which the model was not tried.
         provenance: Where the numbers come from; kept as it is.
@@ -142,6 +156,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
     validity: Validity = Validity()
     axes: Annotated[dict[str, AxisModel], msgspec.Meta(min_length=1)]
+    joints: dict[str, Joint] = {}
     provenance: dict[str, Any] = {}
 
     def __post_init__(self) -> None:
@@ -235,6 +250,11 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """Td [s] of one axis: its own, or the arm's."""
         own = self.axis(axis).delay
         return self.delay if own is None else own
+
+    @property
+    def later(self) -> dict[str, float]:
+        """By how much each joint answers later than the first [s]."""
+        return {name: joint.later for name, joint in self.joints.items()}
 
     def doubts(self) -> list[str]:
         """A sentence if the gain of axes depends on the speed and does not recover."""

@@ -134,7 +134,10 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
         return "rate_hz"
     if listed is not None and any(entry.time.counter or entry.time.shift for entry in listed.entries.values()):
         return "a counter or shift_s"
-    if listed is not None and (oriented := [entry for entry in listed.entries.values() if entry.orientation]):
+    if listed is not None and listed.command.joints and any(config.arm.later.values()):
+        return "joints of which some answer later,"
+    oriented = [] if listed is None else [one for one in listed.entries.values() if one.orientation or one.joints]
+    if listed is not None and oriented:
         if config.tool is None:
             return "an orientation, and no [tool] in fusion.toml,"
         known = [name for name, entry in listed.sensors.items() if entry in oriented]

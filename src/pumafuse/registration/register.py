@@ -126,7 +126,7 @@ def registered(
         marker: Tool from marker as far as it is known: what motion does not tell stays so. None: zeros.
         fix_marker: Whether it stays as it is.
     """
-    both = [(a, _within(b, a.time)) for a, b in ((a.valid(), b.valid()) for a, b in zip(command, sensor, strict=True))]
+    both = [(a, within(b, a.time)) for a, b in ((a.valid(), b.valid()) for a, b in zip(command, sensor, strict=True))]
     both = [(a, b) for a, b in both if len(b.time) >= _FEWEST]
     seconds = sum(float(b.time[-1] - b.time[0]) for _, b in both)
     if seconds < _AT_LEAST:
@@ -135,24 +135,24 @@ def registered(
     about = rough(told, seen)
     if about.correlation < _FOLLOWS:
         return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
-    seen = [_within(b, a.time, _SETTLED * max(about.lag, 0.0)) for a, b in both]
+    seen = [within(b, a.time, _SETTLED * max(about.lag, 0.0)) for a, b in both]
     return _fitted(_begun(told, seen, about, marker or Placement(), fix_marker), fix_marker)
 
 
-def _within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
+def within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
     """What a sensor told while there were commands."""
     if not len(given):
         return sensor.only(np.zeros(0, np.int64))
     return sensor.only((sensor.time >= given[0] + settling) & (sensor.time <= given[-1]))
 
 
-def _thinned(sensor: Sequence[Motion], rows: int) -> list[Motion]:
+def thinned(sensor: Sequence[Motion], rows: int) -> list[Motion]:
     """About so many rows at most."""
     step = -(-sum(len(one.time) for one in sensor) // rows)
     return [one.only(np.arange(0, len(one.time), step)) for one in sensor]
 
 
-def _rows(command: Sequence[Motion], sensor: Sequence[Motion], mean: FloatArray, *, attitude: bool) -> Rows:
+def rows_of(command: Sequence[Motion], sensor: Sequence[Motion], mean: FloatArray, *, attitude: bool) -> Rows:
     """Measurements about a point beside the arm's answer."""
     turned = [Rotation.from_quat(one.quaternion).as_matrix() for one in sensor if one.quaternion is not None]
     return Rows(
@@ -189,7 +189,7 @@ def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Pl
     ahead = about.scale if np.isfinite(about.scale) and abs(np.log(about.scale)) > np.log(_ANOTHER) else 1.0
     sensor = [one._replace(position=ahead * one.position) for one in sensor]
     about = about._replace(scale=about.scale / ahead)
-    few, found = _thinned(sensor, _COARSE), list[Found]()
+    few, found = thinned(sensor, _COARSE), list[Found]()
     mean = np.concatenate([despiked(one.position) for one in few]).mean(axis=0)
     seen = np.concatenate([despiked(one.position) for one in few]) - mean
     spread = float(np.std(seen))
@@ -267,7 +267,7 @@ def _coarse(
         first: By which to turn the rotation that fits the path, to begin elsewhere.
     """
     plant = Plant(_DEAD * about.lag, max((1.0 - _DEAD) * about.lag, 1e-3))
-    rows = _rows(command, sensor, mean, attitude=False)
+    rows = rows_of(command, sensor, mean, attitude=False)
     poses, rows = rows.answer.poses(plant, plant), rows._replace(centred=rows.centred * [1.0, 1.0, sign])
     known = np.array(marker.at)
     path = poses.position + poses.rotation @ known
@@ -334,7 +334,7 @@ def _unit_named(scale: float) -> list[Found]:
 
 def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: bool) -> _Begin:
     """With the sensor's orientations, where they follow; read otherwise where they follow then."""
-    few = _thinned(begin.sensor, _COARSE)
+    few = thinned(begin.sensor, _COARSE)
     told = ("sensor", Reading.AS_TOLD)
     ways = [told, *product(("sensor", "command"), tuple(Reading)[1:])]
     aligned = {way: _aligned(begin, few, *way) for way in ways}
@@ -351,10 +351,10 @@ def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: b
     state, found = begin.state, list(begin.findings)
     if best != told:
         found.append(Found(finding=Finding.READING, source=best[0], reading=best[1]))
-    few = _thinned(sensor, _COARSE)
+    few = thinned(sensor, _COARSE)
     if best[0] == "command":
         state = _coarse(command, few, begin.mean, about, marker, fix_marker).state._replace(scale=1.0)
-    rows = _rows(command, few, begin.mean, attitude=True)
+    rows = rows_of(command, few, begin.mean, attitude=True)
     assert rows.turned is not None
     if not fix_marker:
         arm = rows.answer.poses(state.position, state.angle).rotation
@@ -395,7 +395,7 @@ class _Aligned(NamedTuple):
 def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) -> _Aligned:
     """One frame for both, orientations of a source read in some way."""
     command, sensor = _read_as(begin.command, few, source, reading)
-    rows, state = _rows(command, sensor, begin.mean, attitude=True), begin.state
+    rows, state = rows_of(command, sensor, begin.mean, attitude=True), begin.state
     assert rows.turned is not None
     poses = rows.answer.poses(state.position, state.angle)
     path, seen = unit(poses.position + poses.rotation @ state.marker), unit(rows.centred)
@@ -416,8 +416,8 @@ def _fitted(begin: _Begin, fix_marker: bool) -> Registration:
     found = begin.findings
     if any(one.prevents for one in found):
         return Registration(findings=tuple(found))
-    sensor = _thinned(begin.sensor, _ROWS)
-    rows, state = _rows(begin.command, sensor, begin.mean, attitude=begin.attitude), begin.state
+    sensor = thinned(begin.sensor, _ROWS)
+    rows, state = rows_of(begin.command, sensor, begin.mean, attitude=begin.attitude), begin.state
     poses = rows.answer.poses(state.position, state.angle)
     blind, told = _turned(poses.rotation)
     if fix_marker:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from ..logs.axes import reference_orientation
 from ..logs.clock import without_strays
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run, Source
-from ..model.arm import ArmModel, AxisModel
+from ..model.arm import ArmModel, AxisModel, Joint
 from ..model.plants import FirstOrder
 from ..space.rotations import TURNING
 from ..toml import Interval
@@ -30,6 +30,7 @@ from ..tuning.latency import first_guess
 from ..units import Kind, seconds
 from .beside import later
 from .findings import AS_READ, Vector
+from .joints import Later, joint_lags
 from .motion import Motion
 from .register import Quantity, Registered, Registration, Response, registered
 
@@ -77,11 +78,13 @@ class RegistrationSummary(msgspec.Struct, frozen=True, kw_only=True):
         pumafuse: Version that made it.
         runs: Names of the runs.
         sensors: By sensor.
+        joints: How much later joints answer than the first, where commands are in joints that do not answer alike.
     """
 
     pumafuse: str
     runs: list[str]
     sensors: dict[str, RegisteredSensor]
+    joints: dict[str, Joint] = {}
 
 
 @dataclass(frozen=True, repr=False)
@@ -133,6 +136,7 @@ def register(
         PumafuseError: No sensor can be registered; says why.
     """
     every = [without_strays(run) for run in ([runs] if isinstance(runs, Run) else runs)]
+    every = every if config is None else [_delayed(run, config.arm.later) for run in every]
     fixed = list(fix)
     if unknown := next((one for one in fixed if one not in FIXED), None):
         raise UnknownNameError("--fix", "number", unknown, FIXED)
@@ -140,6 +144,10 @@ def register(
         raise ConfigError(f"--fix {fixed[0]}: as configured where? Give a configuration (-c)")
     names = _sensors(every, config, sensor)
     found = {name: _registered(every, name, config, fixed="marker" in fixed) for name in names}
+    joints = _joints(every, found) if config is None else {}
+    if joints:
+        every = [_delayed(run, {name: joint.later for name, joint in joints.items()}) for run in every]
+        found = {name: _registered(every, name, config, fixed=False) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
     placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
     said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
@@ -156,8 +164,41 @@ def register(
     for notes in said.values():
         for note in notes:
             warnings.warn(note, PumafuseWarning, stacklevel=2)
-    summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=[run.name for run in every], sensors=details)
+    if joints:
+        config = msgspec.structs.replace(config, arm=msgspec.structs.replace(config.arm, joints=joints))
+    runs_named = [run.name for run in every]
+    summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=runs_named, sensors=details, joints=joints)
     return Registrations(config, summary)
+
+
+def _delayed(run: Run, later: Later) -> Run:
+    """The run with joints told later."""
+    return replace(run, command=run.command.delayed(later))
+
+
+def _joints(runs: Sequence[Run], found: Mapping[str, Registration]) -> dict[str, Joint]:
+    """How much later joints answer than the first, by the sensor with the surest lag; nothing where they answer alike.
+
+    A joint of which the motion does not tell has no interval.
+    """
+    lags = {name: one.position.lag.ci95 for name, one in found.items() if one.position and not _as_read(one)}
+    if not lags or any(run.command.joints is None for run in runs):
+        return {}
+    surest = min(lags, key=lambda name: lags[name][1] - lags[name][0])
+    mine = [run for run in runs if surest in run.sensors]
+    names = {run.command.joints.chain.joints for run in mine if run.command.joints is not None}
+    if len(names) > 1:
+        return {}
+    sensor = [_measured(run.sensors[surest]) for run in mine]
+
+    def told(later: Later) -> list[Motion]:
+        return [_motion(run.command.delayed(later)) for run in mine]
+
+    late = joint_lags(told, names.pop(), sensor, lambda command: registered(command, sensor))
+    return {
+        name: Joint(later=round(one.value, _DIGITS), later_ci95=one.ci95 if np.isfinite(one.ci95[1]) else None)
+        for name, one in late.items()
+    }
 
 
 def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | None) -> list[str]:

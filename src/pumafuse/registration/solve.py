@@ -197,10 +197,9 @@ def _normal(
             of Gauss and Newton, which leads down more safely.
     """
     information, score = 0.0, 0.0
-    for slope, one, sd in zip(_slopes(rows, state, off.poses), off.blocks, noise.tolist(), strict=True):
+    for slope, one, sd in zip(slopes(rows, state, off.poses), off.blocks, noise.tolist(), strict=True):
         inner = slope @ free
-        far = (_length(one) / (_CAUCHY * sd)) ** 2
-        weight = 1.0 / ((1.0 + far) * sd**2)
+        far, weight = weights(one, sd)
         curved = weight * (1.0 - 2.0 / 3.0 * far / (1.0 + far)) if expected else weight
         flat = inner.reshape(-1, inner.shape[-1])
         information = information + (flat * np.repeat(curved, 3)[:, None]).T @ flat
@@ -208,7 +207,13 @@ def _normal(
     return np.asarray(information), np.asarray(score)
 
 
-def _slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
+def weights(off: FloatArray, sd: float) -> tuple[FloatArray, FloatArray]:
+    """The square of how far rows are off, of 1 where they count half, and how much each counts [1/sd²], (n,) both."""
+    far = (_length(off) / (_CAUCHY * sd)) ** 2
+    return far, 1.0 / ((1.0 + far) * sd**2)
+
+
+def slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
     """How each block changes with a step, (n, 3, 17)."""
     moved, turned = rows.answer.slopes(state.position, state.angle, poses)
     seen = state.scale * rows.centred @ state.rotation.T

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -148,6 +149,18 @@ class Chain:
                 else:
                     position = position + value * _rotated(turn, motion.joint.axis)
             yield position, turn
+
+
+class Joints(NamedTuple):
+    """Where the joints of a chain are.
+
+    Attributes:
+        chain: What they move.
+        values: In the order of its joints [rad or m], (n, J).
+    """
+
+    chain: Chain
+    values: FloatArray
 
 
 def _orientation(rpy: tuple[float, ...]) -> FloatArray:

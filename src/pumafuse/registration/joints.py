@@ -1,0 +1,131 @@
+"""By how much each joint of an arm answers later than the first: from a sensor of the tool alone.
+
+Where joints lag apart, the tool leaves its path in fast motion, and no lag along its axes explains it. A joint that is
+told later moves each row as the kinematics say. Frame, marker and joints are one linear regression; the plant, of which
+what all joints lag is a part, is found anew after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..arrays import FloatArray
+from .intervals import half_widths
+from .motion import Motion, Plant
+from .register import Quantity, Registration, rows_of, thinned, within
+from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, residual, slopes, weights
+
+Later = Mapping[str, float]  # of each joint [s]
+Told = Callable[[Later], Sequence[Motion]]  # the commands of each run, with joints told later [s]
+_STEP = 5e-3  # s, by which a joint is told later for a slope
+_ROUNDS = 3  # a path bends little within a lag: each round leaves a tenth of what the one before did
+_ROWS = 4000  # that are looked at, evenly
+_BESIDE = np.r_[ROTATION, CENTRE, MARKER, TURN]  # of a registration's step: what is free beside the joints
+_NOTHING = 1e-300  # of a slope that nothing moves
+_SETTLED = 0.6  # s after the first command
+_KNOWN = 0.03  # s, of half an interval: beyond it the motion does not tell how late a joint is
+_PAYS = 0.95  # of the noise that is left where all joints answer alike: what gains less than 5 % is no lag of joints
+
+
+class _Step(NamedTuple):
+    """A step of the regression.
+
+    Attributes:
+        later: By how much more each joint is to be told later [s], (J,).
+        half: Half the 95 % intervals [s], (J,).
+        noise: What the registration left before it, of each block [m, rad].
+    """
+
+    later: FloatArray
+    half: FloatArray
+    noise: FloatArray
+
+
+def joint_lags(
+    told: Told, joints: Sequence[str], sensor: Sequence[Motion], register: Callable[[Sequence[Motion]], Registration]
+) -> dict[str, Quantity]:
+    """By how much each joint answers later than the first [s], with 95 % intervals.
+
+    Args:
+        told: Gives the commands.
+        joints: Their names.
+        sensor: What the sensor told in its own frame, one entry a run.
+        register: Registers it beside commands.
+
+    Returns:
+        Nothing where the joints answer alike as far as the sensor tells. A joint of which the motion does not tell is
+        as late as the others are on average, and its interval infinite.
+    """
+    later, steps = dict.fromkeys(joints, 0.0), list[_Step]()
+    for _ in range(_ROUNDS + 1):
+        found = register(told(later))
+        if found.frame is None:
+            return {}
+        steps.append(_step(told, later, sensor, found))
+        by = zip(later.items(), steps[-1].later.tolist(), strict=True)
+        later = {name: before + more for (name, before), more in by}
+    half, late = steps[-1].half, np.array(list(later.values()))
+    known = half < _KNOWN
+    if not known.any() or np.mean(np.log(steps[-1].noise / steps[0].noise)) > np.log(_PAYS):
+        return {}
+    late = np.where(known, late, late[known].mean())
+    late, half = late - late.min(), np.where(known, half, np.inf)
+    told_late = zip(joints, late.tolist(), half.tolist(), strict=True)
+    return {name: Quantity(by, (by - wide, by + wide)) for name, by, wide in told_late}
+
+
+def _step(told: Told, later: Later, sensor: Sequence[Motion], found: Registration) -> _Step:
+    """How much later each joint is beside a registration."""
+    sensor = _seen(told(later), sensor)
+    attitude, mean = found.rms_rotation is not None, np.concatenate([one.position for one in sensor]).mean(axis=0)
+    state = _state(found, mean)
+
+    def beside(commands: Later) -> Rows:
+        return rows_of([one.valid() for one in told(commands)], sensor, mean, attitude=attitude)
+
+    rows = beside(later)
+    off = residual(rows, state)
+    moved = [residual(beside({**later, name: by + _STEP}), state).blocks for name, by in later.items()]
+    parts, left = list[FloatArray](), list[FloatArray]()
+    for block, (here, slope, sd) in enumerate(
+        zip(off.blocks, slopes(rows, state, off.poses), off.noise().tolist(), strict=True)
+    ):
+        by_joint = np.stack([(there[block] - here) / _STEP for there in moved], axis=-1)
+        root = np.sqrt(weights(here, sd)[1])[:, None]
+        parts.append(np.concatenate([slope[:, :, _BESIDE], by_joint], axis=2) * root[:, :, None])
+        left.append(here * root)
+    step, influence = _regressed(np.concatenate(parts, axis=1), np.concatenate(left, axis=1))
+    own = slice(-len(later), None)
+    return _Step(step[own], half_widths(influence[:, own], [len(one.time) for one in sensor]), off.noise())
+
+
+def _seen(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:
+    """What the sensor told once it is forgotten how the arm moved before the first command."""
+    both = zip(command, sensor, strict=True)
+    return thinned([within(mine.valid(), one.valid().time, _SETTLED) for one, mine in both], _ROWS)
+
+
+def _state(found: Registration, mean: FloatArray) -> State:
+    """What was registered, with the plant of positions for orientations, too: what these lag beyond it joints do."""
+    assert found.frame is not None and found.marker is not None and found.position is not None
+    rotation, turn = (Rotation.from_rotvec(one.rotation).as_matrix() for one in (found.frame, found.marker))
+    plant = Plant(found.position.delay.value, found.position.time_constant.value)
+    return State(rotation, found.frame.at + rotation @ mean, np.array(found.marker.at), turn, 1.0, plant, plant)
+
+
+def _regressed(slope: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The step that leaves least, (k,), and by how much each row moves it, (n, k).
+
+    Args:
+        slope: How rows change with a step, (n, m, k).
+        left: What they leave, (n, m).
+    """
+    flat = slope.reshape(-1, slope.shape[2])
+    size = np.sqrt(np.maximum(np.sum(flat**2, axis=0), _NOTHING))
+    inverse = np.linalg.pinv(flat.T @ flat / np.outer(size, size), hermitian=True) / np.outer(size, size)
+    step = -inverse @ flat.T @ left.reshape(-1)
+    return step, -np.einsum("nij,ni->nj", slope, left + slope @ step) @ inverse
