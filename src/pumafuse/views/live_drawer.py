@@ -188,15 +188,16 @@ class Tool:
             colour: Of the sensor.
             taken: Of x, y and z what is new: valid times [s], positions [m] and which were rejected, (3, n) each.
         """
-        rows = scene.in_all([time for time, _, _ in taken])
-        if not len(rows[0]):
+        shared = scene.in_all([time for time, _, _ in taken])
+        if not len(shared[0]):
             return
-        axes = [one[:, row] for one, row in zip(taken, rows, strict=True)]
-        rejected = np.max([flag for _, _, flag in axes], axis=0)
+        axes = [axis[:, row] for axis, row in zip(taken, shared, strict=True)]
         seen = self._seen[name]
-        seen.add(np.array([axes[0][0], *(position for _, position, _ in axes), rejected]))
-        thinned = _thinned(seen.rows[1:].T)
-        points = scene.seen(thinned[:, :3] * MM, thinned[:, 3] > 0.0, colour)
+        seen.add(np.array([axes[0][0], *(axis[1] for axis in axes), np.max([axis[2] for axis in axes], axis=0)]))
+        rows, flag = seen.rows[1:4].T, seen.rows[4] > 0.0
+        fused, rejected = _thinned(rows[~flag]), _thinned(rows[flag])  # each by itself: few are rejected
+        red = np.repeat([False, True], [len(fused), len(rejected)])
+        points = scene.seen(np.concatenate([fused, rejected]) * MM, red, colour)
         self._sink.stream.set_time(styles.TIMELINE, duration=float(seen.rows[0, -1]))
         self._sink.stream.log(scene.measured(name), points)
 

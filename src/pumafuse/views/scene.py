@@ -2,7 +2,8 @@
 
 Entities below ``path``: ``command`` and ``estimate``, lines; ``tool``, a point, or of a tool that turns its axes;
 ``uncertainty``, the ellipsoid in which the tool point is with 95 %, enlarged; ``measured/<sensor>``, where measurements
-put the tool; ``sensors/<sensor>``, the axes of a sensor where it stands; ``tool/markers/<sensor>``, of what it sees.
+put the tool; ``sensors/<sensor>``, the axes of a sensor where it stands; ``tool/markers/<sensor>``, of what it sees;
+``robot``, a line through the links of a robot whose joints are commanded.
 """
 
 from __future__ import annotations
@@ -16,21 +17,23 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
 from ..filter.outcome import Outcome
 from ..fusion.config import Placement, Sensor
 from ..logs.frames import CARTESIAN, in_space
 from ..space import rotations
-from ..units import KINDS, MM, Kind
+from ..units import KINDS, MM, Kind, seconds
 from . import colours, styles
 from .live import SensorHead
 from .sink import Sink
 
 if TYPE_CHECKING:  # the process of the live view begins sooner without
     from ..fusion.estimates import Estimates
-    from ..logs.run import Run
+    from ..logs.run import Run, Source
+    from ..space.kinematics import Joints
 
 _PATH_POINTS = 20_000  # a 3D path needs no more, whatever the rate of the estimates
+_ROBOT_POSES = 2000  # of a robot in motion: some tens a second of a minute, as many as one sees
 _AXES = 0.15  # of the path's extent: the length of the tool's axes
 _OF_MARKER = 0.5  # times that: those of a marker, which is on the tool
 _OF_SENSOR = 0.15  # of its distance from the path: those of a sensor
@@ -50,6 +53,8 @@ def send_scene(sink: Sink, est: Estimates, run: Run) -> None:
         _strip(sink, "path/command", _points([command[name] for name in names]), colours.COMMAND, -0.7)
     path = _points([estimated[name] for name in names])
     _strip(sink, "path/estimate", path, colours.ESTIMATE, -1.2)
+    if run.command.joints is not None:
+        _robot(sink, run.command, run.command.joints, est.origin)
     every = slice(None, None, max(1, len(path) // _PATH_POINTS))
     if est.turns:
         length, pose, larger = _axes_length(path), est.pose, _enlargement(est)
@@ -67,11 +72,12 @@ def send_scene(sink: Sink, est: Estimates, run: Run) -> None:
         sink.columns("path/tool", est.time[every], rr.Points3D.columns(positions=path[every] * sink.scale))
 
 
-def views(est: Estimates) -> list[rrb.Spatial3DView]:
-    """Of the path of a tool that turns, and of the cell with the sensors."""
+def views(est: Estimates, run: Run) -> list[rrb.Spatial3DView]:
+    """Of the path of a tool that turns, and of the cell with the sensors and the robot."""
     path, larger = est.pose.position, _enlargement(est)
     frames = [known.frame for name in est.measurements.sensors if (known := est.config.sensors.get(name))]
-    return two_views("tool", larger, _eye(path), cell_eye(path, frames))
+    links = None if run.command.joints is None else _links(run.command, run.command.joints)[1].reshape(-1, 3)
+    return two_views("tool", larger, _eye(path), cell_eye(path, frames, links))
 
 
 def two_views(
@@ -107,10 +113,19 @@ def _eye(points: FloatArray) -> rrb.EyeControls3D:
     return rrb.EyeControls3D(position=place * MM, look_target=centre * MM, eye_up=[0.0, 0.0, 1.0])
 
 
-def cell_eye(path: FloatArray, frames: Iterable[Placement | None]) -> rrb.EyeControls3D | None:
-    """An eye that sees a path [m], (n, 3), the robot's base and the sensors; None where none has its place."""
-    sensors = [np.array([frame.at]) for frame in frames if frame is not None]
-    return _eye(np.concatenate([path, np.zeros((1, 3)), *sensors])) if sensors else None
+def cell_eye(
+    path: FloatArray, frames: Iterable[Placement | None], links: FloatArray | None = None
+) -> rrb.EyeControls3D | None:
+    """An eye that sees a path, the base, the sensors and the robot; None where neither of these has its place.
+
+    Args:
+        path: [m], (n, 3).
+        frames: Where the sensors stand.
+        links: Where links of the robot are [m], (n, 3).
+    """
+    others = [np.array([frame.at]) for frame in frames if frame is not None]
+    others += [] if links is None else [links]
+    return _eye(np.concatenate([path, np.zeros((1, 3)), *others])) if others else None
 
 
 def _axes_length(path: FloatArray) -> float:
@@ -155,6 +170,26 @@ def send_tool(
     sink.columns("path/tool", time, rr.Transform3D.columns(translation=point, quaternion=quaternion))
     half = larger * _ELLIPSOID * sink.scale * root
     sink.columns("path/uncertainty", time, rr.Transform3D.columns(translation=point, mat3x3=half))
+
+
+def _robot(sink: Sink, command: Source, joints: Joints, origin: int) -> None:
+    """Send a line through the robot's links, from the base to the tip, where the joints are told to be.
+
+    rerun-sdk's own reader of URDFs draws meshes and shapes only, which a file may not have.
+    """
+    stamp, links = _links(command, joints)
+    sink.log("path/robot", rr.LineStrips3D.from_fields(colors=[colours.rgb(colours.COMMAND)], radii=[-2.0]))
+    lines = rr.LineStrips3D.columns(strips=list(links * sink.scale))
+    sink.columns("path/robot", seconds(stamp, origin), lines)
+
+
+def _links(command: Source, joints: Joints) -> tuple[TimeArray, FloatArray]:
+    """Stamps [ns], (n,), and where each link is then [m], (n, L, 3)."""
+    rows = np.flatnonzero(command.stamp != NO_STAMP)
+    rows = rows[:: max(1, len(rows) // _ROBOT_POSES)]
+    links = joints.chain.frames(joints.values[rows])[:, :, :3, 3]
+    known = np.isfinite(links).all(axis=(1, 2))
+    return command.stamp[rows[known]], links[known]
 
 
 def _measured(sink: Sink, est: Estimates, sensor: str, colour: str) -> None:
