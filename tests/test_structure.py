@@ -34,9 +34,11 @@ GROUND = {"arrays", "errors", "units", "toml", "folders"}
 
 
 def imported_rooms(path: Path) -> set[str]:
-    """Rooms and ground-floor modules that a module imports, from its own relative imports."""
+    """Rooms and ground-floor modules that a module imports, from its own relative imports and from strings."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and re.fullmatch(r"pumafuse\.[\w.]+", str(node.value)):
+            found.add(node.value.split(".")[1])
         if isinstance(node, ast.ImportFrom) and node.level:
             parts = (node.module or "").split(".")
             if node.level == 2 or path.parent == SOURCE:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from .live.results import AxisNow, LiveEstimate, UpdateResult
     from .logs.frames import Cylindrical, Placed, Rotated
     from .logs.run import Run, Source
-    from .model.arm import ArmModel, AxisModel, Gain, Validity
+    from .model.arm import ArmModel, AxisModel, Gain, Joint, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, Plant, SecondOrder
     from .registration.register import Registered
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
     from .simulation.true_arm import TrueAxis
+    from .space.kinematics import Joints
     from .tuning.identifiability import TuneError
     from .tuning.intervals import Profile
     from .tuning.latency import AxisLag, Latency, LatencySummary, PartLag, SensorLag, latency
@@ -81,7 +82,7 @@ _NAMES = {
     "live.results": ["AxisNow", "LiveEstimate", "UpdateResult"],
     "logs.frames": ["Cylindrical", "Placed", "Rotated"],
     "logs.run": ["Run", "Source"],
-    "model.arm": ["ArmModel", "AxisModel", "Gain", "Validity"],
+    "model.arm": ["ArmModel", "AxisModel", "Gain", "Joint", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
     "model.plants": ["FirstOrder", "Plant", "SecondOrder"],
     "registration.register": ["Registered"],
@@ -89,6 +90,7 @@ _NAMES = {
     "simulation.scenario": ["Scenario"],
     "simulation.simulate": ["Simulated", "simulate"],
     "simulation.true_arm": ["TrueAxis"],
+    "space.kinematics": ["Joints"],
     "tuning.identifiability": ["TuneError"],
     "tuning.intervals": ["Profile"],
     "tuning.latency": ["AxisLag", "Latency", "LatencySummary", "PartLag", "SensorLag", "latency"],
@@ -102,17 +104,17 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
-    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
-    "Events", "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification",
-    "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "OrientationScore",
-    "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process", "Profile",
-    "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor", "RegistrationSummary",
-    "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder",
-    "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start",
-    "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError",
+    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog", "Events",
+    "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification", "Joint",
+    "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
+    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process",
+    "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
+    "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen",
+    "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source",
+    "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError",
     "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize",
-    "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score", "simulate",
-    "summarise", "to_rerun", "tune", "validation_figure", "verify",
+    "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score", "simulate", "summarise",
+    "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 

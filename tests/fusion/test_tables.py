@@ -88,7 +88,7 @@ def test_a_saved_folder_is_read_again(run: pf.Run, tmp_path: Path) -> None:
 
 def test_a_plot_is_the_figure_of_the_run(run: pf.Run) -> None:
     """Four panels an axis; a notebook shows what it gets."""
-    drawn = fused(run).plot()
+    drawn = pf.fused_figure(fused(run))
     assert isinstance(drawn, Figure)
     assert len(drawn.axes) == 8
     assert isinstance(pf.validation_figure(fused(run)), Figure)

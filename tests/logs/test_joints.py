@@ -56,3 +56,22 @@ def test_joints_that_are_no_pose_are_refused_in_one_line(case: str, tmp_path: Pa
     with pytest.raises(pf.PumafuseError, match=words) as error:
         read(tmp_path, text)
     assert "\n" not in str(error.value)
+
+
+def test_a_joint_that_is_told_later_has_the_values_of_rows_before(tmp_path: Path) -> None:
+    """By whole intervals of the commands exactly; half-way between them by the mean; at rest before the first."""
+    command = read(tmp_path, ROBOT + HEAD + JOINTS).command
+    told, period = command.joints, 1.0 / 36.0
+    assert told is not None
+    late = command.delayed({"j2": 2.0 * period, "j5": 0.5 * period}).joints
+    assert late is not None
+    np.testing.assert_allclose(late.values[2:, 1], told.values[:-2, 1], atol=1e-7)
+    np.testing.assert_allclose(late.values[1:, 4], 0.5 * (told.values[1:, 4] + told.values[:-1, 4]), atol=1e-7)
+    np.testing.assert_array_equal(late.values[:, [0, 2, 3, 5]], told.values[:, [0, 2, 3, 5]])
+    assert (late.values[:2, 1] == told.values[0, 1]).all()
+    position, orientation = told.chain.pose(late.values)
+    moved = command.delayed({"j2": 2.0 * period, "j5": 0.5 * period})
+    np.testing.assert_array_equal(np.column_stack([moved.values[axis] for axis in "xyz"]), position)
+    np.testing.assert_array_equal(moved.orientation, orientation)
+    with pytest.raises(pf.PumafuseError, match="joint 'j7'"):
+        command.delayed({"j7": period})

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,7 +26,6 @@ from .setup import turn_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from matplotlib.figure import Figure
 
 Mode = Literal["filtered", "as-live", "smoothed"]
 
@@ -279,10 +277,6 @@ class Estimates:
         import polars  # pyright: ignore  (not among what is installed with pumafuse)
 
         return polars.from_arrow(self.to_arrow())  # pyright: ignore
-
-    def plot(self) -> Figure:
-        """Draw each axis with its measurements, the 95 % band and a reference, as ``fused.png`` has it."""
-        return import_module("pumafuse.views.figures").fused_figure(self)  # of a room above: looked up when asked for
 
     def save(self, folder: str | Path, *, force: bool = False) -> None:
         """Write a result folder, complete or not at all: what ``pumafuse fuse -o`` writes and ``compare`` reads.

@@ -28,6 +28,7 @@ _BESIDE = np.r_[ROTATION, CENTRE, MARKER, TURN]  # of a registration's step: wha
 _NOTHING = 1e-300  # of a slope that nothing moves
 _SETTLED = 0.6  # s after the first command
 _KNOWN = 0.03  # s, of half an interval: beyond it the motion does not tell how late a joint is
+_HELD = 0.03  # of the interval of commands, which are held, but told later on the line between: no lag is surer
 _PAYS = 0.95  # of the noise that is left where all joints answer alike: what gains less than 5 % is no lag of joints
 
 
@@ -68,7 +69,8 @@ def joint_lags(
         steps.append(_step(told, later, sensor, found))
         by = zip(later.items(), steps[-1].later.tolist(), strict=True)
         later = {name: before + more for (name, before), more in by}
-    half, late = steps[-1].half, np.array(list(later.values()))
+    period = float(np.median(np.diff(told(later)[0].time)))
+    half, late = np.hypot(steps[-1].half, _HELD * period), np.array(list(later.values()))
     known = half < _KNOWN
     if not known.any() or np.mean(np.log(steps[-1].noise / steps[0].noise)) > np.log(_PAYS):
         return {}

@@ -31,6 +31,7 @@ _WELL = 0.03  # likewise: a frame explains it
 _ODD = 0.025  # likewise, where lengths differ by what is no unit
 _ANOTHER = 3.0  # times as far as commanded: another unit
 _UNEXPLAINED = 0.05  # likewise, beyond its noise: arms leave 1 % of a motion, a tool that turns untold 10
+_LOOSELY = 0.2  # likewise, where joints lag apart by as much as a whole lag
 _AS_IT_IS = np.eye(3)
 _AROUND = Rotation.create_group("T").as_matrix()  # all around, 60 degrees apart at most from the next
 _TURNS = np.radians(0.5)  # of the tool, root mean square: arms err by as much in orientation
@@ -55,6 +56,11 @@ class Quantity(NamedTuple):
 
     value: float
     ci95: Interval
+
+    @property
+    def half(self) -> float:
+        """Half the interval."""
+        return 0.5 * (self.ci95[1] - self.ci95[0])
 
 
 class Registered(msgspec.Struct, frozen=True, kw_only=True):
@@ -117,6 +123,7 @@ def registered(
     *,
     marker: Placement | None = None,
     fix_marker: bool = False,
+    loosely: bool = False,
 ) -> Registration:
     """Frame, marker and lag of a sensor.
 
@@ -125,6 +132,7 @@ def registered(
         sensor: What the sensor told in its own frame and by the same clock, likewise.
         marker: Tool from marker as far as it is known: what motion does not tell stays so. None: zeros.
         fix_marker: Whether it stays as it is.
+        loosely: Whether a fifth of what the sensor saw may be left, as where it is not known yet that joints lag apart.
     """
     both = [(a, within(b, a.time)) for a, b in ((a.valid(), b.valid()) for a, b in zip(command, sensor, strict=True))]
     both = [(a, b) for a, b in both if len(b.time) >= _FEWEST]
@@ -136,7 +144,8 @@ def registered(
     if about.correlation < _FOLLOWS:
         return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
     seen = [within(b, a.time, _SETTLED * max(about.lag, 0.0)) for a, b in both]
-    return _fitted(_begun(told, seen, about, marker or Placement(), fix_marker), fix_marker)
+    begun = _begun(told, seen, about, marker or Placement(), fix_marker, loosely)
+    return _fitted(begun, fix_marker, loosely)
 
 
 def within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
@@ -184,7 +193,9 @@ class _Begin(NamedTuple):
     findings: list[Found]
 
 
-def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Placement, fix_marker: bool) -> _Begin:
+def _begun(
+    command: list[Motion], sensor: list[Motion], about: Rough, marker: Placement, fix_marker: bool, loosely: bool
+) -> _Begin:
     """Unit, handedness and reading of orientations, from positions alone at first."""
     ahead = about.scale if np.isfinite(about.scale) and abs(np.log(about.scale)) > np.log(_ANOTHER) else 1.0
     sensor = [one._replace(position=ahead * one.position) for one in sensor]
@@ -210,7 +221,7 @@ def _begun(command: list[Motion], sensor: list[Motion], about: Rough, marker: Pl
         found.append(Found(finding=Finding.MIRRORED))
     if any(one.prevents for one in found):
         return none
-    factor, unit_found = _unit_of(proper, [len(one.time) for one in few], ahead)
+    factor, unit_found = _unit_of(proper, [len(one.time) for one in few], ahead, loosely)
     found += unit_found
     factor /= ahead
     sensor = [one._replace(position=factor * one.position) for one in sensor]
@@ -314,14 +325,14 @@ def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, 
     return np.hstack(columns)
 
 
-def _unit_of(fit: Fit, lengths: Sequence[int], ahead: float) -> tuple[float, list[Found]]:
+def _unit_of(fit: Fit, lengths: Sequence[int], ahead: float, loosely: bool) -> tuple[float, list[Found]]:
     """By what to multiply a sensor's lengths, and that they need it; they are multiplied ``ahead`` already."""
     scale = fit.state.scale * ahead
     wide = float(half_widths(fit.influence[:, SCALE], lengths)[0])
     if abs(np.log(scale)) < max(_OTHER, wide):
         return 1.0, []
-    found = _unit_named(scale) or [Found(finding=Finding.SCALE, size=scale)]
-    return found[0].size or scale, found
+    found = _unit_named(scale) or ([] if loosely else [Found(finding=Finding.SCALE, size=scale)])
+    return (found[0].size or scale if found else 1.0), found
 
 
 def _unit_named(scale: float) -> list[Found]:
@@ -411,7 +422,7 @@ def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) ->
     return _Aligned(frame, share, excess, (rotation, float(np.sqrt(alone / half))))
 
 
-def _fitted(begin: _Begin, fix_marker: bool) -> Registration:
+def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     """The least squares over all, and what they do not tell."""
     found = begin.findings
     if any(one.prevents for one in found):
@@ -437,7 +448,7 @@ def _fitted(begin: _Begin, fix_marker: bool) -> Registration:
     lengths = [len(one.time) for one in sensor]
     spread = float(np.std(rows.centred))
     odd = any(one.finding is Finding.SCALE and not one.unit for one in found)
-    most = (_ODD if odd else _UNEXPLAINED) * spread
+    most = (_LOOSELY if loosely else _ODD if odd else _UNEXPLAINED) * spread
     if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > most**2:
         said = [one for one in found if one.finding is Finding.SCALE and one.unit]
         return Registration(findings=(*said, _unexplained(begin.command, begin.sensor, fit.left() / spread)))

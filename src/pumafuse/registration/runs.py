@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from ..tuning.latency import first_guess
 from ..units import Kind, seconds
 from .beside import later
 from .findings import AS_READ, Vector
-from .joints import Later, joint_lags
+from .joints import Later, Told, joint_lags
 from .motion import Motion
 from .register import Quantity, Registered, Registration, Response, registered
 
@@ -143,11 +144,9 @@ def register(
     if fixed and config is None:
         raise ConfigError(f"--fix {fixed[0]}: as configured where? Give a configuration (-c)")
     names = _sensors(every, config, sensor)
+    joints = _joints(every, names) if config is None else {}
+    every = [_delayed(run, {name: joint.later for name, joint in joints.items()}) for run in every]
     found = {name: _registered(every, name, config, fixed="marker" in fixed) for name in names}
-    joints = _joints(every, found) if config is None else {}
-    if joints:
-        every = [_delayed(run, {name: joint.later for name, joint in joints.items()}) for run in every]
-        found = {name: _registered(every, name, config, fixed=False) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
     placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
     said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
@@ -176,29 +175,37 @@ def _delayed(run: Run, later: Later) -> Run:
     return replace(run, command=run.command.delayed(later))
 
 
-def _joints(runs: Sequence[Run], found: Mapping[str, Registration]) -> dict[str, Joint]:
+def _joints(runs: Sequence[Run], names: Sequence[str]) -> dict[str, Joint]:
     """How much later joints answer than the first, by the sensor with the surest lag; nothing where they answer alike.
 
     A joint of which the motion does not tell has no interval.
     """
-    lags = {name: one.position.lag.ci95 for name, one in found.items() if one.position and not _as_read(one)}
-    if not lags or any(run.command.joints is None for run in runs):
+    joints = {None if run.command.joints is None else run.command.joints.chain.joints for run in runs}
+    order = joints.pop()
+    if order is None or joints:
         return {}
-    surest = min(lags, key=lambda name: lags[name][1] - lags[name][0])
-    mine = [run for run in runs if surest in run.sensors]
-    names = {run.command.joints.chain.joints for run in mine if run.command.joints is not None}
-    if len(names) > 1:
-        return {}
-    sensor = [_measured(run.sensors[surest]) for run in mine]
+    best, late = np.inf, dict[str, Quantity]()
+    for name in names:
+        told, sensor = _apart(runs, name)
+        register = partial(registered, sensor=sensor, loosely=True)
+        begun = register(told({}))
+        if begun.position is None or _as_read(begun) or begun.position.lag.half >= best:
+            continue
+        best, late = begun.position.lag.half, joint_lags(told, order, sensor, register)
+    return {
+        name: Joint(later=round(one.value, _DIGITS), later_ci95=one.ci95 if np.isfinite(one.half) else None)
+        for name, one in late.items()
+    }
+
+
+def _apart(runs: Sequence[Run], name: str) -> tuple[Told, list[Motion]]:
+    """The commands of the runs that have a sensor, with joints told later, and what the sensor told."""
+    mine = [run for run in runs if name in run.sensors]
 
     def told(later: Later) -> list[Motion]:
         return [_motion(run.command.delayed(later)) for run in mine]
 
-    late = joint_lags(told, names.pop(), sensor, lambda command: registered(command, sensor))
-    return {
-        name: Joint(later=round(one.value, _DIGITS), later_ci95=one.ci95 if np.isfinite(one.ci95[1]) else None)
-        for name, one in late.items()
-    }
+    return told, [_measured(run.sensors[name]) for run in mine]
 
 
 def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | None) -> list[str]:
