@@ -129,8 +129,8 @@ def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Pa
     driven.go(60)
     read = driven.view._health_read
     until(lambda: driven.tick() or driven.view._health_read > read)
-    driven.view.close()
-    until(lambda: len(series(path, "/radial/estimate")[0]) == 60)
+    until(lambda: len(series(path, "/radial/estimate")[0]) == 60 and len(series(path, "/nis/tracker")[0]))
+    driven.view.close()  # not before all has arrived: it waits for no longer than 2 s
     time_, value = series(path, "/radial/command")
     assert np.allclose(time_, 0.028 * np.arange(60), atol=1e-6)
     assert np.allclose(value, 500.0)
