@@ -19,6 +19,8 @@ class Setup:
         axes: About which the tool turns, in the base, a row each.
         orientation: Whether the sensor tells orientations.
         shared: Whether orientations answer as positions do.
+        wrong: How much the arm's kinematics are wrong, as a share of 0.5 mm and 0.2 degrees: the same at a pose in each
+            run.
     """
 
     seed: int
@@ -27,6 +29,7 @@ class Setup:
     axes: np.ndarray = field(default_factory=lambda: np.eye(3))
     orientation: bool = True
     shared: bool = False
+    wrong: float = 0.0
     outliers: float = 0.01
     sd: float = 0.3e-3
     sd_angle: float = 1.5e-3
@@ -60,7 +63,10 @@ class Setup:
         )
         then = time - self.latency
         where = answer(told, place, then, *self.plants[0])
-        turned = Rotation.from_rotvec(answer(told, angle, then, *self.plants[1])) * self.start
+        turns = answer(told, angle, then, *self.plants[1])
+        off = self._kinematics(np.hstack([(where - where.mean(axis=0)) / 0.15, turns / 0.3]))
+        where = where + off[:, :3]
+        turned = Rotation.from_rotvec(off[:, 3:]) * Rotation.from_rotvec(turns) * self.start
         seen = self.frame.inv().apply(where + turned.apply(self.marker) - self.at) + chance.normal(
             0.0, self.sd, where.shape
         )
@@ -71,6 +77,12 @@ class Setup:
         signs = chance.choice([-1.0, 1.0], (len(time), 1))
         command = Motion(told, place, (Rotation.from_rotvec(angle) * self.start).as_quat())
         return command, Motion(time, seen, signs * attitude.as_quat() if self.orientation else None)
+
+    def _kinematics(self, pose: np.ndarray) -> np.ndarray:
+        """By how much the arm is off at poses of about 1 [m, rad], (n, 6): waves as long as the motion is wide."""
+        chance = np.random.default_rng(self.seed)
+        phases = pose @ chance.normal(0.0, 1.0, (6, 6)) + chance.uniform(0.0, 2.0 * np.pi, 6)
+        return self.wrong * np.sqrt(2.0 / 3.0) * np.repeat([0.5e-3, np.radians(0.2)], 3) * np.sin(phases)
 
     def _wander(self, time: np.ndarray, count: int) -> np.ndarray:
         """Sums of sines of about 1, (n, count)."""

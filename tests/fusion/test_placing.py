@@ -92,6 +92,27 @@ def test_a_camera_in_its_own_frame_gives_what_one_along_the_base_gives() -> None
         np.testing.assert_allclose(own[axis].position, given[axis].position, atol=1e-12)
 
 
+def test_zeros_of_a_sensor_that_lost_its_target_are_not_followed() -> None:
+    """Without a gate the estimates are those of a run in which these rows tell nothing."""
+    run = pose_run()[0]
+    camera = run.sensors["camera"]
+    assert camera.orientation is not None
+    lost = np.arange(len(camera.stamp)) % 10 == 0
+
+    def estimates(position: float, oriented: list[float]) -> pf.Estimates:
+        values = {axis: np.where(lost, position, value) for axis, value in camera.values.items()}
+        facing = np.where(lost[:, None], oriented, camera.orientation)
+        return pf.fuse(
+            replace(run, sensors={"camera": replace(camera, values=values, orientation=facing)}),
+            config(camera=CAMERA | PLACE),
+        )
+
+    with pytest.warns(pf.PumafuseWarning, match=r"rows have no finite \w+ value: invalid"):
+        zeros, nothing = estimates(0.0, [0.0, 0.0, 0.0, 1.0]), estimates(np.nan, [np.nan] * 4)
+    for axis in AXES:
+        np.testing.assert_array_equal(zeros[axis].position, nothing[axis].position)
+
+
 @pytest.mark.parametrize("mode", ["filtered", "smoothed", "as-live"])
 def test_a_run_that_is_turned_as_a_whole_gives_the_turned_estimate(mode: pf.fusion.estimates.Mode) -> None:
     """Commands, frame and reference orientation turned by Q: p becomes Q p and θ Q θ, to 1e-9."""

@@ -287,6 +287,14 @@ def test_a_row_without_all_of_x_y_z_is_invalid() -> None:
     assert dict(result.axes) == dict.fromkeys("xyz", pf.Outcome.INVALID)
 
 
+def test_zeros_of_a_sensor_that_lost_its_target_are_invalid() -> None:
+    """It writes 0, 0, 0 in its own frame, where nothing is: that tells nothing of the tool."""
+    live = pf.LiveEstimator(KNOWN)
+    live.command(0.0, x=0.5, y=0.2, z=0.1, orientation=Q)
+    result = live.measurement(0.1, "tracker", x=0.0, y=0.0, z=0.0)
+    assert dict(result.axes) == dict.fromkeys("xyz", pf.Outcome.INVALID)
+
+
 def test_a_command_that_turns_too_far_is_refused() -> None:
     """Near half a turn from the reference a rotation vector changes its sign; from 120° on that is said."""
     said: list[str] = []

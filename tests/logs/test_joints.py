@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,3 +76,18 @@ def test_a_joint_that_is_told_later_has_the_values_of_rows_before(tmp_path: Path
     np.testing.assert_array_equal(moved.orientation, orientation)
     with pytest.raises(pf.PumafuseError, match="joint 'j7'"):
         command.delayed({"j7": period})
+
+
+def test_an_arm_whose_joints_lag_apart_says_where_they_are_not_heeded(tmp_path: Path) -> None:
+    """Commands in joints are told later; of commands in x, y, z a note says that nothing is."""
+    arm = pf.ArmModel.parse(
+        'name = "arm"\nupdate_period_ms = 28.0\ndelay_ms = 40.0\n[joints.j2]\nlater_ms = 30.0\n'
+        '[axes.x]\nplant = "first-order"\ntime_constant_ms = 30.0\n'
+    )
+    assert pf.ArmModel.parse(arm.to_toml()) == arm
+    run = read(tmp_path, ROBOT + HEAD + JOINTS)
+    heeded, posed = run.heeding(arm), replace(run, command=replace(run.command, joints=None)).heeding(arm)
+    assert not any("heeded" in note for note in heeded.notes)
+    np.testing.assert_array_equal(heeded.command.values["x"], run.command.delayed({"j2": 0.03}).values["x"])
+    assert [note for note in posed.notes if "j2 30 ms" in note and "not heeded" in note]
+    np.testing.assert_array_equal(posed.command.values["x"], run.command.values["x"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pumafuse.registration.beside import later
 from pumafuse.registration.motion import Motion
@@ -13,15 +14,25 @@ def path(time: np.ndarray) -> np.ndarray:
     return 0.1 * np.column_stack([np.sin(1.1 * time), np.sin(1.7 * time + 1.0), np.cos(2.3 * time)])
 
 
+def turned(time: np.ndarray) -> Rotation:
+    """The tool turns as it moves, 30 ms later."""
+    return Rotation.from_rotvec(3.0 * path(time - 0.03)[:, [1, 2, 0]])
+
+
 def pair(late: float, seed: int, seconds: float = 30.0) -> tuple[Motion, Motion]:
-    """Two sensors of one tool, the second one so much later [s], with outliers, in a frame that is a little wrong."""
+    """Two sensors of one tool, the second one so much later [s], with outliers.
+
+    Its frame is a little wrong, and what it sees is 1 mm from where the first one takes it to be.
+    """
     rng = np.random.default_rng(seed)
     first, second = (np.sort(rng.uniform(0.0, seconds, int(rate * seconds))) for rate in (100.0, 40.0))
     one = path(first) + rng.normal(0.0, 2e-4, (len(first), 3))
-    other = path(second - late) @ (np.eye(3) + 2e-3 * rng.normal(size=(3, 3))) + [1e-3, -2e-3, 0.0]
+    told = turned(first) * Rotation.from_rotvec(rng.normal(0.0, 1e-3, (len(first), 3)))
+    point = path(second - late) + turned(second - late).apply(rng.normal(0.0, 1e-3, 3))
+    other = point @ (np.eye(3) + 2e-3 * rng.normal(size=(3, 3))) + [1e-3, -2e-3, 0.0]
     other += rng.normal(0.0, 1e-4, other.shape)
     other[::97] += 0.05
-    return Motion(first, one), Motion(second, other)
+    return Motion(first, one, told.as_quat()), Motion(second, other)
 
 
 @pytest.mark.long
@@ -36,7 +47,7 @@ def test_intervals_hold_the_true_difference(late: float) -> None:
 
 
 def test_what_is_later_is_told_with_its_sign() -> None:
-    """12 ms later is +12 ms, beside a frame that is wrong by 0.2 % and outliers."""
+    """12 ms later is +12 ms, beside a frame that is wrong by 0.2 %, a marker by 1 mm, and outliers."""
     found = later(*([one] for one in pair(0.012, 7)))
     assert found is not None
     assert found.value == pytest.approx(0.012, abs=5e-4)

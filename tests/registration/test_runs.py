@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
+from pumafuse.registration.runs import RegisteredSensor
 from setups import Setup
 
 RUNS = Path(__file__).parents[2] / "examples" / "pose-virtual"
@@ -62,6 +63,43 @@ def test_what_is_written_as_json_is_what_is_configured(registered: Path) -> None
         assert one["latency_ms"] == pytest.approx(config.sensors[name].latency * 1e3, abs=1e-3)
         assert 0.1 < one["rms_mm"] < 2.0  # the arm's kinematics are 0.5 mm and 0.2° wrong
     assert 0.05 < told["sensors"]["mocap"]["rms_deg"] < 0.5
+
+
+@pytest.fixture(scope="module")
+def each() -> list[dict[str, RegisteredSensor]]:
+    """The sensors as each of the two runs tells them."""
+    return [pf.register(pf.Run.read(RUNS / name)).details.sensors for name in ("inspect1", "wander1")]
+
+
+def test_the_latency_beside_another_sensor_is_that_of_the_set_up(each: list[dict[str, RegisteredSensor]]) -> None:
+    """Whatever the arm errs, which both see: 12 − 5 ms to 0.1 ms, and the interval holds it."""
+    for sensors in each:
+        assert sensors["tracker"].latency == 0.0
+        late, between = sensors["mocap"].latency, sensors["mocap"].latency_ci95
+        assert late is not None and between is not None
+        assert late == pytest.approx(0.007, abs=1e-4)
+        assert between[0] < 0.007 < between[1]
+
+
+def test_two_runs_agree_within_their_intervals(each: list[dict[str, RegisteredSensor]]) -> None:
+    """Of all numbers of frames, markers and latencies 90 % differ by less than their joint 95 % intervals."""
+    numbers, halves = zip(*(placed(sensors) for sensors in each), strict=True)
+    assert np.mean(np.abs(numbers[1] - numbers[0]) <= np.hypot(*halves)) >= 0.9
+
+
+def placed(sensors: dict[str, RegisteredSensor]) -> tuple[np.ndarray, np.ndarray]:
+    """All numbers that are known, and half their intervals."""
+    pairs: list[tuple[float, tuple[float, float]]] = []
+    for one in sensors.values():
+        assert one.frame is not None and one.marker is not None and one.latency is not None
+        for place in (one.frame, one.marker):
+            pairs += [
+                *zip(place.at, place.at_ci95, strict=True),
+                *zip(place.rotation, place.rotation_ci95, strict=True),
+            ]
+        pairs.append((one.latency, one.latency_ci95 or (0.0, 0.0)))
+    known = [(number, interval) for number, interval in pairs if 0.0 < np.ptp(interval) < np.inf]
+    return np.array([number for number, _ in known]), 0.5 * np.array([np.ptp(interval) for _, interval in known])
 
 
 @pytest.mark.parametrize("sensor", ["mocap", "tracker"])

@@ -19,6 +19,7 @@ from ..logs.axes import in_axes, reference_orientation
 from ..logs.clock import TOLERATED_STEP_BACK_NS, without_strays
 from ..logs.frames import CARTESIAN, Placed
 from ..logs.run import Run, Source
+from ..logs.screening import lost
 from ..model.arm import ArmModel
 from ..space import rotations
 from ..space.rotations import TURNING
@@ -46,8 +47,7 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
             no orientation in a row of a piece.
         ConfigError: The tool's orientation is needed and nothing tells it.
     """
-    run = without_strays(run)
-    run = replace(run, command=run.command.delayed(config.arm.later))
+    run = without_strays(run).heeding(config.arm)
     config = with_tool(config, run)
     tool = config.tool.reference if config.tool else None
     of_tool = {
@@ -90,8 +90,8 @@ class Placing:
 
     @_QUIET
     def seen(self, measured: FloatArray) -> FloatArray:
-        """What it sees, along the base's axes [m], of x, y and z [m] in its own frame, (n, 3) → (n, 3)."""
-        return self._at + rotations.turned(self._turn, measured)
+        """What it sees, along the base's axes [m], of x, y and z [m] in its own frame, (n, 3); NaN where it is lost."""
+        return np.where(lost(measured)[:, None], np.nan, self._at + rotations.turned(self._turn, measured))
 
     def oriented(self, measured: FloatArray) -> FloatArray:
         """The tool's orientation of what it measures, as quaternions, (n, 4) → (n, 4)."""
@@ -119,8 +119,9 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
     if not set(CARTESIAN) <= source.values.keys():
         raise RunError(f"{source.label_for(name)}: has a frame or a marker, so that it must give x, y and z")
     placing, told, spread = Placing(config.sensors[name]), source.orientation, dict(source.spread)
-    point = placing.seen(np.column_stack([source.values[axis] for axis in CARTESIAN]))
-    oriented = None if told is None else placing.oriented(told)
+    measured = np.column_stack([source.values[axis] for axis in CARTESIAN])
+    point = placing.seen(measured)
+    oriented = None if told is None else np.where(lost(measured)[:, None], np.nan, placing.oriented(told))
     if placing.has_marker:
         lever = np.full(point.shape, np.nan) if oriented is None else placing.lever(oriented)
         spread |= placing.spread(lever)

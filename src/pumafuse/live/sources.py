@@ -7,7 +7,6 @@ import os
 import select
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,8 +57,7 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
     """
     if run.clock != "stamps" and run.has_orientation:
         raise RunError(f"run '{run.name}': with orientations its clock = '{run.clock}' cannot be replayed; fuse it")
-    run = replace(run, command=run.command.delayed(config.arm.later))
-    for part in segments(run)[0]:
+    for part in segments(run.heeding(config.arm))[0]:
         yield from _paced(*_arrivals(part, config), speed)
 
 

@@ -22,6 +22,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.placing import Placing, turning_axes
 from ..logs.axes import FAR_TURN, FARTHEST_TURN
 from ..logs.frames import CARTESIAN
+from ..logs.screening import lost
 from ..model.arm import ArmModel
 from ..space import rotations
 from ..space.rotations import TURNING
@@ -159,8 +160,10 @@ class Tool:
         oriented: FloatArray | None = found.pop(ORIENTATION, None)
         placing, seen = self._placings.get(sensor), None
         if placing is not None:
-            point = placing.seen(np.array([[number(values.get(axis)) for axis in CARTESIAN]]))
-            oriented = None if oriented is None else placing.oriented(oriented)
+            measured = np.array([[number(values.get(axis)) for axis in CARTESIAN]])
+            point = placing.seen(measured)
+            if oriented is not None:
+                oriented = np.where(lost(measured)[:, None], np.nan, placing.oriented(oriented))
             if placing.has_marker and oriented is None:
                 seen = point[0]
                 point = point - self._lever(sensor, np.array([stamp]))

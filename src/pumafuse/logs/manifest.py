@@ -350,7 +350,7 @@ def _with_pose(keys: dict[str, Any], where: str, path: str) -> dict[str, Any]:
         raise ConfigError(f"{where}: {path}.pose: expected the path of a pose in a message, as in 'pose.pose', or '.'")
     if twice := next((key for key in (*CARTESIAN, "orientation") if key in keys), None):
         raise ConfigError(f"{where}: {path}: gives {twice} and a pose, which has it; give one")
-    position, orientation = _IN_TRANSFORM if leaf(pose) == "transform" else _IN_POSE
+    position, orientation = _IN_TRANSFORM if leaf(pose).rpartition(".")[2] == "transform" else _IN_POSE
     inside = "" if pose == "." else f"{pose}."
     found = {key: value for key, value in keys.items() if key != "pose"}
     found |= {axis: {"column": f"{inside}{position}.{axis}", "unit": "m"} for axis in CARTESIAN}

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError, counted
-from ..model.arm import CANONICAL_AXES
+from ..model.arm import CANONICAL_AXES, ArmModel
 from ..space import rotations
 from ..space.kinematics import Chain, Joints
 from ..units import AN, Kind, ending, nanoseconds, unwrapped
@@ -360,6 +360,12 @@ class Run:
         """Rows stamped in the part to use, (rows,); in the whole run all rows, also those without a stamp."""
         since, until = self.ends(origin)
         return (stamp >= since) & (stamp <= until) if self.interval else np.ones(len(stamp), dtype=np.bool_)
+
+    def heeding(self, arm: ArmModel) -> Run:
+        """The run with joints told as much later as they answer, with a note where this would need other commands."""
+        if self.command.joints is None:
+            return replace(self, notes=tuple(dict.fromkeys([*self.notes, *arm.unheeded()])))
+        return replace(self, command=self.command.delayed(arm.later))
 
     def each(self, change: Callable[[str, Source], Source]) -> Run:
         """The run with each of its sources changed; ``change`` is given its name in notes, too."""

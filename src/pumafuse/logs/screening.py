@@ -29,6 +29,14 @@ _COARSE = 3.0  # typical over smallest step of a value: below it a sensor counts
 _MOSTLY = 1.5  # times that each value comes, on the mean: half of them, or more, come again
 
 
+def lost(position: FloatArray) -> BoolArray:
+    """In which rows x, y and z are all zero, as a sensor in a frame of its own writes them that lost its target, (n,).
+
+    Nothing is in the middle of a sensor.
+    """
+    return (position == 0.0).all(axis=1)
+
+
 def usual_of(steps: FloatArray) -> float:
     """The step than which few are larger; numpy's quantile takes longer, and imports masked arrays (0.02 s)."""
     place = int(USUAL * len(steps))

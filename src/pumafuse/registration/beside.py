@@ -1,7 +1,7 @@
 """How late one sensor is beside another that saw the same tool: by what both tell, never as a difference of lags.
 
-What the arm does not do as commanded is the same to both, and so costs nothing here. Frames and markers that are
-slightly wrong leave an affine function of the position, which is projected out.
+What the arm does not do as commanded is the same to both, and so costs nothing here. Frames and scales that are
+slightly wrong leave an affine function of the position, a marker that is leaves R m: both are found beside the time.
 """
 
 from __future__ import annotations
@@ -9,64 +9,79 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ..arrays import FloatArray
-from .intervals import half_widths
+from ..arrays import BoolArray, FloatArray, median
+from .intervals import blocks, inverse
 from .motion import Motion
 from .register import Quantity
+from .solve import MEDIAN, curvature, weights
 from .start import despiked
 
 _SPEED = 0.05  # s, over which a velocity is taken
-_ROUNDS = 10  # of the weights
+_ROUNDS = 10  # of the weights and of the time
 _FEWEST = 60  # rows
 _UNKNOWN = 0.05  # s, of half an interval
+_ROUNDING = 1e-12  # m
 
 
 def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) -> Quantity | None:
     """By how much the stamps of one sensor's rows are later than those of another's [s], with its 95 % interval.
 
     Args:
-        first: What one sensor tells of the tool in the base's frame, one entry a run.
-        other: What the other one tells of it, likewise.
+        first: What one sensor tells in the base's frame of the point that the other one sees, and, where it is known,
+            how the tool is turned, one entry a run.
+        other: Where the other one sees that point, likewise.
         about: By how much, roughly [s].
 
     Returns:
         None where they have too little in common, or nothing moves, or it is not known to 50 ms.
     """
-    shifted = [one._replace(time=one.time - about) for one in other]
-    pairs = [_compared(a.valid(), b.valid()) for a, b in zip(first, shifted, strict=True)]
-    pairs = [pair for pair in pairs if len(pair[0]) >= _FEWEST]
+    pairs = [(_Path(a.valid()), b.valid()) for a, b in zip(first, other, strict=True)]
+    pairs = [(path, b.only(path.holds(b.time - about))) for path, b in pairs]
+    pairs = [(path, b) for path, b in pairs if len(b.time) >= _FEWEST]
     if not pairs:
         return None
-    apart, speed = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    weight = np.ones(len(apart))
-    energy = float(np.sum(speed**2))
-    if energy <= 0.0:
-        return None
-    late = 0.0
-    for _ in range(_ROUNDS):  # Cauchy's weights
-        late = -float(np.sum(weight[:, None] * speed * apart)) / energy
-        off = np.sqrt(np.sum((apart + late * speed) ** 2, axis=1))
-        weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-12)) ** 2)
-        energy = float(np.sum(weight[:, None] * speed**2))
-    influence = -np.sum(weight[:, None] * speed * (apart + late * speed), axis=1) / energy
-    half = float(half_widths(influence[:, None], [len(pair[0]) for pair in pairs])[0])
-    return None if half > _UNKNOWN else Quantity(about + late, (about + late - half, about + late + half))
+    late, weight = about, np.ones(sum(len(b.time) for _, b in pairs))
+    half = np.inf
+    for _ in range(_ROUNDS):
+        parts = [path.beside(b, late) for path, b in pairs]
+        apart, slope = (np.concatenate(part) for part in zip(*parts, strict=True))
+        told = blocks(slope, apart, weight, weight)
+        step = inverse(told.information.sum(axis=0)) @ told.score.sum(axis=0)
+        left = apart - slope @ step
+        half = float(blocks(slope, left, curvature(weight), weight).half_widths(np.eye(len(step))[-1:])[0])
+        late += float(step[-1])
+        far = np.linalg.norm(left, axis=1)
+        weight = weights(far, max(median(far) / MEDIAN, _ROUNDING))
+    return Quantity(late, (late - half, late + half)) if 0.0 < half < _UNKNOWN else None
 
 
-def _compared(first: Motion, other: Motion) -> tuple[FloatArray, FloatArray]:
-    """What the second sensor's rows are apart from the first [m], and its velocity [m/s], without what is affine."""
-    ends = (first.time[0] + _SPEED, first.time[-1] - _SPEED) if len(first.time) else (0.0, -1.0)
-    other = other.only((other.time >= ends[0]) & (other.time <= ends[1]))
-    if not len(other.time):
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    smooth = despiked(first.position)
+class _Path:
+    """What the first sensor tells of one run, at any instant."""
 
-    def at(time: FloatArray) -> FloatArray:
-        return np.column_stack([np.interp(time, first.time, smooth[:, axis]) for axis in range(3)])
+    def __init__(self, first: Motion) -> None:
+        turned = [] if first.quaternion is None else [Rotation.from_quat(first.quaternion).as_matrix().reshape(-1, 9)]
+        self._time, self._told = first.time, np.hstack([despiked(first.position), *turned])
 
-    there = at(other.time)
-    speed = (at(other.time + _SPEED) - at(other.time - _SPEED)) / (2.0 * _SPEED)
-    basis = np.linalg.qr(np.column_stack([there - there.mean(axis=0), np.ones(len(there))]))[0]
-    apart = other.position - there
-    return apart - basis @ (basis.T @ apart), speed - basis @ (basis.T @ speed)
+    def holds(self, time: FloatArray) -> BoolArray:
+        """Whether there are velocities at some instants, also when they are shifted a little."""
+        first, last = (self._time[0], self._time[-1]) if len(self._time) else (np.inf, -np.inf)
+        return (time >= first + 2.0 * _SPEED) & (time <= last - 2.0 * _SPEED)
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        columns: list[FloatArray] = [np.interp(time, self._time, one) for one in self._told.T]
+        return np.column_stack(columns)
+
+    def beside(self, other: Motion, late: float) -> tuple[FloatArray, FloatArray]:
+        """How far the other sensor's rows are off [m], (n, 3), and the slopes of that, (n, 3, k): the last is of time.
+
+        Before it are those of what is affine, and of the marker.
+        """
+        time = other.time - late
+        there, ahead, behind = self._at(time), self._at(time + _SPEED), self._at(time - _SPEED)
+        place, turned = there[:, :3], there[:, 3:].reshape(len(there), 3, -1)
+        affine = np.column_stack([place - place.mean(axis=0), np.ones(len(place))])
+        affine = np.einsum("ij,nk->nijk", np.eye(3), affine).reshape(len(place), 3, -1)
+        speed = (behind - ahead)[:, :3, None] / (2.0 * _SPEED)
+        return other.position - place, np.concatenate([affine, turned, speed], axis=-1)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray
-from .intervals import half_widths
+from .intervals import Blocks, blocks, inverse
 from .motion import Motion, Plant
 from .register import Quantity, Registration, rows_of, thinned, within
 from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, residual, slopes, weights
@@ -25,7 +25,6 @@ _STEP = 5e-3  # s, by which a joint is told later for a slope
 _ROUNDS = 3  # a path bends little within a lag: each round leaves a tenth of what the one before did
 _ROWS = 4000  # that are looked at, evenly
 _BESIDE = np.r_[ROTATION, CENTRE, MARKER, TURN]  # of a registration's step: what is free beside the joints
-_NOTHING = 1e-300  # of a slope that nothing moves
 _SETTLED = 0.6  # s after the first command
 _KNOWN = 0.03  # s, of half an interval: beyond it the motion does not tell how late a joint is
 _HELD = 0.03  # of the interval of commands, which are held, but told later on the line between: no lag is surer
@@ -92,17 +91,27 @@ def _step(told: Told, later: Later, sensor: Sequence[Motion], found: Registratio
     rows = beside(later)
     off = residual(rows, state)
     moved = [residual(beside({**later, name: by + _STEP}), state).blocks for name, by in later.items()]
-    parts, left = list[FloatArray](), list[FloatArray]()
-    for block, (here, slope, sd) in enumerate(
-        zip(off.blocks, slopes(rows, state, off.poses), off.noise().tolist(), strict=True)
-    ):
-        by_joint = np.stack([(there[block] - here) / _STEP for there in moved], axis=-1)
-        root = np.sqrt(weights(here, sd)[1])[:, None]
-        parts.append(np.concatenate([slope[:, :, _BESIDE], by_joint], axis=2) * root[:, :, None])
-        left.append(here * root)
-    step, influence = _regressed(np.concatenate(parts, axis=1), np.concatenate(left, axis=1))
+    by_joint = [
+        (np.stack(there, axis=-1) - here[:, :, None]) / _STEP for *there, here in zip(*moved, off.blocks, strict=True)
+    ]
+    slope = [
+        np.concatenate([one[:, :, _BESIDE], by], axis=2)
+        for one, by in zip(slopes(rows, state, off.poses), by_joint, strict=True)
+    ]
+    before = _told(slope, off.blocks, off.noise())
+    step = -inverse(before.information.sum(axis=0)) @ before.score.sum(axis=0)
+    after = _told(slope, [one + by @ step for one, by in zip(off.blocks, slope, strict=True)], off.noise())
     own = slice(-len(later), None)
-    return _Step(step[own], half_widths(influence[:, own], [len(one.time) for one in sensor]), off.noise())
+    return _Step(step[own], after.half_widths(np.eye(len(step))[own]), off.noise())
+
+
+def _told(slope: Sequence[FloatArray], off: Sequence[FloatArray], noise: FloatArray) -> Blocks:
+    """What rows tell of a step that are so far off and change so with it, positions and orientations."""
+    parts = list[Blocks]()
+    for by, one, sd in zip(slope, off, noise.tolist(), strict=True):
+        weight = weights(np.linalg.norm(one, axis=1), sd) / sd**2
+        parts.append(blocks(by, one, weight, weight))
+    return Blocks(*(np.sum(one, axis=0) for one in zip(*parts, strict=True)))
 
 
 def _seen(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:
@@ -117,17 +126,3 @@ def _state(found: Registration, mean: FloatArray) -> State:
     rotation, turn = (Rotation.from_rotvec(one.rotation).as_matrix() for one in (found.frame, found.marker))
     plant = Plant(found.position.delay.value, found.position.time_constant.value)
     return State(rotation, found.frame.at + rotation @ mean, np.array(found.marker.at), turn, 1.0, plant, plant)
-
-
-def _regressed(slope: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The step that leaves least, (k,), and by how much each row moves it, (n, k).
-
-    Args:
-        slope: How rows change with a step, (n, m, k).
-        left: What they leave, (n, m).
-    """
-    flat = slope.reshape(-1, slope.shape[2])
-    size = np.sqrt(np.maximum(np.sum(flat**2, axis=0), _NOTHING))
-    inverse = np.linalg.pinv(flat.T @ flat / np.outer(size, size), hermitian=True) / np.outer(size, size)
-    step = -inverse @ flat.T @ left.reshape(-1)
-    return step, -np.einsum("nij,ni->nj", slope, left + slope @ step) @ inverse

@@ -16,7 +16,6 @@ from ..fusion.config import Placement
 from ..space.rotations import crossed, left_jacobian
 from ..toml import Interval
 from .findings import Finding, Found, Reading, Vector
-from .intervals import half_widths
 from .motion import Answer, Motion, Plant
 from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, fitted
 from .start import Rough, aligned_turns, despiked, kabsch, read, rough, unit
@@ -221,7 +220,7 @@ def _begun(
         found.append(Found(finding=Finding.MIRRORED))
     if any(one.prevents for one in found):
         return none
-    factor, unit_found = _unit_of(proper, [len(one.time) for one in few], ahead, loosely)
+    factor, unit_found = _unit_of(proper, ahead, loosely)
     found += unit_found
     factor /= ahead
     sensor = [one._replace(position=factor * one.position) for one in sensor]
@@ -250,7 +249,7 @@ def _told_as(command: list[Motion], begin: Callable[..., Fit], spread: float) ->
         others = {one: _read_as(command, [], "command", one)[0] for one in readings}
         fits = {one: begin(other) for one, other in others.items()}
         best = min(fits, key=lambda one: left(fits[one]))
-        if left(fits[best]) < _CLEARER * left(fit):
+        if left(fits[best]) < min(_CLEARER * left(fit), _LEFT * spread):
             return others[best], fits[best], [Found(finding=Finding.READING, source="command", reading=best)]
     return command, fit, []
 
@@ -283,13 +282,14 @@ def _coarse(
     known = np.array(marker.at)
     path = poses.position + poses.rotation @ known
     seen = np.concatenate([despiked(one.position) for one in sensor]) - mean
-    scale = about.scale if np.isfinite(about.scale) else 1.0
+    moves = bool(np.std(path, axis=0).max() > _BESIDE)  # else a scale is one of the marker
+    scale = about.scale if moves and np.isfinite(about.scale) else 1.0
     rotation = kabsch(unit(path), unit(seen * [1.0, 1.0, sign]))[0]
     turn = Rotation.from_rotvec(marker.rotation).as_matrix()
     markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
-    moves = bool(np.std(path, axis=0).max() > _BESIDE)  # else a scale is one of the marker
-    free = _free(np.eye(3), markers, turn=False, scale=moves, own=False)
-    return fitted(rows, State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant), free)
+    begin = State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant)
+    held, free = (_free(np.eye(3), markers, turn=False, scale=one, own=False) for one in (False, moves))
+    return fitted(rows, fitted(rows, begin, held).state, free)  # a free scale makes all small first
 
 
 def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -325,10 +325,10 @@ def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, 
     return np.hstack(columns)
 
 
-def _unit_of(fit: Fit, lengths: Sequence[int], ahead: float, loosely: bool) -> tuple[float, list[Found]]:
+def _unit_of(fit: Fit, ahead: float, loosely: bool) -> tuple[float, list[Found]]:
     """By what to multiply a sensor's lengths, and that they need it; they are multiplied ``ahead`` already."""
     scale = fit.state.scale * ahead
-    wide = float(half_widths(fit.influence[:, SCALE], lengths)[0])
+    wide = float(fit.half_widths(np.eye(SIZE)[SCALE])[0])
     if abs(np.log(scale)) < max(_OTHER, wide):
         return 1.0, []
     found = _unit_named(scale) or ([] if loosely else [Found(finding=Finding.SCALE, size=scale)])
@@ -442,17 +442,17 @@ def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
         found.append(Found(finding=Finding.LINE, axis=_vector(loose[:, 0])))
     elif begin.either and not (begin.attitude and told.shape[1]):
         found.append(Found(finding=Finding.PLANE))
-    own = begin.attitude and len(told.T) > 0
+    moves = bool(np.std(poses.position, axis=0).max() > _BESIDE)
+    own = begin.attitude and len(told.T) > 0 and moves  # else nothing tells the lag of positions
     turn = begin.attitude and not fix_marker
     fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
-    lengths = [len(one.time) for one in sensor]
     spread = float(np.std(rows.centred))
     odd = any(one.finding is Finding.SCALE and not one.unit for one in found)
     most = (_LOOSELY if loosely else _ODD if odd else _UNEXPLAINED) * spread
     if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > most**2:
         said = [one for one in found if one.finding is Finding.SCALE and one.unit]
         return Registration(findings=(*said, _unexplained(begin.command, begin.sensor, fit.left() / spread)))
-    return _told(fit, begin, lengths, loose, blind, own)
+    return _told(fit, begin, loose, blind, own)
 
 
 def _unexplained(command: Sequence[Motion], sensor: Sequence[Motion], share: float) -> Found:
@@ -486,7 +486,6 @@ def _vector(of: FloatArray) -> Vector:
 def _told(
     fit: Fit,
     begin: _Begin,
-    lengths: Sequence[int],
     loose: FloatArray,
     blind: FloatArray,
     own: bool,
@@ -494,7 +493,7 @@ def _told(
     """The numbers with their intervals."""
     state = fit.state
     values, slopes = _numbers(state, begin.mean)
-    half = half_widths(fit.influence @ slopes.T, lengths)
+    half = fit.half_widths(slopes)
     lost = np.zeros((SIZE, loose.shape[1] + blind.shape[1]))
     lost[ROTATION, : loose.shape[1]], lost[MARKER, loose.shape[1] :] = loose, blind
     half[(np.abs(slopes @ lost) > _TILT).any(axis=1)] = np.inf
@@ -510,7 +509,7 @@ def _told(
         rotation=rotation if own else None,
         rms=noise[0],
         rms_rotation=noise[1] if begin.attitude else None,
-        rows=sum(lengths),
+        rows=len(fit.off.blocks[0]),
         findings=tuple(begin.findings),
     )
 

@@ -13,16 +13,18 @@ import msgspec
 import numpy as np
 
 from .. import toml
+from ..arrays import FloatArray
 from ..discovery.guesses import guess
 from ..discovery.roles import relations
 from ..discovery.survey import Survey
 from ..errors import ConfigError, PumafuseWarning, RunError, UnknownNameError
 from ..fusion.config import SD_BOUNDS, FusionConfig, Placement, Sensor, Start, Tool
-from ..fusion.placing import in_base, with_tool
+from ..fusion.placing import Placing, in_base, with_tool
 from ..logs.axes import reference_orientation
 from ..logs.clock import without_strays
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run, Source
+from ..logs.screening import lost
 from ..model.arm import ArmModel, AxisModel, Joint
 from ..model.plants import FirstOrder
 from ..space.rotations import TURNING
@@ -32,7 +34,7 @@ from ..units import Kind, seconds
 from .beside import later
 from .findings import AS_READ, Vector
 from .joints import Later, Told, joint_lags
-from .motion import Motion
+from .motion import Answer, Motion, Plant
 from .register import Quantity, Registered, Registration, Response, registered
 
 FIXED = ("marker", "latency")  # what can be left as it is
@@ -137,15 +139,16 @@ def register(
         PumafuseError: No sensor can be registered; says why.
     """
     every = [without_strays(run) for run in ([runs] if isinstance(runs, Run) else runs)]
-    every = every if config is None else [_delayed(run, config.arm.later) for run in every]
     fixed = list(fix)
     if unknown := next((one for one in fixed if one not in FIXED), None):
         raise UnknownNameError("--fix", "number", unknown, FIXED)
     if fixed and config is None:
         raise ConfigError(f"--fix {fixed[0]}: as configured where? Give a configuration (-c)")
     names = _sensors(every, config, sensor)
-    joints = _joints(every, names) if config is None else {}
-    every = [_delayed(run, {name: joint.later for name, joint in joints.items()}) for run in every]
+    joints = _joints(every, names) if config is None else config.arm.joints
+    config = config and _with_joints(config, {})  # they are heeded in the commands from here on
+    later = {name: joint.later for name, joint in joints.items()}
+    every = [replace(run, command=run.command.delayed(later)) for run in every]
     found = {name: _registered(every, name, config, fixed="marker" in fixed) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
     placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
@@ -163,16 +166,13 @@ def register(
     for notes in said.values():
         for note in notes:
             warnings.warn(note, PumafuseWarning, stacklevel=2)
-    if joints:
-        config = msgspec.structs.replace(config, arm=msgspec.structs.replace(config.arm, joints=joints))
-    runs_named = [run.name for run in every]
-    summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=runs_named, sensors=details, joints=joints)
-    return Registrations(config, summary)
+    named = [run.name for run in every]
+    summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=named, sensors=details, joints=joints)
+    return Registrations(_with_joints(config, joints), summary)
 
 
-def _delayed(run: Run, later: Later) -> Run:
-    """The run with joints told later."""
-    return replace(run, command=run.command.delayed(later))
+def _with_joints(config: FusionConfig, joints: dict[str, Joint]) -> FusionConfig:
+    return msgspec.structs.replace(config, arm=msgspec.structs.replace(config.arm, joints=joints))
 
 
 def _joints(runs: Sequence[Run], names: Sequence[str]) -> dict[str, Joint]:
@@ -253,28 +253,28 @@ def _motion(source: Source) -> Motion:
 def _latencies(
     runs: Sequence[Run], found: Mapping[str, Registration], config: FusionConfig, lag: float | None
 ) -> dict[str, Quantity]:
-    """The latency of each sensor [s]: of the one with the surest lag beyond the arm's, of others beside that one.
+    """The latency of each sensor [s]: that of the surest lag beyond the arm's, those of others beside it.
 
-    Where the arm's lag is not known, the earliest sensor has none.
+    Where the arm's lag is not known, the earliest sensor has none. Sensors are compared with one that tells
+    orientations, if there is one: it tells where the points are that others see.
     """
     lags = {name: one.position.lag for name, one in found.items() if one.position is not None and not _as_read(one)}
     if not lags:
         return {}
-    surest = min(lags, key=lambda name: lags[name].ci95[1] - lags[name].ci95[0])
-    beside = {surest: _exactly(0.0)}
-    seen = _placed(config, found, {})
-    in_space = [in_base(run, seen)[0] for run in runs]
-    for name in lags.keys() - {surest}:
-        both = [run for run in in_space if {name, surest} <= run.sensors.keys()]
-        one, other = ([_of_tool(run.sensors[which]) for run in both] for which in (surest, name))
-        told = later(one, other, lags[name].value - lags[surest].value)
-        beside[name] = told or _shifted(lags[name], -lags[surest].value)
+    best = min(lags, key=lambda name: (found[name].rms_rotation is None, _width(lags[name])))
+    beside, placed = {best: _exactly(0.0)}, _placed(config, found, {})
+    for name in lags.keys() - {best}:
+        both = [run for run in runs if {name, best} <= run.sensors.keys()]
+        points = [_of_point(run, best, found[best], placed, name) for run in both]
+        told = later(points, [_in_base(run, name, placed) for run in both], lags[name].value - lags[best].value)
+        beside[name] = told or _sum(lags[name], -lags[best].value)
     if lag is None:
-        earliest = min(one.value for one in beside.values())
-        return {name: _shifted(one, -earliest) for name, one in beside.items()}
-    low, high = _shifted(lags[surest], -lag).ci95
+        first, known = min(beside, key=lambda name: beside[name].value), _exactly(0.0)
+    else:
+        first = min(lags, key=lambda name: _width(lags[name]))
+        known = _sum(lags[first], -lag)
     return {
-        name: Quantity(one.value + lags[surest].value - lag, (one.ci95[0] + low, one.ci95[1] + high))
+        name: known if name == first else _sum(one, known.value - beside[first].value, beside[first], known)
         for name, one in beside.items()
     }
 
@@ -284,13 +284,32 @@ def _as_read(one: Registration) -> bool:
     return any(found.finding in AS_READ for found in one.findings)
 
 
-def _of_tool(source: Source) -> Motion:
-    """What a placed sensor tells of the tool; a row of which the orientation is missing tells nothing."""
-    motion = _measured(source)
-    untold = [np.isnan(source.values[axis]) for axis in TURNING if axis in source.values]
-    if untold:
-        motion = motion._replace(position=np.where(np.any(untold, axis=0)[:, None], np.nan, motion.position))
-    return motion
+def _in_base(run: Run, name: str, config: FusionConfig) -> Motion:
+    """What a placed sensor sees, where it is in the base's frame."""
+    seen = _measured(run.sensors[name]).valid()
+    return seen._replace(position=Placing(config.sensors[name]).seen(seen.position))
+
+
+def _of_point(run: Run, name: str, found: Registration, config: FusionConfig, point: str) -> Motion:
+    """What a placed sensor tells of the point that another one sees, and how the tool is turned, if that is told."""
+    seen, placing = _in_base(run, name, config), Placing(config.sensors[name])
+    if seen.quaternion is not None and found.rms_rotation is not None:
+        turned = placing.oriented(seen.quaternion)
+    else:
+        turned = _commanded(run, seen.time, found)
+    if turned is None:
+        return seen._replace(quaternion=None)
+    lever = Placing(config.sensors[point]).lever(turned) - placing.lever(turned)
+    return Motion(seen.time, seen.position + lever, turned)
+
+
+def _commanded(run: Run, time: FloatArray, found: Registration) -> FloatArray | None:
+    """How the commands have turned the tool when a sensor measures, as quaternions; None where they do not tell."""
+    command, response = _motion(run.command).valid(), found.rotation or found.position
+    if command.quaternion is None or response is None:
+        return None
+    plant = Plant(response.delay.value, response.time_constant.value)
+    return Answer([command], [time]).quaternions(plant)
 
 
 def _lag(arm: ArmModel) -> float:
@@ -321,8 +340,14 @@ def _exactly(value: float) -> Quantity:
     return Quantity(value, (value, value))
 
 
-def _shifted(one: Quantity, by: float) -> Quantity:
-    return Quantity(one.value + by, (one.ci95[0] + by, one.ci95[1] + by))
+def _width(one: Quantity) -> float:
+    return one.ci95[1] - one.ci95[0]
+
+
+def _sum(one: Quantity, by: float, *unsure: Quantity) -> Quantity:
+    """A number moved by another one, which is as unsure as some others are together."""
+    value, half = one.value + by, 0.5 * sum(map(_width, (one, *unsure)))
+    return Quantity(value, (value - half, value + half))
 
 
 def _without_place(one: Registration) -> Registration:
@@ -334,8 +359,7 @@ def _measured(source: Source) -> Motion:
     """What a sensor tells, without what is no news: values that it repeats, and zeros, as it writes them when lost."""
     motion = _motion(source)
     again = (np.diff(motion.position, axis=0, prepend=np.nan) == 0.0).all(axis=1)
-    lost = (motion.position == 0.0).all(axis=1)
-    return motion._replace(position=np.where((again | lost)[:, None], np.nan, motion.position))
+    return motion._replace(position=np.where((again | lost(motion.position))[:, None], np.nan, motion.position))
 
 
 def _details(one: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:

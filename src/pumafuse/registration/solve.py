@@ -15,19 +15,19 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray, median
 from ..space.rotations import crossed
+from .intervals import Blocks, blocks, inverse
 from .motion import Answer, Plant, Poses
 
 ROTATION, CENTRE, MARKER, TURN, SCALE, POSITION, ANGLE = (
     slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 13), slice(13, 15), slice(15, 17)
 )  # fmt: skip  # of a step: delay and log τ in the last two
 SIZE = 17
-_CAUCHY = 3.0  # standard deviations from which a row counts half
-_MEDIAN = 1.5382  # of the length of three standard normal deviates
+CAUCHY = 3.0  # standard deviations from which a row counts half
+MEDIAN = 1.5382  # of the length of three standard normal deviates
 _LEAST = 1e-9  # m or rad: rounding
 _STEPS = 50  # at most
 _HALVED = 6  # times that a step which leads up is halved
 _ENOUGH = 1e-8  # of the sum per row: a step that gains less is the last
-_SINGULAR = 1e-11  # of the largest eigenvalue: what is smaller is not told by the rows
 _SHORTEST, _LONGEST = 1e-3, 2.0  # s, of a time constant
 _FASTEST = 0.3  # s, by which a dead time changes in a step at most; τ and scale change by a factor of e
 
@@ -99,7 +99,7 @@ class Off(NamedTuple):
 
     def noise(self) -> FloatArray:
         """The standard deviation of each block, by the median."""
-        return np.array([max(median(_length(one)) / _MEDIAN, _LEAST) for one in self.blocks])
+        return np.array([max(median(_length(one)) / MEDIAN, _LEAST) for one in self.blocks])
 
     def rms(self) -> list[float]:
         """Of each block, over rows that are within ten medians."""
@@ -110,7 +110,7 @@ class Off(NamedTuple):
     def cost(self, noise: FloatArray) -> float:
         """Cauchy's sum."""
         pairs = zip(self.blocks, noise.tolist(), strict=True)
-        return float(sum(np.log1p((_length(one) / (_CAUCHY * sd)) ** 2).sum() for one, sd in pairs))
+        return float(sum(np.log1p((_length(one) / (CAUCHY * sd)) ** 2).sum() for one, sd in pairs))
 
 
 class Fit(NamedTuple):
@@ -119,16 +119,22 @@ class Fit(NamedTuple):
     Attributes:
         state: What was looked for.
         off: How far each row is off.
-        influence: By how much each row moves each number of a step, (n, 17): their sums are 0.
+        free: The steps that are allowed, as columns, (17, k).
+        told: What blocks of rows tell of them.
     """
 
     state: State
     off: Off
-    influence: FloatArray
+    free: FloatArray
+    told: Blocks
 
     def left(self) -> float:
         """The standard deviation of positions [m]."""
         return float(self.off.noise()[0])
+
+    def half_widths(self, numbers: FloatArray) -> FloatArray:
+        """Half the 95 % interval of numbers that change so with a step, (q, 17) → (q,)."""
+        return self.told.half_widths(numbers @ self.free)
 
 
 def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
@@ -142,22 +148,15 @@ def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
     off = residual(rows, state)
     for _ in range(_STEPS):
         noise = off.noise()
-        information, score = _normal(rows, state, off, noise, free, expected=False)
-        total = score.sum(axis=0)
-        step = -_inverse(information) @ total
-        if -(total @ step) < _ENOUGH * len(score):
+        information, score = (one.sum(axis=0) for one in _normal(rows, state, off, noise, free, expected=False))
+        step = -inverse(information) @ score
+        if -(score @ step) < _ENOUGH * len(rows.centred):
             break
         better = _better(rows, state, free @ step, off.cost(noise), noise)
         if better is None:
             break
         state, off = better
-    return Fit(state, off, influence(rows, state, off, free))
-
-
-def influence(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArray:
-    """By how much each row moves each number of a step, (n, 17), at the least squares; their sum leads there."""
-    information, score = _normal(rows, state, off, off.noise(), free, expected=True)
-    return -score @ _inverse(information) @ free.T
+    return Fit(state, off, free, _normal(rows, state, off, off.noise(), free, expected=True))
 
 
 def residual(rows: Rows, state: State) -> Off:
@@ -182,35 +181,34 @@ def _better(rows: Rows, state: State, step: FloatArray, cost: float, noise: Floa
     return None
 
 
-def _normal(
-    rows: Rows, state: State, off: Off, noise: FloatArray, free: FloatArray, *, expected: bool
-) -> tuple[FloatArray, FloatArray]:
-    """The information of the free steps, (k, k), and each row's slope of half the sum, (n, k).
+def _normal(rows: Rows, state: State, off: Off, noise: FloatArray, free: FloatArray, *, expected: bool) -> Blocks:
+    """The information of the free steps and the slope of half the sum, of each block of rows.
 
     Args:
         rows: What was measured.
         state: Where.
         off: How far rows are off there.
-        noise: Of each block.
+        noise: Of each block of the residual.
         free: The steps that are allowed.
         expected: Whether the information is that of Cauchy's curvature, of which intervals are made, or the larger one
             of Gauss and Newton, which leads down more safely.
     """
-    information, score = 0.0, 0.0
+    parts = list[Blocks]()
     for slope, one, sd in zip(slopes(rows, state, off.poses), off.blocks, noise.tolist(), strict=True):
-        inner = slope @ free
-        far, weight = weights(one, sd)
-        curved = weight * (1.0 - 2.0 / 3.0 * far / (1.0 + far)) if expected else weight
-        flat = inner.reshape(-1, inner.shape[-1])
-        information = information + (flat * np.repeat(curved, 3)[:, None]).T @ flat
-        score = score + np.matmul((one * weight[:, None])[:, None], inner)[:, 0]
-    return np.asarray(information), np.asarray(score)
+        weight = weights(_length(one), sd)
+        told = curvature(weight) if expected else weight
+        parts.append(blocks(slope @ free, one, told / sd**2, weight / sd**2))
+    return Blocks(*(np.sum(one, axis=0) for one in zip(*parts, strict=True)))
 
 
-def weights(off: FloatArray, sd: float) -> tuple[FloatArray, FloatArray]:
-    """The square of how far rows are off, of 1 where they count half, and how much each counts [1/sd²], (n,) both."""
-    far = (_length(off) / (_CAUCHY * sd)) ** 2
-    return far, 1.0 / ((1.0 + far) * sd**2)
+def weights(length: FloatArray, sd: float) -> FloatArray:
+    """By how much rows count that are so far off, by Cauchy's distribution, (n,)."""
+    return 1.0 / (1.0 + (length / (CAUCHY * sd)) ** 2)
+
+
+def curvature(weight: FloatArray) -> FloatArray:
+    """By how much rows count for the curvature: the mean over the directions in which they may be off, (n,)."""
+    return weight * (1.0 + 2.0 * weight) / 3.0
 
 
 def slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
@@ -232,12 +230,6 @@ def slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
     angle[:, :, TURN] = state.rotation @ rows.turned @ state.turn.T
     angle[:, :, ANGLE] = np.stack(turned, axis=-1)
     return [place, angle]
-
-
-def _inverse(information: FloatArray) -> FloatArray:
-    """Of a matrix whose numbers have units of their own; what rows do not tell does not move."""
-    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    return np.linalg.pinv(information / np.outer(size, size), rcond=_SINGULAR, hermitian=True) / np.outer(size, size)
 
 
 def _length(vectors: FloatArray) -> FloatArray:

@@ -23,6 +23,7 @@ _QUIET = 0.99  # quantile at which speeds are cut off: a jump must not decide
 _FAST = 0.8  # quantile of speeds
 _STANDS = 1e-9  # m
 _MOVED = 1e-3  # m, within a window
+_LEVER = 0.1  # m, about, from a tool point to what is seen: a tool that turns in place moves it
 _OUTLIER = 5  # rows of a running median
 _APART = (0.09, 0.21, 0.37)  # of all rows: between orientations that are compared
 _HALF_TURN = 2.6  # rad, beyond which the axis of a rotation may point either way
@@ -57,8 +58,7 @@ def rough(command: Sequence[Motion], sensor: Sequence[Motion]) -> Rough:
                     left, right = _beside(pairs, lag)
                     alike = _correlation(left, right)
                     if alike > best.correlation:
-                        lengths = [(a[0], b[0], at) for a, b, at in zip(told, seen, starts, strict=True)]
-                        best = Rough(lag * _TICK, _ratio(*_beside(lengths, lag)), alike)
+                        best = Rough(lag * _TICK, _ratio(told, seen, starts, lag), alike)
     return best
 
 
@@ -97,12 +97,16 @@ def _beside(pairs: Sequence[tuple[FloatArray, FloatArray, int]], lag: int) -> tu
     return np.concatenate(left), np.concatenate(right)
 
 
-def _ratio(told: FloatArray, seen: FloatArray) -> float:
-    """Of two speeds where the tool is fast; NaN where it keeps its place."""
-    fast = told >= np.quantile(told, _FAST)
-    if median(told[fast]) < _MOVED:
+def _ratio(told: Sequence[list[FloatArray]], seen: Sequence[list[FloatArray]], starts: list[int], lag: int) -> float:
+    """How far a marker should go, over how far it is seen to, where the tool is fast; NaN where it keeps its place."""
+    moved, distance = _beside([(a[0], b[0], at) for a, b, at in zip(told, seen, starts, strict=True)], lag)
+    fast = moved >= np.quantile(moved, _FAST)
+    if median(moved[fast]) < _MOVED:
         return np.nan
-    return median(told[fast]) / max(median(seen[fast]), _STANDS)
+    if all(len(one) > 1 for one in told):
+        turned = _beside([(a[1], b[0], at) for a, b, at in zip(told, seen, starts, strict=True)], lag)[0]
+        moved = np.hypot(moved, _LEVER * turned)
+    return median(moved[fast]) / max(median(distance[fast]), _STANDS)
 
 
 def _correlation(one: FloatArray, other: FloatArray) -> float:
