@@ -9,16 +9,22 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import psutil
 import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 import pumafuse as pf
+import turning
+from pumafuse.fusion.placing import with_tool
+from pumafuse.live.stream import Stream
 from pumafuse.live.wire import Event
+from pumafuse.views import colours, live_drawer, live_viewer
 from pumafuse.views import live as live_view
-from pumafuse.views import live_drawer, live_viewer
 from pumafuse.views.live import Frame, LiveView, SensorHead
-from recordings import series
+from recordings import columns, series
 
 AXES = ("tangential", "radial", "vertical")
 SENSORS = {
@@ -123,8 +129,8 @@ def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Pa
     driven.go(60)
     read = driven.view._health_read
     until(lambda: driven.tick() or driven.view._health_read > read)
-    driven.view.close()
-    until(lambda: len(series(path, "/radial/estimate")[0]) == 60)
+    until(lambda: len(series(path, "/radial/estimate")[0]) == 60 and len(series(path, "/nis/tracker")[0]))
+    driven.view.close()  # not before all has arrived: it waits for no longer than 2 s
     time_, value = series(path, "/radial/command")
     assert np.allclose(time_, 0.028 * np.arange(60), atol=1e-6)
     assert np.allclose(value, 500.0)
@@ -141,6 +147,64 @@ def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Pa
     assert np.allclose(series(path, "/radial/range")[1], 500.0, atol=0.5)
     assert np.all(np.abs(series(path, "/residual/radial/range")[1]) < 0.5)
     assert len(series(path, "/nis/tracker")[0])
+
+
+def newest(path: Path, entity: str, component: str, *, static: bool = False) -> np.ndarray:
+    """The last value of a component that has arrived, (n, …)."""
+    return np.array(
+        [one[component].to_pylist()[-1] for one in columns(path, entity, static=static) if component in one][-1]
+    )
+
+
+def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(
+    recorder: tuple[subprocess.Popen[bytes], Path], tmp_path: Path
+) -> None:
+    """Its newest pose, its ellipsoid of 95 % ten times as large, the camera in the cell and its marker on the tool.
+
+    Measurements lie at frame · z − R · marker with R of the same row; one that was rejected is red.
+    """
+    config = with_tool(pf.FusionConfig.load(turning.configured(tmp_path)), turning.recorded())
+    camera = msgspec.structs.replace(config.sensors["camera"], gate=8.0)
+    config = msgspec.structs.replace(config, sensors={"camera": camera})
+    given = turning.sources()
+    given["camera"] = tuple(one[:290] for one in given["camera"])  # a path has 300 points; more would be thinned out
+    given["camera"][1][200] += 0.1
+    events = [
+        Event(float(t), "" if name == "command" else name, dict(zip("xyz", point, strict=True)) | {"orientation": turn})
+        for name in ("command", "camera")
+        for t, point, turn in zip(given[name][0], given[name][1], given[name][2].as_quat(), strict=True)
+    ]
+    notices, lines = list[str](), list[bytes]()
+    live, view, path = pf.LiveEstimator(config), LiveView("connect", config, notices.append), recorder[1]
+    until(lambda: view.tick(live.health) or any("drawing into" in line for line in notices))
+    Stream(live, lines.extend, notices.append, watchers=[view]).take(sorted(events, key=lambda event: event.t))
+    seen = "/path/measured/camera"
+    until(lambda: view.tick(live.health) or columns(path, seen))
+    view.close()
+
+    now = msgspec.json.decode(lines[-1])
+    point, sd = (np.array([now[axis][of] for axis in "xyz"]) for of in ("position_mm", "sd_mm"))
+    assert np.allclose(newest(path, "/path/tool", "Transform3D:translation")[0], point, atol=1e-3)
+    turned = Rotation.from_quat(newest(path, "/path/tool", "Transform3D:quaternion")[0])
+    assert (turned * Rotation.from_quat(now["q"]).inv()).magnitude() < 1e-6
+    half = newest(path, "/path/uncertainty", "Transform3D:mat3x3")[0].reshape(3, 3)
+    assert np.allclose(half, np.diag(10.0 * np.sqrt(chi2.ppf(0.95, 3)) * sd), rtol=1e-5)
+    for entity, at, placed in (
+        ("/path/sensors/camera", turning.CORNER, turning.CORNER_TURNED),
+        ("/path/tool/markers/camera", turning.MARKER, turning.MARKER_TURNED),
+    ):
+        assert np.allclose(newest(path, entity, "Transform3D:translation", static=True), at * 1e3, atol=1e-3)
+        found = Rotation.from_quat(newest(path, entity, "Transform3D:quaternion", static=True)[0])
+        assert (found * placed.inv()).magnitude() < 1e-6
+
+    _, z, turn = given["camera"]
+    lever = (turning.CORNER_TURNED * turn * turning.MARKER_TURNED.inv()).apply(turning.MARKER)
+    wanted = 1e3 * (turning.CORNER + turning.CORNER_TURNED.apply(z) - lever)
+    points = newest(path, seen, "Points3D:positions")
+    nearest = np.linalg.norm(points[:, None] - wanted, axis=2)
+    assert sorted(nearest.argmin(axis=1)) == list(range(290)) and nearest.min(axis=1).max() < 1e-3
+    red = np.array(newest(path, seen, "Points3D:colors")) >> 8 == int(colours.REJECTED[1:], 16)
+    assert nearest.argmin(axis=1)[red].tolist() == [200]
 
 
 def test_a_scaled_measurement_is_where_it_saw_the_tool() -> None:

@@ -18,6 +18,24 @@ from pumafuse.logs.frames import Cylindrical
 from pumafuse.views.rerun import to_rerun
 from recordings import columns, times
 
+VIEWER = Path(sys.executable).parent / "rerun"
+TWO_LINKS = """<robot name="two">
+  <link name="base"/><link name="upper"/><link name="lower"/><link name="tip"/>
+  <joint name="a" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/></joint>
+  <joint name="b" type="revolute"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0.3 0 0"/><axis xyz="0 0 1"/></joint>
+  <joint name="end" type="fixed"><parent link="lower"/><child link="tip"/><origin xyz="0.2 0 0.1"/></joint>
+</robot>"""
+IN_JOINTS = """[robot]
+urdf = "two.urdf"
+base = "base"
+tip = "tip"
+[command]
+file = "joints.csv"
+time = "time_s"
+joints = { a = "a_deg", b = "b_deg" }
+"""
+
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.errors.PumafuseWarning")
 
 
@@ -34,6 +52,11 @@ def numbers(path: Path, entity: str, component: str, *, static: bool = False) ->
     """The values of a component, row by row, (n, …)."""
     chunks = [one for one in columns(path, entity, static=static) if component in one]
     return np.array([row[0] for chunk in chunks for row in chunk[component].to_pylist()])
+
+
+def layout(path: Path) -> str:
+    """A recording as text, with what its layout shows."""
+    return subprocess.run([VIEWER, "rrd", "print", "-vvv", path], capture_output=True, text=True, check=True).stdout
 
 
 def test_the_tool_is_where_the_pose_is(fused: tuple[pf.Estimates, Path]) -> None:
@@ -90,11 +113,40 @@ def test_a_sensor_stands_in_the_scene_and_its_marker_on_the_tool(fused: tuple[pf
         assert numbers(path, entity, "Points3D:labels", static=True).tolist() == ["camera"]
 
 
+def test_a_robot_whose_joints_are_commanded_moves(tmp_path: Path) -> None:
+    """A line through its links, worked out by hand for two in a plane, at 2500 of 5000 commands; in a view of the cell.
+
+    Without joints there is none.
+    """
+    time = 0.02 * np.arange(5000)
+    a, b = 40.0 + 30.0 * np.sin(0.5 * time), -20.0 + 40.0 * np.cos(0.8 * time)
+    rows = np.column_stack([time, a, b])
+    np.savetxt(tmp_path / "joints.csv", rows, "%.9f", ",", header="time_s,a_deg,b_deg", comments="")
+    (tmp_path / "two.urdf").write_text(TWO_LINKS)
+    (tmp_path / "run.toml").write_text(IN_JOINTS)
+    run = pf.Run.read(tmp_path)
+    config = pf.FusionConfig(arm=pf.FusionConfig.load(turning.configured(tmp_path)).arm)
+    to_rerun(pf.fuse(run, config), run, tmp_path / "fused.rrd")
+    found = columns(tmp_path / "fused.rrd", "/path/robot")
+    upper, both = np.radians(a), np.radians(a + b)
+    elbow = 300.0 * np.column_stack([np.cos(upper), np.sin(upper), 0.0 * upper])
+    tip = elbow + np.column_stack([200.0 * np.cos(both), 200.0 * np.sin(both), 100.0 + 0.0 * both])
+    wanted = np.stack([0.0 * elbow, 0.0 * elbow, elbow, tip], axis=1)
+    assert np.allclose(times(found), time[::2], atol=1e-8, rtol=0)
+    np.testing.assert_allclose(
+        numbers(tmp_path / "fused.rrd", "/path/robot", "LineStrips3D:strips"), wanted[::2], atol=1e-3
+    )
+    assert "cell [mm]" in layout(tmp_path / "fused.rrd")
+
+    still = replace(run, command=replace(run.command, joints=None))
+    to_rerun(pf.fuse(still, config), still, tmp_path / "still.rrd")
+    assert not columns(tmp_path / "still.rrd", "/path/robot") and "cell [mm]" not in layout(tmp_path / "still.rrd")
+
+
 def test_the_layout_opens_on_the_tool_and_the_cell(fused: tuple[pf.Estimates, Path]) -> None:
     """A view of each, tabs of six axes, and a file that the viewer accepts."""
     _, path = fused
-    viewer = Path(sys.executable).parent / "rerun"
-    subprocess.run([viewer, "rrd", "verify", path], capture_output=True, check=True)
-    shown = subprocess.run([viewer, "rrd", "print", "-vvv", path], capture_output=True, text=True, check=True).stdout
+    subprocess.run([VIEWER, "rrd", "verify", path], capture_output=True, check=True)
+    shown = layout(path)
     for name in ("tool [mm]; where it is with 95 %", "cell [mm]", "positions", "rx [deg]", "outcomes"):
         assert name in shown

@@ -7,9 +7,10 @@ a frame that does not fit into the pipe is left out.
 Entities: ``<axis>/command``, ``/estimate`` with its variance, ``/<sensor>`` and ``/<sensor>/rejected``;
 ``residual/<axis>/<sensor>``, the measurement minus the estimate, about ``residual/<axis>/estimate``, 0 with the
 estimate's variance; ``path/command``, ``path/estimate``, ``path/tool`` in 3D, and with a frame ``path/<sensor>``;
-``nis/<sensor>``, ``rate/<sensor>``. All against seconds since the first event, positions in mm or degrees. With a
-frame, commands and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its mean distance from
-the estimate.
+``nis/<sensor>``, ``rate/<sensor>``. Of a tool that turns ``path`` has the entities of a recorded result
+(:mod:`pumafuse.views.scene`). All against seconds since the first event, positions in mm or degrees. With a frame,
+commands and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its mean distance from the
+estimate.
 """
 
 from __future__ import annotations
@@ -27,8 +28,10 @@ import msgspec
 
 from ..errors import ConfigError
 from ..filter.outcome import Outcome
+from ..fusion.config import Placement, Vector
 from ..live.results import COMPARED
 from ..logs.frames import CARTESIAN, in_space
+from ..space.rotations import TURNING
 from ..units import Kind
 
 if TYPE_CHECKING:
@@ -51,11 +54,15 @@ class SensorHead(msgspec.Struct):
         scale: Of the position in the measurement.
         latency: [s].
         biased: Whether a constant bias must be found first.
+        frame: Where the sensor stands, if it has a frame of its own.
+        marker: What it sees on the tool, if that is not the tool point.
     """
 
     scale: float
     latency: float
     biased: bool
+    frame: Placement | None = None
+    marker: Placement | None = None
 
 
 class Header(msgspec.Struct):
@@ -65,6 +72,7 @@ class Header(msgspec.Struct):
         mode: ``spawn``, ``connect`` or ``web``.
         axes: The arm's, in their order, and whether each is a length or an angle.
         space: The three axes, or x, y, z, that are a position in space; empty without.
+        tool: Of a tool that turns the orientation at which rx, ry, rz are 0, a rotation vector [rad].
         sensors: By name.
         port: Where the viewer listens.
         web_port: Where its page is served.
@@ -73,6 +81,7 @@ class Header(msgspec.Struct):
     mode: str
     axes: dict[str, Kind]
     space: tuple[str, ...]
+    tool: Vector | None
     sensors: dict[str, SensorHead]
     port: int
     web_port: int
@@ -119,10 +128,12 @@ class LiveView:
             if any(sensor.bias_sd_of(axis) > 0.0 for axis in config.arm.axes)
         }
         unbiased = {name for name, sensor in config.sensors.items() if sensor.scale == 1.0 and name not in biased}
-        self._in_space = {
+        turns = {*CARTESIAN, *TURNING} <= config.arm.axes.keys()
+        tool = config.tool.reference if turns and config.tool is not None else None
+        self._in_space = {  # sources that are drawn as positions in space; of a tool that turns the drawer makes these
             "",
-            *(unbiased if self._space == CARTESIAN else ()),
-        }  # sources that are drawn as positions in space
+            *(unbiased if self._space == CARTESIAN and tool is None else ()),
+        }
         self._origin: float | None = None
         self._newest = 0.0
         self._segments = 1
@@ -133,9 +144,10 @@ class LiveView:
         self._child: subprocess.Popen[bytes] | None
         self._child, self._stdin, self._stdout = _start()
         sensors = {
-            name: SensorHead(sensor.scale, sensor.latency, name in biased) for name, sensor in config.sensors.items()
+            name: SensorHead(sensor.scale, sensor.latency, name in biased, sensor.frame, sensor.marker)
+            for name, sensor in config.sensors.items()
         }
-        self._write(Header(mode, config.arm.kind_of, self._space, sensors, PORT, WEB_PORT))
+        self._write(Header(mode, config.arm.kind_of, self._space, tool, sensors, PORT, WEB_PORT))
 
     def event(self, event: Event, result: UpdateResult) -> None:
         """Take in an event and what became of it."""

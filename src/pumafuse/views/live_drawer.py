@@ -13,17 +13,23 @@ import queue
 import sys
 import threading
 import uuid
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from ..arrays import FloatArray
+from ..arrays import BoolArray, FloatArray
+from ..fusion.config import Vector
+from ..logs.frames import CARTESIAN
+from ..space import rotations
+from ..space.rotations import TURNING
 from ..units import MM, SCREEN, Screen
-from . import colours, styles
+from . import colours, scene, styles
 from .live import Frame, Header, SensorHead
 from .live_viewer import Viewer
+from .sink import Sink
 
 _WAITING = 20  # frames
 _LAST = 1.0  # s for the last frames
@@ -35,6 +41,8 @@ _MOST_KEPT = 20_000  # estimates, or measurements that wait for them
 _LONGEST_GAP = 0.25  # s between estimates; in a longer one the arm may have gone anywhere
 _PATH_POINTS = 300
 _AVERAGED = 1000  # measurements that a bias is averaged over
+_AXES = 0.1  # m: a tenth of the way from the eye to the tool, whose axes are so long
+_LARGER = 10.0  # times: an ellipsoid of some tenths of a millimetre is seen then, one of a centimetre fits in
 
 
 class Picture:
@@ -56,6 +64,7 @@ class Picture:
             for name, sensor in header.sensors.items()
         }
         self._paths: dict[str, Recent] = {}
+        self._tool = None if header.tool is None else Tool(stream, header, header.tool, self._estimates)
         stream.send_blueprint(_blueprint(header))
         self._of_sensors = colours.sensor_colours(list(header.sensors))
         self._colours = {"command": colours.COMMAND, "estimate": colours.ESTIMATE, **self._of_sensors}
@@ -71,9 +80,11 @@ class Picture:
             known.add(estimates)
             self._band(f"{axis}/estimate", "estimate ± sd", time, position * scale, sd * scale, axis)
             self._band(f"residual/{axis}/estimate", "estimate's sd", time, np.zeros(len(time)), sd * scale, axis)
+        taken: dict[tuple[str, str], FloatArray] = {}
         for (axis, name), residuals in self._residuals.items():
             residuals.add(_columns(frame, f"measurement/{axis}/{name}", 3))
             time, position, residual, rejected = residuals.take()
+            taken[axis, name] = np.array([time, position, rejected], dtype=np.float64)
             screen, fused = self._screens[axis], ~rejected
             shown = self._estimates[axis].clip(position, screen)
             points, crosses = (
@@ -89,6 +100,10 @@ class Picture:
                 self._plot(path, styles.line(colour, name), *_columns(frame, path, 2))
         for name, colour in self._colours.items():
             self._draw_path(name, colour, _columns(frame, f"path/{name}", 4))
+        if self._tool is not None:
+            self._tool.draw()
+            for name, colour in self._of_sensors.items():
+                self._tool.draw_seen(name, colour, [taken[axis, name] for axis in CARTESIAN])
 
     def _draw_path(self, name: str, colour: str, rows: FloatArray) -> None:
         """The last seconds of a path; measurements as points. A negative radius is in points of the screen."""
@@ -96,18 +111,20 @@ class Picture:
         if not rows.size:
             return
         if not self._paths:
-            self._stream.send_blueprint(_blueprint(self._header, rows[1:, 0] * MM))
+            self._stream.send_blueprint(_blueprint(self._header, rows[1:, 0]))
+            if self._tool is not None:
+                self._tool.place_sensors(rows[1:, 0])
         path = self._paths.setdefault(name, Recent(4))
         path.add(rows)
         strip, rgb = path.rows[1:].T * MM, colours.rgb(colour)
-        thinned = strip[:: -(1 + len(strip) // _PATH_POINTS)]  # the newest is among them
+        thinned = _thinned(strip)
         self._stream.set_time(styles.TIMELINE, duration=float(rows[0, -1]))
         if name in self._header.sensors:
             self._stream.log(f"path/{name}", rr.Points3D(thinned, colors=[rgb], radii=-1.0))
         else:
             width = -0.7 if name == "command" else -1.2
             self._stream.log(f"path/{name}", rr.LineStrips3D([thinned], colors=[rgb], radii=width))
-        if name == "estimate":
+        if name == "estimate" and self._tool is None:
             tool = rr.Points3D(strip[-1:], colors=[colours.rgb(colours.REJECTED)], radii=-5.0)
             self._stream.log("path/tool", tool)
 
@@ -128,6 +145,61 @@ class Picture:
             self._styled.add(path)
             self._stream.log(path, style, static=True)
         rr.send_columns(path, styles.timeline(time), columns, recording=self._stream)
+
+
+class Tool:
+    """A tool that turns, what sensors see of it, and where they stand, as a recorded result has it."""
+
+    def __init__(
+        self, stream: rr.RecordingStream, header: Header, reference: Vector, estimates: Mapping[str, Recent]
+    ) -> None:
+        """Send how it looks.
+
+        Args:
+            stream: Connected.
+            header: The sensors.
+            reference: The orientation at which rx, ry, rz are 0, a rotation vector [rad].
+            estimates: Of each axis, as they are when it is drawn.
+        """
+        self._sink, self._sensors = Sink(stream), header.sensors
+        self._reference, self._estimates = np.array(reference), estimates
+        self._seen = {name: Recent(5) for name in header.sensors}
+        scene.send_look(self._sink, _AXES, _LARGER)
+
+    def place_sensors(self, point: FloatArray) -> None:
+        """Send where the sensors stand and what they see, as the tool is about at a point [m], (3,)."""
+        for name, colour in colours.sensor_colours(list(self._sensors)).items():
+            scene.send_placed(self._sink, name, self._sensors[name], colour, point, _AXES)
+
+    def draw(self) -> None:
+        """Send the newest estimate, with its ellipsoid."""
+        if not all(self._estimates[axis].rows.size for axis in (*CARTESIAN, *TURNING)):
+            return
+        lengths, angles = ([self._estimates[axis].rows for axis in axes] for axes in (CARTESIAN, TURNING))
+        point, turn = (np.array([[rows[1, -1] for rows in axes]]) for axes in (lengths, angles))
+        turned, root = rotations.quaternions(turn, self._reference), np.diag([rows[2, -1] for rows in lengths])
+        scene.send_tool(self._sink, lengths[0][0, -1:], point, turned, root[None], _LARGER)
+
+    def draw_seen(self, name: str, colour: str, taken: Sequence[FloatArray]) -> None:
+        """Send where the last seconds of a sensor's measurements put the tool.
+
+        Args:
+            name: Of the sensor.
+            colour: Of the sensor.
+            taken: Of x, y and z what is new: valid times [s], positions [m] and which were rejected, (3, n) each.
+        """
+        shared = scene.in_all([time for time, _, _ in taken])
+        if not len(shared[0]):
+            return
+        axes = [axis[:, row] for axis, row in zip(taken, shared, strict=True)]
+        seen = self._seen[name]
+        seen.add(np.array([axes[0][0], *(axis[1] for axis in axes), np.max([axis[2] for axis in axes], axis=0)]))
+        rows, flag = seen.rows[1:4].T, seen.rows[4] > 0.0
+        fused, rejected = _thinned(rows[~flag]), _thinned(rows[flag])  # each by itself: few are rejected
+        red = np.repeat([False, True], [len(fused), len(rejected)])
+        points = scene.seen(np.concatenate([fused, rejected]) * MM, red, colour)
+        self._sink.stream.set_time(styles.TIMELINE, duration=float(seen.rows[0, -1]))
+        self._sink.stream.log(scene.measured(name), points)
 
 
 class Recent:
@@ -179,7 +251,7 @@ class Residuals:
         rows = np.array([stamp - self._sensor.latency, value / self._sensor.scale, rejected])
         self._waiting = np.concatenate([self._waiting, rows], axis=1)[:, -_MOST_KEPT:]
 
-    def take(self) -> tuple[FloatArray, FloatArray, FloatArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    def take(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Valid times [s], positions, positions less the estimate [SI], and which were rejected."""
         if self._estimates.rows.shape[1] < 2:
             return np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.bool_)
@@ -193,39 +265,72 @@ class Residuals:
         return time, position - self._bias, residual - self._bias, rejected
 
 
+def _thinned(rows: FloatArray) -> FloatArray:
+    """As many rows as a path needs, the newest among them."""
+    return rows[:: -(1 + len(rows) // _PATH_POINTS)]
+
+
 def _columns(frame: Frame, name: str, width: int) -> FloatArray:
     """The columns of the rows of a name, (width, n)."""
     return np.array(frame.get(name, ()), dtype=np.float64).reshape(-1, width).T
 
 
 def _blueprint(header: Header, first: FloatArray | None = None) -> rrb.Blueprint:
-    """Positions, residuals, and on the right the path and the sensors' health; all follow the newest.
+    """Positions, residuals, the path and the sensors' health; all follow the newest.
 
     Args:
         header: The axes.
-        first: Where the path begins [mm], (3,).
+        first: Where the path begins [m], (3,).
     """
     units = {axis: SCREEN[kind].unit for axis, kind in header.axes.items()}
     first_axis = next(iter(units))
-    positions = [_plot(f"/{axis}", f"{axis} [{unit}]", legend=axis == first_axis) for axis, unit in units.items()]
-    residuals = [
-        _plot(f"/residual/{axis}", f"{axis}: measurement − estimate [{unit}]", legend=False)
+    positions = {axis: _plot(f"/{axis}", f"{axis} [{unit}]", legend=axis == first_axis) for axis, unit in units.items()}
+    residuals = {
+        axis: _plot(f"/residual/{axis}", f"{axis}: measurement − estimate [{unit}]", legend=False)
         for axis, unit in units.items()
-    ]
-    health = [("/nis", "NIS [1 as configured]"), ("/rate", "measurements [Hz]")]
-    right: rrb.Container = rrb.Tabs(*(_plot(origin, name, legend=True) for origin, name in health))
-    if header.space:
-        # The eye is where the arm's usual reach fits in; of itself it would stay as near as it began.
-        eye = None if first is None else rrb.EyeControls3D(position=first + _EYE, look_target=first, eye_up=(0, 0, 1))
-        name = f"path of the last {_SHOWN:.0f} s [mm]"
-        path = rrb.Spatial3DView(origin="/path", name=name, line_grid=False, eye_controls=eye)
-        right = rrb.Vertical(path, right, row_shares=[3, 2])
+    }
+    names = {"/nis": "NIS [1 as configured]", "/rate": "measurements [Hz]"}
+    health = [_plot(origin, name, legend=True) for origin, name in names.items()]
+    if header.tool is not None:
+        layout = _of_turning(header, first, positions, residuals, health)
+    else:
+        right: rrb.Container = rrb.Tabs(*health)
+        if header.space:
+            name = f"path of the last {_SHOWN:.0f} s [mm]"
+            path = rrb.Spatial3DView(origin="/path", name=name, line_grid=False, eye_controls=_eye(first))
+            right = rrb.Vertical(path, right, row_shares=[3, 2])
+        left, middle = rrb.Vertical(*positions.values()), rrb.Vertical(*residuals.values())
+        layout = rrb.Horizontal(left, middle, right, column_shares=[4, 3, 3])
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(*positions), rrb.Vertical(*residuals), right, column_shares=[4, 3, 3]),
+        layout,
         rrb.TimePanel(state="collapsed", timeline=styles.TIMELINE, play_state="following"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
+
+
+def _of_turning(
+    header: Header,
+    first: FloatArray | None,
+    positions: Mapping[str, rrb.View],
+    residuals: Mapping[str, rrb.View],
+    health: Sequence[rrb.View],
+) -> rrb.Container:
+    """The scene on the left, as of a recorded result; on the right tabs of plots, those of positions in front."""
+    frames = [sensor.frame for sensor in header.sensors.values()]
+    cell = None if first is None else scene.cell_eye(first[None], frames)
+    views = scene.two_views(f"tool, last {_SHOWN:.0f} s", _LARGER, _eye(first), cell)
+    plots = {"positions": positions, "residuals": residuals}
+    tabs = [scene.by_kind(of_axis, header.axes, name) for name, of_axis in plots.items()]
+    left = rrb.Vertical(*views, row_shares=[5, 3][: len(views)])
+    return rrb.Horizontal(left, rrb.Tabs(*tabs, rrb.Vertical(*health, name="sensors")), column_shares=[1, 1])
+
+
+def _eye(first: FloatArray | None) -> rrb.EyeControls3D | None:
+    """An eye from where the arm's usual reach fits in; of itself it would stay as near as it began."""
+    if first is None:
+        return None
+    return rrb.EyeControls3D(position=first * MM + _EYE, look_target=first * MM, eye_up=[0.0, 0.0, 1.0])
 
 
 def _plot(origin: str, name: str, *, legend: bool) -> rrb.TimeSeriesView:

@@ -28,9 +28,9 @@ from ..fusion.placing import in_base
 from ..logs.entities import Recording
 from ..logs.frames import in_space
 from ..logs.run import Run
-from ..units import KINDS, Screen, seconds
+from ..units import Screen, seconds
 from . import colours, styles
-from .scene import send_scene, views
+from .scene import by_kind, send_scene, views
 from .sink import Sink
 
 _OPENING_S = 4.0
@@ -77,7 +77,7 @@ def recording_of(est: Estimates, run: Run) -> bytes:
         return _layer(est, run, run.recording)
     with rr.RecordingStream("pumafuse") as stream:
         memory = stream.memory_recording()
-        stream.send_blueprint(_blueprint(est), make_active=True)  # a browser follows no other
+        stream.send_blueprint(_blueprint(est, run), make_active=True)  # a browser follows no other
         _send_named(est, run, stream)
         return memory.drain_as_bytes()
 
@@ -192,7 +192,7 @@ def _series(
         sink.columns(path, time[there], rr.Scalars.columns(scalars=value[there] * scale))
 
 
-def _blueprint(est: Estimates) -> rrb.Blueprint:
+def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:
     """A layout that opens on the busiest seconds: positions on the left; the path, residuals and outcomes right.
 
     Of a tool that turns the path has the left side, and positions are beside rotations.
@@ -217,7 +217,9 @@ def _blueprint(est: Estimates) -> rrb.Blueprint:
         residuals.append(_plot(f"/residual/{name}", title, whole, (-limit, limit)))
     layout: rrb.Container = rrb.Grid(*positions, grid_columns=1 if len(positions) < _TWO_COLUMNS else 2)
     if est.turns:
-        return rrb.Blueprint(_of_turning(est, positions, innovations, residuals, whole), collapse_panels=True)
+        return rrb.Blueprint(
+            _of_turning(views(est, run), est, positions, innovations, residuals, whole), collapse_panels=True
+        )
     right, shares = list[rrb.View | rrb.Container](), list[float]()
     if est.cartesian is not None or in_space(est.config.arm):
         right.append(rrb.Spatial3DView(origin="/path", name="path [mm]"))
@@ -232,6 +234,7 @@ def _blueprint(est: Estimates) -> rrb.Blueprint:
 
 
 def _of_turning(
+    scene: Sequence[rrb.View],
     est: Estimates,
     positions: Sequence[rrb.View],
     innovations: Sequence[rrb.View],
@@ -239,14 +242,12 @@ def _of_turning(
     whole: tuple[float, float],
 ) -> rrb.Container:
     """The scene and outcomes on the left; on the right tabs of axes, those of rotations beside those of positions."""
-    kinds = est.config.arm.kind_of
     measured = [axis for axis in est.axes if axis in _measured(est)]
 
     def tab(plots: Sequence[rrb.View], axes: Iterable[str], name: str) -> rrb.Container:
-        sides = [[plot for plot, axis in zip(plots, axes, strict=True) if kinds[axis] == kind] for kind in KINDS]
-        return rrb.Horizontal(*(rrb.Vertical(*side) for side in sides if side), name=name)
+        return by_kind(dict(zip(axes, plots, strict=True)), est.config.arm.kind_of, name)
 
-    left, tabs = list[rrb.View | rrb.Container](views(est)), [tab(positions, est.axes, "positions")]
+    left, tabs = list[rrb.View | rrb.Container](scene), [tab(positions, est.axes, "positions")]
     shares = [5.0, 3.0][: len(left)]
     if innovations:
         tabs += [tab(innovations, measured, "innovations"), tab(residuals, measured, "residuals")]
