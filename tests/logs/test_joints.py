@@ -91,3 +91,14 @@ def test_an_arm_whose_joints_lag_apart_says_where_they_are_not_heeded(tmp_path: 
     np.testing.assert_array_equal(heeded.command.values["x"], run.command.delayed({"j2": 0.03}).values["x"])
     assert [note for note in posed.notes if "j2 30 ms" in note and "not heeded" in note]
     np.testing.assert_array_equal(posed.command.values["x"], run.command.values["x"])
+
+
+def test_a_clock_that_is_set_back_begins_anew(tmp_path: Path) -> None:
+    """What is told after it is later by what was told after it."""
+    command = read(tmp_path, ROBOT + HEAD + JOINTS).command
+    half = len(command.stamp) // 2
+    stamp = command.stamp - np.where(np.arange(len(command.stamp)) < half, 0, 100_000_000_000)
+    whole = replace(command, stamp=stamp).delayed({"j2": 0.05}).joints
+    parts = [command.rows(rows).delayed({"j2": 0.05}).joints for rows in (slice(None, half), slice(half, None))]
+    assert whole is not None
+    np.testing.assert_allclose(whole.values, np.concatenate([part.values for part in parts if part]), atol=1e-12)

@@ -115,11 +115,12 @@ class Source:
         if unknown := next((name for name in later if name not in names), None):
             raise UnknownNameError(f"{self.label}: joints of the arm", "joint", unknown, names)
         known = np.flatnonzero(np.isfinite(told).all(axis=1) & (self.stamp != NO_STAMP))
-        known = known[np.argsort(self.stamp[known], kind="stable")]
-        time = (self.stamp[known] - self.stamp[known[:1]]) / 1e9
-        for name, by in later.items():
-            column = names.index(name)
-            told[known, column] = np.interp(time - by, time, told[known, column])
+        set_back = np.flatnonzero(np.diff(self.stamp[known]) < -_OUT_OF_ORDER_NS) + 1
+        for part in np.split(known, set_back):
+            rows = part[np.argsort(self.stamp[part], kind="stable")]
+            time = (self.stamp[rows] - self.stamp[rows[:1]]) / 1e9
+            for column, by in ((names.index(name), by) for name, by in later.items()):
+                told[rows, column] = np.interp(time - by, time, told[rows, column])
         return self.posed(Joints(self.joints.chain, told))
 
     def ordered(self, axis: str) -> IntArray:
