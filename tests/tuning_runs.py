@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -86,10 +86,14 @@ def spoiled_arm(config: pf.FusionConfig) -> pf.FusionConfig:
 
 
 def free_of(
-    likelihood: Likelihood, config: pf.FusionConfig, fit: Sequence[Fit], *fixed: str, sd_prior: bool = True
+    likelihood: Likelihood,
+    config: pf.FusionConfig,
+    fit: Sequence[Fit],
+    *fixed: str,
+    believed: Mapping[tuple[str, str], float] | None = None,
 ) -> list[Parameter]:
     """The free parameters of a configuration."""
-    return parameters(config, likelihood.config, likelihood.sensors, fit, fixed, sd_prior)
+    return parameters(config, likelihood.config, likelihood.sensors, fit, fixed, believed=believed or {})
 
 
 def fit_stage(

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from pumafuse.filter.response import response
 from pumafuse.tuning.arm_search import ArmSearch, Freedom
-from pumafuse.tuning.arms import Arm, Measured, Recording, Rest
+from pumafuse.tuning.arms import Arm, Measured, Recording
 from pumafuse.tuning.posterior import chosen_model
 
 T = 0.02
@@ -36,7 +36,7 @@ def measured(seed: int, gain: float = 1.0, noise: float = 2e-3) -> Measured:
 @pytest.fixture(scope="module")
 def search() -> ArmSearch:
     freedom = Freedom(Arm(0.0, 0.1), orders=(1,), gains=("given", "static"))
-    return ArmSearch(measured(1), freedom, Rest(np.array([2e-3])), [1e-6])
+    return ArmSearch(measured(1), freedom, [1e-6])
 
 
 def table(search: ArmSearch, gain: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -74,7 +74,7 @@ def test_quantiles_are_those_of_the_integral(search: ArmSearch) -> None:
 @pytest.mark.parametrize(("gain", "kind"), [(1.0, "given"), (0.9, "static"), (0.5, "static"), (2.0, "static")])
 def test_the_simplest_arm_that_is_likely_is_taken(gain: float, kind: str) -> None:
     """First order in all; a gain is found to a hundredth of itself."""
-    found = ArmSearch(measured(2, gain, 2e-3 * gain), Freedom(Arm(0.0, 0.1)), Rest(np.array([1e-3])), [1e-6])
+    found = ArmSearch(measured(2, gain, 2e-3 * gain), Freedom(Arm(0.0, 0.1)), [1e-6])
     mixture = found.posterior.mixture()
     model = chosen_model(mixture)
     assert (model.order, model.gain) == (1, kind)

@@ -113,7 +113,7 @@ def test_what_an_arm_leaves_is_found(number: int, kind: str) -> None:
     one = recording(6, 1500)._replace(time=np.arange(1500) * 20_000_000)
     value = np.random.default_rng(7).multivariate_normal(np.zeros(1500), covariance(one, rest, 1e-3))
     still = one._replace(value=value, command=np.full(100, 0.3))
-    found = list(rests(Measured([still], T, ["a"]), Arm(0.0, 0.1), Rest(np.array([1e-3])), 0.04, [1e-6]))
+    found = list(rests(Measured([still], T, ["a"]), Arm(0.0, 0.1), 0.04, [1e-6]))
     if number:
         assert found[number][1] > found[3 - number][1]
     likely = found[number][0]
@@ -122,20 +122,6 @@ def test_what_an_arm_leaves_is_found(number: int, kind: str) -> None:
         assert likely.walk == pytest.approx(5e-3, rel=0.2)
     else:
         assert (likely.disturbance_sd, likely.disturbance_time) == pytest.approx((0.02, 0.3), rel=0.35)
-
-
-def test_without_a_belief_the_guess_of_the_noise_changes_nothing() -> None:
-    """A thousandth and a thousand times the true noise: the same rest, to the last digit."""
-    measured = Measured([recording(8, 400, 2)], T, ["a", "b"])
-    found = [
-        [one for one, _ in rests(measured, Arm(0.0, 0.1), Rest(np.full(2, guess)), 0.04, [1e-6, 1e-6])]
-        for guess in (1e-5, 10.0)
-    ]
-    for first, second in zip(*found, strict=True):
-        assert np.array_equal(first.sd, second.sd) and (first.walk, first.disturbance_sd) == (
-            second.walk,
-            second.disturbance_sd,
-        )
 
 
 def test_jitter_is_white_noise_beside_a_smooth_motion() -> None:

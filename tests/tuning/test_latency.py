@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -265,3 +268,18 @@ def test_no_interval_ends_at_its_estimate() -> None:
         low, high = one.lag_ci95
         assert low < one.lag < high, name
         assert one.lag - low > 1e-4 and high - one.lag > 1e-4, name  # s
+
+
+def test_no_digit_depends_on_how_a_process_hashes() -> None:
+    """Python orders a set of names anew in each process: the result of two axes is the same to the last digit."""
+    code = f"import pumafuse as pf; print(pf.latency(pf.Run.read({str(EXAMPLES / 'my-run')!r})).to_json())"
+    found = [
+        subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", code],
+            env={**os.environ, "PYTHONHASHSEED": str(seed)},
+            capture_output=True,
+            check=True,
+        ).stdout
+        for seed in (1, 2)
+    ]
+    assert found[0] == found[1]

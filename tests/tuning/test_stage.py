@@ -10,6 +10,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.simulation.true_sensor import Outliers, TrueSensor
+from pumafuse.tuning.arms import BELIEF
 from pumafuse.tuning.intervals import ConfidenceInterval
 from pumafuse.tuning.parameters import with_order
 from pumafuse.tuning.stage import Stage
@@ -56,17 +57,17 @@ def test_a_wrong_latency_is_found(believed: float) -> None:
 
 
 @pytest.mark.long
-def test_intervals_of_latencies_over_40_runs() -> None:
-    """They contain the truth in 88 to 100 %: one standard deviation of a share of 95 % in 40 is 3.4 %.
+def test_intervals_of_latencies_over_80_runs() -> None:
+    """They contain the truth in 90 to 100 %: one standard deviation of a share of 95 % in 80 is 2.4 %.
 
     The mean is within 0.5 ms.
     """
     inside, off = [], []
-    for seed in range(40):
+    for seed in range(80):
         found, interval = wrong_latency(seed, 0.009)
         inside.append(interval.ci95[0] < 0.045 < interval.ci95[1])
         off.append(found.best.config.sensors["vision"].latency - 0.045)
-    assert np.mean(inside) >= 0.88
+    assert np.mean(inside) >= 0.90
     assert abs(np.mean(off)) < 5e-4
 
 
@@ -210,8 +211,7 @@ def test_outliers_do_not_count(seed: int) -> None:
 def test_a_noise_that_is_not_identifiable_is_fixed() -> None:
     """A gauge of a few micrometres, rare beside a camera: its innovations hardly depend on its sd.
 
-    It stays as configured and is named alone. With its prior it is the configured one within a factor of 1.5, and its
-    interval is hardly narrower than the prior's.
+    It stays as configured and is named alone. With its prior it has an interval, of which that prior makes up the most.
     """
     camera_alone = scenario("panel-vision", 0.1, 0.02)
     gauge = TrueSensor(rate=5.0, sd=4e-6)
@@ -227,9 +227,8 @@ def test_a_noise_that_is_not_identifiable_is_fixed() -> None:
     assert list(believed.not_identifiable) == []
     for key, one in intervals_of(believed).items():
         if key in keys:
-            low, high = one.ci95
-            assert numbers(believed)[key] == pytest.approx(5e-3, rel=0.5)
-            assert 0.8 < np.log(high / low) / (2.0 * 1.96 * np.log(1.5)) < 1.1
+            assert not any(one.open)
+            assert 0.5 < np.log(one.ci95[1] / one.ci95[0]) / (2.0 * 1.96 * BELIEF) < 1.1
 
 
 def test_what_is_fixed_stays_to_the_last_bit_and_the_rest_moves() -> None:

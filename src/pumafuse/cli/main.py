@@ -330,7 +330,7 @@ def tune(
     trust: Annotated[str | None, Option(metavar="SENSOR", help="Fit the arm on this accurate sensor first.")] = None,
     validate: Annotated[Path | None, Option(metavar="RUN", help="Default: a single run's last third.")] = None,
     no_sd_prior: Annotated[
-        bool, Option("--no-sd-prior", help="Let a sensor's sd be any; else as configured within a factor of some 1.5.")
+        bool, Option("--no-sd-prior", help="Let a sensor's sd be any; else near what its second differences show.")
     ] = False,
     since: From = None,
     until: To = None,

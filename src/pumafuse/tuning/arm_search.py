@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
+from .arms import SHOWN, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
 from .parameters import QUICKEST, RECOVERY, RECOVERY_PRIOR
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
 from .posterior import (
@@ -97,6 +97,7 @@ class ArmSearch:
     """The arms of an axis: maxima of each model, and the walk from one along the dead time.
 
     Attributes:
+        freedom: What was to be found.
         sensors: By which it is known.
         plain: The arm of least squares; None where nothing moves.
         limits: Where its numbers may lie.
@@ -109,9 +110,8 @@ class ArmSearch:
         self,
         measured: Measured,
         freedom: Freedom,
-        noise: Rest,
         least: Sequence[float],
-        prior: float | None = None,
+        believed: bool = False,
         near: ArmSearch | None = None,
     ) -> None:
         """Search.
@@ -119,12 +119,11 @@ class ArmSearch:
         Args:
             measured: The measurements of the axis.
             freedom: What is to be found.
-            noise: What an arm is believed to leave.
             least: The least noise of each sensor [m].
-            prior: The sd of the logarithm of the sensors' noise about that in ``noise``; None: it is not believed.
+            believed: Whether the sensors' noise is believed to be what second differences show.
             near: What was found on a part of the measurements, to begin from.
         """
-        self._measured, self._freedom, self.sensors = measured, freedom, measured.sensors
+        self._measured, self.freedom, self.sensors = measured, freedom, measured.sensors
         self._longest = longest_delay(measured.period)
         self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
         self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
@@ -134,7 +133,7 @@ class ArmSearch:
         low, high = _USUAL_GAIN
         gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
         self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
-        peaks, branches = self._peaks(noise, least, prior), list[Branch]()
+        peaks, branches = self._peaks(least, believed), list[Branch]()
         for evidence, model, peak in peaks:
             walked = (one for one in branches if one.model == model)
             if evidence > peaks[0][0] - _FORLORN and not any(
@@ -143,6 +142,12 @@ class ArmSearch:
                 highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
                 branches.append(self._walk(model, peak, highest - _FORLORN))
         self.posterior = AxisPosterior(branches)
+
+    @property
+    def likely_noise(self) -> dict[str, float]:
+        """The white noise that each sensor is believed to have [m]."""
+        found = SHOWN * self._measured.jitter(self._best(self._fits).arm)
+        return dict(zip(self.sensors, found.tolist(), strict=True))
 
     @property
     def spread(self) -> float:
@@ -155,12 +160,12 @@ class ArmSearch:
         if delay is None:
             return max(entries, key=lambda one: one.log_density).arm
         near = min(entries, key=lambda one: abs(one.delay - delay)).arm._replace(delay=delay)
-        names = [name for name in self._freedom.names(model) if name != "delay"]
+        names = [name for name in self.freedom.names(model) if name != "delay"]
         return self._measured.fitted(near, names, self.rest, self.limits).arm
 
     def lag_scatter(self, model: Model, arm: Arm) -> float:
         """How much more the lag scatters over pieces of the runs than the information says, 1 or more (White, 1982)."""
-        names = self._freedom.names(model)
+        names = self.freedom.names(model)
         free = [name for name, one in zip(names, self.limits.inside(arm, names), strict=True) if one]
         slope = np.array(
             [(arm.moved([name], [arm.coordinate(name) + _SLOPE]).total - arm.total) / _SLOPE for name in free]
@@ -189,17 +194,17 @@ class ArmSearch:
         least = max(evidence.values()) - _NEARLY
         return {model: fit for model, fit in found.items() if evidence[model] > least}
 
-    def _peaks(self, noise: Rest, least: Sequence[float], prior: float | None) -> list[tuple[float, Model, Fit]]:
+    def _peaks(self, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
         for _ in range(_GATED):
-            self.rest = self._likely_rest(self._best(self._fits).arm, noise, least, prior)
+            self.rest = self._likely_rest(self._best(self._fits).arm, least, believed)
             self._measured = self._measured.gated(self._best(self._fits).arm, self.rest, _GATE)
         self._fits = self._likely(self._fitted([self._best(self._fits).arm, *self._on_grid(1)], self._fits))
-        self.rest = self._likely_rest(self._best(self._fits).arm, noise, least, prior)
+        self.rest = self._likely_rest(self._best(self._fits).arm, least, believed)
         self._fits = self._likely(self._fitted([self._best(self._fits).arm], self._fits))
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
         highest = max(one[0] for one in every)
-        for evidence, model, fit in list(every) if "delay" in self._freedom.free else ():
+        for evidence, model, fit in list(every) if "delay" in self.freedom.free else ():
             for ticks in (-1.0, 1.0) if evidence > highest - _FORLORN else ():
                 beside = self._fit(model, self._delayed(fit.arm, fit.arm.delay + ticks * self._measured.period))
                 known = [one.arm.delay for _, other, one in every if other == model]
@@ -209,7 +214,7 @@ class ArmSearch:
 
     def _on_grid(self, count: int) -> list[Arm]:
         """The arms of highest likelihood on a grid of first-order plants, no two of them neighbours."""
-        given, free = self._freedom.given, self._freedom
+        given, free = self.freedom.given, self.freedom
         late = delays(self._measured) if "delay" in free.free else np.array([given.delay])
         lags = LAGS if "lag" in free.free else np.array([given.lag])
         damping = 0.0 if 1 in free.orders else given.damping
@@ -227,9 +232,9 @@ class ArmSearch:
         summits.sort(key=lambda one: -log[one])
         return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
 
-    def _likely_rest(self, arm: Arm, noise: Rest, least: Sequence[float], prior: float | None) -> Rest:
+    def _likely_rest(self, arm: Arm, least: Sequence[float], believed: bool) -> Rest:
         """The most likely of what an arm leaves, after the penalty for its numbers."""
-        found = list(rests(self._measured, arm, noise, QUICKEST * self._measured.period, least, prior))
+        found = list(rests(self._measured, arm, QUICKEST * self._measured.period, least, believed))
         self.rests = [rest for rest, _ in found]
         dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
         prices = [WANDERS, dearer + SMOOTHER, dearer]
@@ -238,14 +243,14 @@ class ArmSearch:
     def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None) -> dict[Model, Fit]:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
         found = dict[Model, Fit]()
-        for model in known or self._freedom.models:
+        for model in known or self.freedom.models:
             arms = starts if not found else [self._best(found).arm]
             tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, 1 if known else 2)]
             if known:
                 tries.append(self._fit(model, known[model].arm))
             found[model] = max(tries, key=lambda one: one.log_posterior)
         best = max(found, key=lambda model: found[model].log_posterior)
-        for ticks in _TICKS if "delay" in self._freedom.free else ():
+        for ticks in _TICKS if "delay" in self.freedom.free else ():
             there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)
             found[best] = max(found[best], self._fit(best, there), key=lambda one: one.log_posterior)
         return found
@@ -255,7 +260,7 @@ class ArmSearch:
         tried = [shaped for arm in arms for shaped in self._shapes(model, arm)]
         if len(tried) <= count:
             return tried
-        varied = "gain" in self._freedom.names(model)
+        varied = "gain" in self.freedom.names(model)
         log, gain = self._measured.weighed(tried, self.rest, self.limits if varied else None)
         return [tried[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:count].tolist()]
 
@@ -265,7 +270,7 @@ class ArmSearch:
         kind = "recovering" if arm.recovery else "static"
         gains = [arm]
         if model.gain != "recovering" or kind == "recovering":
-            gains = [self._freedom.shaped(arm, model.gain)]
+            gains = [self.freedom.shaped(arm, model.gain)]
         else:
             changes = product(_ERRORS, _RECOVERING)
             gains = [arm._replace(gain=1.0 + error, recovery=recovery) for error, recovery in changes]
@@ -282,20 +287,20 @@ class ArmSearch:
     def _as_late(self, arm: Arm, total: float) -> Arm:
         """An arm whose plant makes up for what its gain changed of the lag."""
         low, high = BOUNDS["lag"]
-        if "lag" not in self._freedom.free:
+        if "lag" not in self.freedom.free:
             return arm
         return arm._replace(lag=min(max(arm.lag + total - arm.total, 0.1 * arm.lag, low), high))
 
     def _delayed(self, arm: Arm, delay: float) -> Arm:
         """An arm with another dead time, and so much less or more lag of the plant, where these are free."""
-        if "delay" not in self._freedom.free:
+        if "delay" not in self.freedom.free:
             return arm
         delay = min(max(delay, 0.0), self._longest)
         later = arm._replace(delay=delay)
         return self._as_late(later, arm.total)
 
     def _fit(self, model: Model, start: Arm) -> Fit:
-        names = self._freedom.names(model)
+        names = self.freedom.names(model)
         return self._measured.fitted(start, names, self.rest, self.limits)
 
     def _best(self, found: Mapping[Model, Fit]) -> Fit:
@@ -303,7 +308,7 @@ class ArmSearch:
 
     def _evidence(self, model: Model, fit: Fit) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly."""
-        names = self._freedom.names(model)
+        names = self.freedom.names(model)
         inside = self.limits.inside(fit.arm, names)
         doubt = _DOUBT if "recovery" in names and not inside[names.index("recovery")] else 0.0
         return self._laplace(fit, names, inside) - doubt
@@ -331,8 +336,8 @@ class ArmSearch:
 
     def _walk(self, model: Model, peak: Fit, least: float) -> Branch:
         """The entries of a model about a maximum, until they count for nothing or less than ``least``."""
-        names = self._freedom.names(model)
-        if "delay" not in self._freedom.free:
+        names = self.freedom.names(model)
+        if "delay" not in self.freedom.free:
             return Branch(model, [self._entry(peak, names)])
         cov = covariance(peak.information)
         sd, slope = math.sqrt(cov[0, 0]), cov[1:, 0] / cov[0, 0]

@@ -23,7 +23,9 @@ from .steps import bounded_step
 _NOISE = np.dtype(
     [(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")]
 )
-_WRONG = 0.01  # how likely a guess is just wrong
+# A sensor's noise is believed to be so much of what second differences show, since arms jerk, too; and that within a
+# factor of some 2: the sd of its logarithm. Chosen so that error bars hold in benchmarks/real.py and intervals do in tests.
+SHOWN, BELIEF = 0.9, math.log(1.9)
 _LATEST, _PERIODS = 0.6, 5.0  # s, or update periods: the longest dead time
 _FAR = 30.0  # times all that is measured: where an offset may begin
 _WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
@@ -466,26 +468,20 @@ class _Linear(NamedTuple):
     information: FloatArray
 
 
-def log_belief(x: float) -> float:
-    """What is believed of a number that is so many standard deviations from a guess, which may be just wrong."""
-    return math.log(math.exp(-0.5 * x * x) + _WRONG)
-
-
 # ---- the rest -------------------------------------------------------------------------------------------------------
 
 
 def rests(
-    measured: Measured, arm: Arm, noise: Rest, quickest: float, least: Sequence[float], prior: float | None = None
+    measured: Measured, arm: Arm, quickest: float, least: Sequence[float], believed: bool = False
 ) -> Iterator[tuple[Rest, float]]:
     """The most likely rest that an arm leaves, without a disturbance and with one of each kind.
 
     Args:
         measured: The measurements.
         arm: The arm.
-        noise: The mean of the prior of its sensors' noise.
         quickest: The shortest time of a disturbance that is believed [s].
         least: The least noise of each sensor [m].
-        prior: The sd of the logarithm of the sensors' noise; None: the measurements alone decide.
+        believed: Whether the sensors' noise is believed to be what second differences show.
 
     Yields:
         Each with its log-posterior.
@@ -496,7 +492,7 @@ def rests(
     spread = max(float(np.std(np.concatenate([one[0] for one in left]))), 1e-7)
     sensors = [(max(one, _SDS[0]), _SDS[1]) for one in least]
     white = np.clip(measured.jitter(arm), *np.transpose(sensors))
-    s, means = len(white), np.log(np.maximum(noise.sd, least))
+    s, means = len(white), np.log(np.maximum(SHOWN * white, least))
     for smoothness in (0.0, 1.5, 0.5):
         begin, bounds = [0.1 * spread], [*sensors, _WALKS]
         if smoothness:
@@ -509,7 +505,7 @@ def rests(
         def cost(x: FloatArray, rest_of: Callable[[FloatArray], Rest] = rest_of) -> float:
             white, log_determinant = measured.whitened(rest_of(x), left)
             found = 0.5 * (float(np.vdot(white, white)) + log_determinant + measured.count * _LOG_2PI)
-            return found - (sum(map(log_belief, ((x[:s] - means) / prior).tolist())) if prior else 0.0)
+            return found + 0.5 * float(np.sum(((x[:s] - means) / BELIEF) ** 2)) * believed
 
         at, options = np.log([*white, *begin]), {"ftol": 1e-3, "eps": 1e-4}
         found = minimize(cost, at, method="SLSQP", bounds=np.log(bounds), options=options)

@@ -181,12 +181,15 @@ def not_identifiable(likelihood: Likelihood, best: Point, free: Sequence[Paramet
 
 
 def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[Parameter]:
-    """The noises and drifts of sensors that are uncertain by more than a factor of e, or at their lower bound."""
+    """The noises and drifts of sensors that are uncertain by more than a factor of e, or at their lower bound.
+
+    None of which something is believed.
+    """
     inside = within_bounds(free, best.config)
     cov = covariance(derivatives(likelihood, best, inside).information, inside)
     wide = {one.key for one, variance in zip(inside, np.diag(cov), strict=True) if variance > 1.0}
-    noises = [one for one in free if one.sensor is not None and (one.fit == "noise" or "bias_drift_sd" in one.path)]
-    return [one for one in noises if one.key in wide or one.at_bound(best.config) == "lower"]
+    noises = [one for one in free if one.is_noise or "bias_drift_sd" in one.path]
+    return [one for one in noises if one.prior is None and (one.key in wide or one.at_bound(best.config) == "lower")]
 
 
 def shared_times(

@@ -29,7 +29,7 @@ from ..model.plants import FirstOrder
 from ..toml import Interval
 from ..units import MS
 from .arm_search import ArmSearch, Chosen, Freedom, chosen_arms
-from .arms import Arm, Rest
+from .arms import Arm
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
 from .parameters import (
@@ -401,12 +401,11 @@ def _with_right_stamps(config: FusionConfig, trusted: str) -> FusionConfig:
 def _search(likelihood: Likelihood, axis: str) -> ArmSearch:
     """The arm of one axis."""
     config, names = likelihood.config, likelihood.sensors[axis]
-    sd = np.array([config.sensors[name].sd_of(axis) for name in names], dtype=np.float64)
     least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
     measured, freedom = likelihood.measured(axis, config), Freedom(Arm(0.0, 0.1))
     if measured.count < FEW:
         freedom = freedom._replace(orders=(1,), gains=("given",))
-    return ArmSearch(measured, freedom, Rest(sd), least)
+    return ArmSearch(measured, freedom, least)
 
 
 def _arm(config: FusionConfig, found: Mapping[str, ArmSearch], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:

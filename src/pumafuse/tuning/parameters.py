@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Literal, TypeAlias, TypeVar, cast, get_args
 
 import msgspec
@@ -16,7 +17,7 @@ from ..errors import ConfigError, suggestion
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor
 from ..model.plants import FirstOrder, SecondOrder
 from ..units import ending, of_kind, si
-from .arms import Arm, Rest, log_belief, longest_delay
+from .arms import BELIEF, Arm, Rest, longest_delay
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale", "bias"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -28,7 +29,6 @@ _replace = msgspec.structs.replace
 LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured one
 RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
 RECOVERY_PRIOR = (0.5 * math.log(RECOVERY[0] * RECOVERY[1]), math.log(RECOVERY[1] / RECOVERY[0]) / (2.0 * 1.96))
-_SD_PRIOR = (0.0, math.log(1.5))  # about the configured number
 QUICKEST = 2.0  # update periods, of a disturbance
 _INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
 _TICK = 0.028  # s; a large change of a time, on any arm
@@ -153,23 +153,14 @@ class Parameter:
         return "lower" if at <= low + margin else "upper" if at >= high - margin else None
 
     def log_prior(self, config: FusionConfig) -> float:
-        """Logarithm of the prior density, but for a constant.
-
-        A sensor's noise is believed to be wrong by any factor in one case of a hundred: then the measurements alone
-        decide.
-        """
-        if self.prior is None:
-            return 0.0
-        x = self._from_prior(config)
-        return log_belief(x) if self.is_noise else -0.5 * x * x
+        """Logarithm of the prior density, but for a constant."""
+        return 0.0 if self.prior is None else -0.5 * self._from_prior(config) ** 2
 
     def prior_score(self, config: FusionConfig) -> tuple[float, float]:
         """How the prior's logarithm changes with the coordinate, and the prior's information of it."""
         if self.prior is None:
             return 0.0, 0.0
-        x, sd = self._from_prior(config), self.prior[1]
-        weight = math.exp(-0.5 * x * x - log_belief(x)) if self.is_noise else 1.0
-        return -weight * x / sd, weight / sd**2
+        return -self._from_prior(config) / self.prior[1], 1.0 / self.prior[1] ** 2
 
     def _from_prior(self, config: FusionConfig) -> float:
         mean, sd = cast("tuple[float, float]", self.prior)
@@ -184,8 +175,7 @@ class Parameter:
         if one.path[-1] == "disturbance_time":  # what is faster is no motion of an arm but noise of its sensors
             return replace(one, bounds=(quickest(known), one.bounds[1]))
         if self.log:
-            around = self.prior and one.fit == "noise"
-            return replace(one, prior=(one.at(known), self.prior[1])) if around and self.prior else one
+            return one
         middle, (low, high) = one.get(known), self.bounds
         if self.fit == "delay":
             return replace(one, bounds=(0.0, max(longest_delay(known.arm.update_period), middle)))
@@ -209,7 +199,7 @@ _TABLE = (
     _line("noise", "process.{axis}.maneuver_drift_mm_rts_per_m_s", "process.{axis}.maneuver_drift", 1e-5, 300.0),
     _line("noise", "process.{axis}.disturbance_sd_mm", "process.{axis}.disturbance_sd", 1e-7, 10.0),
     _line("noise", "process.{axis}.disturbance_time_ms", "process.{axis}.disturbance_time", 1e-3, 1e3),
-    _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", *SD_BOUNDS, prior=_SD_PRIOR),
+    _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", *SD_BOUNDS),
     _line("delay", "axes.{axis}.delay_ms", "arm.axes.{axis}.delay", 0.0, 0.0, log=False, scale=_TICK),
     _line("delay", "delay_ms", "arm.delay", 0.0, 0.0, log=False, scale=_TICK),
     _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
@@ -231,8 +221,8 @@ def parameters(
     sensors: Mapping[str, Sequence[str]],
     fit: Sequence[Fit],
     fixed: Iterable[str] = (),
-    sd_prior: bool = True,
-    resolution: Mapping[tuple[str, str], float] | None = None,
+    resolution: Mapping[tuple[str, str], float] = MappingProxyType({}),
+    believed: Mapping[tuple[str, str], float] = MappingProxyType({}),
 ) -> list[Parameter]:
     """The parameters to fit, those of each axis together.
 
@@ -242,8 +232,8 @@ def parameters(
         sensors: For each axis the sensors that measure it.
         fit: Which kinds.
         fixed: Parts of names: a parameter whose name has all the parts of one, in their order, is left out.
-        sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5.
         resolution: The least noise of a sensor on an axis [m or rad]: at rest all its values may be one.
+        believed: The noise that a sensor on an axis is believed to have, within a factor of some 2 [m or rad].
     """
     used = {name for names in sensors.values() for name in names}
     every = [
@@ -255,13 +245,16 @@ def parameters(
     ]
     free = [one for one in every if not is_fixed(one.key, fixed)]
     free = [one for one in free if _belongs(one, config, sensors)]
-    free = [_above(one, (resolution or {}).get((one.sensor or "", one.axis or ""), 0.0)) for one in free]
-    return free if sd_prior else [replace(one, prior=None) if one.fit == "noise" else one for one in free]
+    return [_noise(one, resolution, believed) if one.is_noise else one for one in free]
 
 
-def _above(one: Parameter, least: float) -> Parameter:
-    """The parameter; if it is a sensor's noise, not below a least one."""
-    return replace(one, bounds=(least, one.bounds[1])) if one.is_noise and least > one.bounds[0] else one
+def _noise(
+    one: Parameter, resolution: Mapping[tuple[str, str], float], believed: Mapping[tuple[str, str], float]
+) -> Parameter:
+    """A sensor's noise with its least value and what is believed of it."""
+    of = str(one.sensor), str(one.axis)
+    one = replace(one, bounds=(max(resolution.get(of, 0.0), one.bounds[0]), one.bounds[1]))
+    return replace(one, prior=(one.coordinate(believed[of]), BELIEF)) if of in believed else one
 
 
 def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:

@@ -149,7 +149,7 @@ class AxisPosterior:
     def log_density(self, delays: FloatArray) -> FloatArray:
         """The log-density of the delay, all models together, (m,)."""
         found = np.full(len(delays), -np.inf)
-        for model in {branch.model for branch in self.branches}:
+        for model in dict.fromkeys(branch.model for branch in self.branches):  # one order in every process: it rounds
             each = [branch.at(delays) for branch in self.branches if branch.model == model]
             found = np.logaddexp(found, np.max(each, axis=0))
         return found

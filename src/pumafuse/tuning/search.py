@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
 from .arm_search import SMOOTHER, WANDERS, ArmSearch, Freedom, chosen_arms
-from .arms import Arm, Rest
+from .arms import Arm
 from .identifiability import covariance
 from .likelihood import Likelihood, in_threads
 from .maximise import Notify, Point, derivatives, maximise, maximise_by_axis, maximise_with_gates, point
@@ -58,54 +58,72 @@ def search(
     likelihood: Likelihood,
     config: FusionConfig,
     free: FreeOf,
+    arms: Mapping[str, ArmSearch],
     notify: Notify,
     one_delay: bool = False,
-    near: Mapping[str, ArmSearch] | None = None,
-) -> tuple[Point, dict[str, str], dict[str, ArmSearch]]:
+    begun: bool = False,
+) -> tuple[Point, dict[str, str]]:
     """Find the most likely configuration.
 
     Args:
         likelihood: The likelihood.
         config: The configuration as given.
         free: The parameters to vary, which depend on the order of the plants.
+        arms: What was looked for of each axis's arm.
         notify: Called with each better point.
         one_delay: Whether all axes whose delay is free share one whatever the measurements say.
-        near: The arms that were found on a part of the measurements, to begin from; the configuration has the noise
-            that was found there.
+        begun: Whether the configuration has the noise that was found on a part of the measurements: one start more.
 
     Returns:
-        The best point; for each axis the reasons for the order of its plant, its gain, its disturbance and whether it
-        shares the arm's delay; and the arms that were looked for.
+        The best point; and for each axis the reasons for the order of its plant, its gain, its disturbance and whether
+        it shares the arm's delay.
     """
     reasons: Reasons = {axis: [] for axis in likelihood.sensors}
-    freedoms = {axis: one for axis in likelihood.sensors if (one := _freedom(config, free, axis)) is not None}
-
-    def of(axis: str) -> ArmSearch:
-        return _arm_search(likelihood, config, free(config), axis, freedoms.get(axis), (near or {}).get(axis))
-
-    arms = dict(zip(likelihood.sensors, in_threads(of, list(likelihood.sensors)), strict=True))
-    searched = {axis: arms[axis] for axis in freedoms}
-    config = _with_arms(config, searched, freedoms, one_delay, reasons)
+    config = _with_arms(config, {axis: one for axis, one in arms.items() if one.freedom.free}, one_delay, reasons)
     for one in free(config):
         if one.fit == "latency":
             config = _nearest_latency(likelihood, config, one, free)
     found = list[Point]()
     starts = _noise_models(likelihood, config, arms, free)
-    for start in starts if near is None else [*starts, config]:
+    for start in [*starts, config] if begun else starts:
         if found:  # an arm that is likeliest under one noise is near that under another
             start = _with_arm_of(start, found[0].config, free)
         found.append(_maximum(likelihood, start, free, notify))
     best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
     best = _without_needless(likelihood, best, free, notify)
     best = _under_gates(likelihood, best, config, free, notify)
-    return best, {axis: "; ".join(why) for axis, why in reasons.items() if why}, searched
+    return best, {axis: "; ".join(why) for axis, why in reasons.items() if why}
 
 
 # ---- arms -----------------------------------------------------------------------------------------------------------
 
 
-def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom | None:
-    """What of an axis's arm the free parameters leave open; None: nothing."""
+def arm_searches(
+    likelihood: Likelihood, config: FusionConfig, free: FreeOf, believed: bool, near: Mapping[str, ArmSearch]
+) -> dict[str, ArmSearch]:
+    """The arm of each axis as far as it is free, and what it leaves, by sensors whose latency is known and steady.
+
+    Args:
+        likelihood: The likelihood.
+        config: The configuration as given.
+        free: The parameters to vary.
+        believed: Whether the sensors' noise is believed to be what second differences show.
+        near: What was found on a part of the measurements, to begin from.
+    """
+    late = {one.sensor for one in free(config) if one.fit == "latency"}
+    late |= {name for name, sensor in config.sensors.items() if sensor.latency_sd}
+
+    def of(axis: str) -> ArmSearch:
+        names = [name for name in likelihood.sensors[axis] if name not in late] or list(likelihood.sensors[axis])
+        least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
+        measured = likelihood.measured(axis, config, names)
+        return ArmSearch(measured, _freedom(config, free, axis), least, believed, near.get(axis))
+
+    return dict(zip(likelihood.sensors, in_threads(of, list(likelihood.sensors)), strict=True))
+
+
+def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom:
+    """What of an axis's arm the free parameters leave open."""
     given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
     other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if given.damping else 1.0, 0.1))
     here, there = ({one.path[-1] for one in free(at) if one.axis == axis} for at in (config, other))
@@ -121,50 +139,20 @@ def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom | None:
     here |= plants[0] if whole else here
     names = {_NAMES[field] for field in here if field in _NAMES}
     order = 2 if given.damping else 1
-    return Freedom(given, names, (1, 2) if whole else (order,), gains) if names else None
-
-
-def _arm_search(
-    likelihood: Likelihood,
-    config: FusionConfig,
-    free: Sequence[Parameter],
-    axis: str,
-    freedom: Freedom | None,
-    near: ArmSearch | None,
-) -> ArmSearch:
-    """The arm of an axis by the sensors whose latency is known and steady, and what it leaves."""
-    late = {one.sensor for one in free if one.fit == "latency"}
-    late |= {name for name, sensor in config.sensors.items() if sensor.latency_sd}
-    names = [name for name in likelihood.sensors[axis] if name not in late] or list(likelihood.sensors[axis])
-    sd = np.array([config.sensors[name].sd_of(axis) for name in names], dtype=np.float64)
-    least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
-    believed = [one.prior for one in free if one.is_noise and one.axis == axis and one.prior is not None]
-    given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
-    return ArmSearch(
-        likelihood.measured(axis, config, names),
-        freedom or Freedom(given, (), (2 if given.damping else 1,), ("given",)),
-        Rest(sd),
-        least,
-        believed[0][1] if believed else None,
-        near,
-    )
+    return Freedom(given, names, (1, 2) if whole else (order,), gains)
 
 
 def _with_arms(
-    config: FusionConfig,
-    searched: Mapping[str, ArmSearch],
-    freedoms: Mapping[str, Freedom],
-    one_delay: bool,
-    reasons: Reasons,
+    config: FusionConfig, searched: Mapping[str, ArmSearch], one_delay: bool, reasons: Reasons
 ) -> FusionConfig:
     """The configuration with the likeliest arm of each axis; one delay for those that share it."""
-    delayed = {axis: one.posterior for axis, one in searched.items() if "delay" in freedoms[axis].free}
+    delayed = {axis: one.posterior for axis, one in searched.items() if "delay" in one.freedom.free}
     found, delay = chosen_arms(searched, delayed, one_delay)
     shares = [axis for axis, one in found.items() if one.shares]
     worth = {} if one_delay else own_worth(delayed, shares)
     for axis, one in found.items():
         config = with_arm(config, axis, one.arm)
-        reasons[axis] += _why(freedoms[axis], one.mixture, one.model)
+        reasons[axis] += _why(searched[axis].freedom, one.mixture, one.model)
         if len(delayed) > 1 and axis in delayed:
             gain = f" (own {worth[axis]:+.1f})" if axis in worth else ""
             reasons[axis].append(f"delay: {'shared' if one.shares else 'its own'}{gain}")

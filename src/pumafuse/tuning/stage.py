@@ -37,7 +37,7 @@ from .parameters import (
     with_gates,
     with_own_delays,
 )
-from .search import FreeOf, search
+from .search import FreeOf, arm_searches, search
 
 _GATE = 5.0  # of the fit for a sensor with a narrow one:
 _NARROWEST = 3.0  # below it rejecting good measurements would pay, the more the smaller the noise
@@ -59,7 +59,7 @@ class Plan:
         fixed: Names of parameters to leave as they are.
         sensors: The sensors to use; None: all.
         trusted: The sensor that the arm was fitted on: only parameters of other sensors are free; None: all.
-        sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5.
+        sd_prior: Whether a sensor's noise is believed to be what second differences show.
         one_delay: Whether all axes share one delay whatever the measurements say.
     """
 
@@ -117,10 +117,11 @@ def run_stage(
     """
     likelihood = likelihood_of(runs, config, plan, until)
     excited, fixed = excited_axes(likelihood, config), list[NotIdentifiable]()
+    believed: dict[tuple[str, str], float] = {}  # noise of sensors, when arms are known
 
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]
-        every = parameters(at, config, likelihood.sensors, plan.fit, names, plan.sd_prior, likelihood.resolution)
+        every = parameters(at, config, likelihood.sensors, plan.fit, names, likelihood.resolution, believed)
         return for_few(likelihood, [one for one in every if _may_vary(one, at, plan, excited)])[0]
 
     start, notes = likelihood.config, list[str]()
@@ -138,7 +139,12 @@ def run_stage(
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
-    best, orders, arms = search(likelihood, start, free, notify, plan.one_delay, near.arms if near else None)
+    arms = arm_searches(likelihood, start, free, plan.sd_prior, near.arms if near else {})
+    searched = {axis: one for axis, one in arms.items() if one.freedom.free}
+    if plan.sd_prior:
+        believed |= likelihood.scatter
+        believed |= {(name, axis): noise for axis, one in arms.items() for name, noise in one.likely_noise.items()}
+    best, orders = search(likelihood, start, free, arms, notify, plan.one_delay, begun=near is not None)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
@@ -157,7 +163,7 @@ def run_stage(
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
     notes += few_measurements(likelihood, free(best.config)) + for_few(likelihood, [])[1]
-    return Stage(likelihood, best, free(best.config), fixed, orders, notes, arms)
+    return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched)
 
 
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:

@@ -106,7 +106,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
         fit: The kinds of parameters fitted.
         fixed: Names that were fixed, as asked.
         trusted: The trusted sensor, if there is one.
-        sd_prior: Whether sensors' noises were believed to be the configured ones within a factor of 1.5.
+        sd_prior: Whether sensors' noises were believed to be what second differences show, within a factor of 2.
         interrupted: Whether it was stopped before the end; the numbers are the best until then.
         likelihood: By axis.
         lags: Of each axis of whose arm anything was fitted that the lag depends on.
@@ -257,7 +257,7 @@ def _notes(one: Parameter, interval: ConfidenceInterval) -> str:
         return f"open up to {bounds['upper']}"
     low, high = interval.ci95
     if one.sensor and one.prior and math.log(high / low) > _FROM_PRIOR * 2.0 * Z95 * one.prior[1]:
-        return "mostly by its prior, as configured within a factor of 1.5: the measurements hardly tell it"
+        return "mostly by its prior, what second differences show within a factor of 2: the likelihood hardly tells it"
     return "the likelihood has two maxima along it" if interval.profile.bimodal else ""
 
 

@@ -109,8 +109,8 @@ def tune(
             only noise, latency and scale are fitted then.
         validate: A run to compare before and after on. For None a single run is fitted on its first two thirds,
             validated on the last third, and then fitted anew as a whole.
-        sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5 (log-normal, one
-            standard deviation); else the measurements alone decide, which may be too few to.
+        sd_prior: Whether a sensor's noise is believed to be what second differences of its measurements show, within a
+            factor of 2 (log-normal, one standard deviation); else the likelihood alone decides.
         share: ``delay``: all axes share one whatever the measurements say. Else those share one to which an own one is
             not worth its number (Bayesian information criterion).
         profiles: Whether to compute the likelihood along each parameter, too, to draw it and to look for a second
@@ -161,7 +161,7 @@ def tune(
     stages, names = pipeline.stages, [run.name for run in runs]
     free = [one for stage in stages for one in stage.free]
     if not stages:  # the configuration as given, or interrupted before a stage was complete
-        free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed, sd_prior)
+        free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed)
     result, arms = pipeline.result(), {axis: one for stage in stages for axis, one in stage.arms.items()}
     lost = [axis for axis, one in arms.items() if one.plain is None or result.arm.lag_of(axis) > LONGEST]
     lags = with_doubts(fitted_lags(free, config, result, around, lost), found, config, result)
