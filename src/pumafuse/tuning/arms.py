@@ -24,7 +24,7 @@ _NOISE = np.dtype(
     [(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")]
 )
 # A sensor's noise is believed to be so much of what second differences show, since arms jerk, too; and that within a
-# factor of some 2: the sd of its logarithm. Chosen so that error bars hold in benchmarks/real.py and intervals do in tests.
+# factor of some 2: the sd of its logarithm. Chosen so that error bars of benchmarks/real.py and tests hold.
 SHOWN, BELIEF = 0.9, math.log(1.9)
 _LATEST, _PERIODS = 0.6, 5.0  # s, or update periods: the longest dead time
 _FAR = 30.0  # times all that is measured: where an offset may begin
