@@ -276,7 +276,7 @@ def _coarse(
         sign: −1: the sensor is mirrored.
         first: By which to turn the rotation that fits the path, to begin elsewhere.
     """
-    plant = Plant(_DEAD * about.lag, max((1.0 - _DEAD) * about.lag, 1e-3))
+    plant = _plant(about.lag)
     rows = rows_of(command, sensor, mean, attitude=False)
     poses, rows = rows.answer.poses(plant, plant), rows._replace(centred=rows.centred * [1.0, 1.0, sign])
     known = np.array(marker.at)
@@ -289,7 +289,14 @@ def _coarse(
     markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
     begin = State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant)
     held, free = (_free(np.eye(3), markers, turn=False, scale=one, own=False) for one in (False, moves))
-    return fitted(rows, fitted(rows, begin, held).state, free)  # a free scale makes all small first
+    nearer = fitted(rows, begin, held).state  # a free scale makes all small first
+    again = _plant(nearer.position.lag)  # a short τ from far away may be stuck among the steps of held commands
+    return fitted(rows, nearer._replace(position=again, angle=again), free)
+
+
+def _plant(lag: float) -> Plant:
+    """A plant to begin with."""
+    return Plant(_DEAD * lag, max((1.0 - _DEAD) * lag, 1e-3))
 
 
 def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
