@@ -289,9 +289,10 @@ def _coarse(
     markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
     begin = State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant)
     held, free = (_free(np.eye(3), markers, turn=False, scale=one, own=False) for one in (False, moves))
-    nearer = fitted(rows, begin, held).state  # a free scale makes all small first
+    nearer = fitted(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
     again = _plant(nearer.position.lag)  # a short τ from far away may be stuck among the steps of held commands
-    return fitted(rows, nearer._replace(position=again, angle=again), free)
+    both = (fitted(rows, one, free) for one in (begin, nearer._replace(position=again, angle=again)))
+    return min(both, key=lambda one: one.left() / one.state.scale)
 
 
 def _plant(lag: float) -> Plant:
