@@ -69,7 +69,7 @@ def show(found: RegistrationSummary) -> None:
     for name, one in found.sensors.items():
         _show(name, one)
     if found.joints:
-        typer.echo("joints do not answer alike; each is later than the first by")
+        typer.echo("joints do not answer alike; each is later than the one that answers first by")
         rows = [[n, f"{one.later * MS:.2f}", _limits(one.later_ci95, MS, ".2f")] for n, one in found.joints.items()]
         print_tables([table(["joint", "later_ms", "95 % interval"], rows)])
 

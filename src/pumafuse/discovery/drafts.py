@@ -131,6 +131,8 @@ def _rebased(found: Survey, folder: Path) -> str:
     for table in (tree["command"], tree.get("reference"), *tree.get("sensors", {}).values()):
         if table is not None:
             table["file"] = _from(folder, beside / table["file"])
+    if "robot" in tree:
+        tree["robot"]["urdf"] = _from(folder, beside / tree["robot"]["urdf"])
     return (
         f"# The log's own run.toml ({printable(str(beside))}), with its files named from here.\n{tomli_w.dumps(tree)}"
     )

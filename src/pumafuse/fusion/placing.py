@@ -26,6 +26,7 @@ from ..space.rotations import TURNING
 from .config import FusionConfig, Placement, Sensor, Tool
 
 _HERE = Placement()
+_ELSEWHERE = np.radians(30.0)  # what no arm lags or errs by for most of a run
 _QUIET = np.errstate(over="ignore", invalid="ignore")  # a sensor without a target may report infinity
 
 
@@ -122,6 +123,8 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
     measured = np.column_stack([source.values[axis] for axis in CARTESIAN])
     point = placing.seen(measured)
     oriented = None if told is None else np.where(lost(measured)[:, None], np.nan, placing.oriented(told))
+    if oriented is not None and whole and _can_be_commanded(run, config):
+        _check_turned(name, source, oriented, run)
     if placing.has_marker:
         lever = np.full(point.shape, np.nan) if oriented is None else placing.lever(oriented)
         spread |= placing.spread(lever)
@@ -136,6 +139,30 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
         point = point - lever
     values = dict(source.values) | dict(zip(CARTESIAN, point.T.copy(), strict=True))
     return replace(source, values=values, orientation=oriented, spread=spread)
+
+
+def _check_turned(name: str, source: Source, oriented: FloatArray, run: Run) -> None:
+    """Whether a sensor tells the tool to be turned about as it is commanded to be.
+
+    Raises:
+        RunError: It is far from that for most of the run, as no arm is: its marker is turned otherwise.
+    """
+    command, given = run.command.orientation, run.command.stamp
+    assert command is not None
+    known = np.flatnonzero(np.isfinite(command).all(axis=1) & (given != NO_STAMP))
+    known = known[np.argsort(given[known], kind="stable")]
+    seen = np.flatnonzero(np.isfinite(oriented).all(axis=1) & (source.stamp != NO_STAMP))
+    if not len(known) or not len(seen):
+        return
+    last = np.clip(np.searchsorted(given[known], source.stamp[seen], side="right") - 1, 0, None)
+    alike = np.abs(np.sum(command[known[last]] * oriented[seen], axis=1))
+    off = float(np.median(2.0 * np.arccos(np.clip(alike, 0.0, 1.0))))
+    if off > _ELSEWHERE:
+        raise RunError(
+            f"{source.label_for(name)}: it tells the tool to be turned {np.degrees(off):.0f}° from where it is"
+            f" commanded to be: give rotation_vector_deg of sensors.{name}.marker, which `pumafuse register` finds, or leave its"
+            " orientation out of run.toml"
+        )
 
 
 def _can_be_commanded(run: Run, config: FusionConfig) -> bool:

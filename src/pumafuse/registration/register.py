@@ -504,6 +504,8 @@ def _told(
     half = fit.half_widths(slopes)
     lost = np.zeros((SIZE, loose.shape[1] + blind.shape[1]))
     lost[ROTATION, : loose.shape[1]], lost[MARKER, loose.shape[1] :] = loose, blind
+    if blind.shape[1] == 1:  # along the one axis that the tool turns about the frame's place makes up for the marker
+        lost[CENTRE, loose.shape[1] :] = fit.off.poses.rotation.mean(axis=0) @ blind
     half[(np.abs(slopes @ lost) > _TILT).any(axis=1)] = np.inf
     if not begin.attitude:
         half[9:12] = np.inf
