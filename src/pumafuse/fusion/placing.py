@@ -160,8 +160,8 @@ def _check_turned(name: str, source: Source, oriented: FloatArray, run: Run) -> 
     if off > _ELSEWHERE:
         raise RunError(
             f"{source.label_for(name)}: it tells the tool to be turned {np.degrees(off):.0f}° from where it is"
-            f" commanded to be: give rotation_vector_deg of sensors.{name}.marker, which `pumafuse register` finds, or leave its"
-            " orientation out of run.toml"
+            f" commanded to be: give rotation_vector_deg of sensors.{name}.marker, which `pumafuse register` finds, or"
+            " leave its orientation out of run.toml"
         )
 
 
