@@ -6,13 +6,21 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+from mcap.writer import Writer
+from mcap_ros2.writer import Writer as Ros2Writer
 from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
+from bag_files import definition_of
+from pumafuse.registration.register import registered as registration
 from pumafuse.registration.runs import RegisteredSensor
 from setups import Setup
 
@@ -214,6 +222,119 @@ def test_rows_that_are_no_news_change_no_frame(change: Callable[[np.ndarray], np
     np.testing.assert_allclose(found.rotation, whole.rotation, atol=np.radians(0.1))
 
 
+def along_base(marker: float) -> pf.Run:
+    """A run beside a sensor that measures along the base's axes, so many times the marker of a set-up on the tool."""
+    setup = Setup(3, seconds=20.0, wrong=1.0)
+    setup.frame, setup.at = Rotation.identity(), np.zeros(3)
+    setup.marker, setup.turn = marker * setup.marker, setup.turn if marker else Rotation.identity()
+    command, sensor = setup.run()
+    told, seen = (
+        dict(zip("xyz", one.position.T, strict=True)) | {"orientation": one.quaternion} for one in (command, sensor)
+    )
+    return pf.Run.from_arrays(command.time, told, {"camera": (sensor.time, seen)})
+
+
+def test_a_sensor_along_the_axes_of_the_base_gets_no_frame() -> None:
+    """Nor a marker if that is the tool point; what is configured of its bias stays."""
+    with pytest.warns(pf.PumafuseWarning, match="sensor 'camera' measures along the base's axes"):
+        found = pf.register(along_base(0.0))
+    camera = found.config.sensors["camera"]
+    assert camera.frame is None
+    assert camera.marker is None
+    assert found.details.sensors["camera"].frame is not None
+    sensors = {"camera": msgspec.structs.replace(camera, bias_sd=2e-3)}
+    given = msgspec.structs.replace(found.config, sensors=sensors)
+    with pytest.warns(pf.PumafuseWarning, match="no frame is written"):
+        camera = pf.register(along_base(1.0), given).config.sensors["camera"]
+    assert camera.frame is None
+    assert camera.bias_sd == 2e-3
+    assert camera.marker is not None
+    np.testing.assert_allclose(camera.marker.at, Setup(3).marker, atol=2e-3)
+
+
+def test_a_sensor_that_lacks_an_axis_is_named() -> None:
+    """What it lacks, and what becomes of it; where it is the only one nothing is registered, in a line."""
+    run = recorded(as_it_is)
+    camera = run.sensors["camera"]
+    flat = replace(camera, values={axis: camera.values[axis] for axis in "xy"}, orientation=None)
+    with pytest.warns(pf.PumafuseWarning, match="sensor 'flat' gives no z, without which it is not registered"):
+        found = pf.register(replace(run, sensors={"camera": camera, "flat": flat}))
+    assert found.config.sensors["camera"].frame is not None
+    with pytest.raises(pf.RunError, match=r"no sensor gives x, y and z, .*: sensor 'flat' gives no z"):
+        pf.register(replace(run, sensors={"flat": flat}))
+
+
+def test_a_run_in_which_a_sensor_lacks_an_axis_is_not_looked_at_for_it() -> None:
+    """The sensor is registered by the other run alone."""
+    run = recorded(as_it_is)
+    camera = run.sensors["camera"]
+    level = replace(camera, values={"z": camera.values["z"]}, orientation=None)
+    both = pf.register([run, replace(run, sensors={"camera": level})]).config.sensors["camera"]
+    assert both.frame == pf.register(run).config.sensors["camera"].frame
+
+
+@dataclass
+class Pose:
+    """How a message has a pose: its path, the names in it, and the type of ROS; JSON where there is none."""
+
+    path: str
+    names: tuple[str, str]
+    kind: str = ""
+
+    def fields(self, position: np.ndarray, quaternion: np.ndarray) -> dict[str, Any]:
+        """The fields of a message."""
+        parts = zip(self.names, ("xyz", "xyzw"), (position, quaternion), strict=True)
+        inner: Any = {name: dict(zip(letters, map(float, of), strict=True)) for name, letters, of in parts}
+        for name in reversed(self.path.split(".")):
+            inner = {name: inner}
+        header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+        return inner | ({"header": header} if self.kind else {})
+
+
+IN_POSE, IN_TRANSFORM = ("position", "orientation"), ("translation", "rotation")
+BAGS = {
+    "ros": (
+        Pose("pose", IN_POSE, "geometry_msgs/msg/PoseStamped"),
+        Pose("transform", IN_TRANSFORM, "geometry_msgs/msg/TransformStamped"),
+    ),
+    "json": (Pose("a.pose", IN_POSE), Pose("a.transform", IN_TRANSFORM)),
+}
+
+
+@pytest.mark.parametrize("kind", BAGS)
+def test_poses_of_a_bag_are_registered(kind: str, tmp_path: Path) -> None:
+    """Commands in a Pose and a sensor in a Transform, also within other fields: the frame is that of the arrays."""
+    motions, text = Setup(4, seconds=12.0).run(), ""
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Ros2Writer(file) if BAGS[kind][0].kind else Writer(file)
+        if isinstance(writer, Writer):
+            writer.start("", "")
+        for name, pose, motion in zip(("command", "sensors.camera"), BAGS[kind], motions, strict=True):
+            topic = f"/{name}"
+            text += f'[{name}]\nfile = "log.mcap"\ntopic = "{topic}"\ntime = "log_time"\npose = "{pose.path}"\n'
+            if isinstance(writer, Writer):
+                channel = writer.register_channel(topic, "json", writer.register_schema("a", "jsonschema", b"{}"))
+                write = partial(writer.add_message, channel)
+            else:
+                write = partial(
+                    writer.write_message, topic, writer.register_msgdef(pose.kind, definition_of(pose.kind))
+                )
+            for time, position, quaternion in zip(*motion, strict=True):
+                stamp, fields = round(1e9 * (10.0 + time)), pose.fields(position, quaternion)
+                if isinstance(writer, Writer):
+                    write(stamp, json.dumps(fields).encode(), stamp)
+                else:
+                    write(fields, log_time=stamp, publish_time=stamp)
+        writer.finish()
+    (tmp_path / "run.toml").write_text(text)
+    alone = registration(*([motion._replace(time=motion.time + 10.0)] for motion in motions)).frame
+    found = pf.register(pf.Run.read(tmp_path)).details.sensors["camera"].frame
+    assert alone is not None
+    assert found is not None
+    np.testing.assert_allclose(found.at, alone.at, atol=1e-6)
+    np.testing.assert_allclose(found.rotation, alone.rotation, atol=1e-6)
+
+
 def test_what_no_frame_explains_is_refused() -> None:
     """Commands without an orientation, of a tool that turns with a marker far from its point: said, not guessed."""
     with pytest.raises(pf.RunError, match=r"no frame explains how: .* the commands tell no orientation"):
@@ -228,7 +349,7 @@ def test_a_motion_along_one_axis_is_registered_as_far_as_it_tells() -> None:
     values = [0.1 * np.sin(seen - 0.1), np.full(len(seen), 0.05), np.full(len(seen), 0.08)]
     noisy = {axis: value + rng.normal(0.0, 1e-4, len(seen)) for axis, value in zip("xyz", values, strict=True)}
     run = pf.Run.from_arrays(time, told, {"camera": (seen, noisy)})
-    with pytest.warns(pf.PumafuseWarning, match="motion along|does not turn|do not tell"):
+    with pytest.warns(pf.PumafuseWarning, match="motion along|does not turn|do not tell|no frame is written"):
         found = pf.register(run).details.sensors["camera"]
-    assert "line" in found.findings
+    assert {"line", "along-base"} <= {*found.findings}
     assert found.lag == pytest.approx(0.09, abs=1e-3)  # 0.1 s behind the path, half a period less behind held commands

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from ..errors import printable
+from ..logs.frames import CARTESIAN
 from ..units import MS
 from .following import LATEST
 from .guesses import SensorGuess
@@ -77,6 +78,9 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
                 ask = (
                     ": are axes exchanged, or its clock another one?" if follow else ", nor anything else its commands"
                 )
+                missing = [one for one in CARTESIAN if one not in source.values]
+                if axis in CARTESIAN and missing:
+                    ask += f" It gives no {' and no '.join(missing)}, without which no frame of its own is found"
                 how = "does not follow" if abs(one.correlation) < FOLLOWS else "hardly follows"
                 later.append(f"{name} {how} the commands on {axis} (correlation {one.correlation:+.2f}){ask}")
                 continue

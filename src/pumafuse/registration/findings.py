@@ -27,6 +27,7 @@ class Finding(enum.Enum):
     READING = "reading"  # an orientation follows if it is read in another way
     ATTITUDE = "attitude"  # orientations are told in another frame than positions
     ATTITUDE_UNRELATED = "attitude-unrelated"  # orientations follow in no way
+    ALONG_BASE = "along-base"  # the frame is the base's, as nearly as an arm tells
 
 
 AS_READ = (Finding.SCALE, Finding.READING, Finding.ATTITUDE)  # rows were read otherwise than run.toml says
@@ -51,7 +52,7 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
         axis: LINE: in the base; ONE_AXIS: on the tool.
         source: READING: whose, command or sensor.
         reading: READING: how it follows.
-        unit: SCALE: the units of sensor and base that it looks like.
+        unit: SCALE: the units of sensor and base that it looks like; UNEXPLAINED, ATTITUDE_UNRELATED: those of angles.
     """
 
     finding: Finding
@@ -80,6 +81,8 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
                 why = (
                     "the commands tell no orientation (run.toml), by which alone one knows where its marker is"
                     if self.source == "command"
+                    else f"{self.unit} (run.toml)"
+                    if self.unit
                     else "are units, the order and the unit of orientations right, of the commands, too (run.toml)?"
                 )
                 what = f"moves with the tool, and no frame explains how: {100.0 * size:.0f} % are left; {why}"
@@ -92,10 +95,8 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
             case Finding.PLANE:
                 what = "saw motion in a plane only: its axes are taken to be right-handed, which nothing tells"
             case Finding.SCALE:
-                unit = f", as if it were {self.unit}" if self.unit else ""
-                what = (
-                    f"measures lengths that are to be multiplied by {size:.4g}{unit}: mend its unit or scale (run.toml)"
-                )
+                unit = f", as if it were {self.unit}, or the commands the other way round" if self.unit else ""
+                what = f"measures lengths that are to be multiplied by {size:.4g}{unit}: mend unit or scale (run.toml)"
             case Finding.STILL:
                 what = "saw a tool that does not turn: its marker stays as given, and the frame's place makes up for it"
             case Finding.ONE_AXIS:
@@ -109,5 +110,8 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
                     " its orientations are not used"
                 )
             case Finding.ATTITUDE_UNRELATED:
-                what = "tells orientations that do not follow the commanded ones: they are not used"
+                unit = f"; {self.unit} (run.toml)" if self.unit else ""
+                what = f"tells orientations that do not follow the commanded ones: they are not used{unit}"
+            case Finding.ALONG_BASE:
+                what = "measures along the base's axes, as far as the motion tells: no frame is written"
         return f"{sensor} {what}"

@@ -15,10 +15,11 @@ from ..arrays import FloatArray
 from ..fusion.config import Placement
 from ..space.rotations import crossed, left_jacobian
 from ..toml import Interval
+from ..units import DEG
 from .findings import Finding, Found, Reading, Vector
 from .motion import Answer, Motion, Plant
 from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, fitted
-from .start import Rough, aligned_turns, despiked, kabsch, read, rough, unit
+from .start import Rough, aligned_turns, despiked, kabsch, ratio, read, rough, unit
 
 _SETTLED = 6.0  # rough lags after the first command: how the arm moved before is forgotten
 _AT_LEAST, _FEWEST = 5.0, 60  # s and rows of a sensor beside commands
@@ -45,7 +46,10 @@ _SURELY = 0.1  # likewise, of orientations that follow as they are
 _LEVER = 0.15  # m: arms err by 0.5 mm and 0.2 degrees
 _TILT = 0.05  # of a number per step in a direction that nothing tells: less is told
 _OF_NORMAL = 0.6745  # median of the absolute value of a standard normal variable
-_UNIT = 0.05  # tolerance of a factor between units
+_HERE, _AS_TURNED = 3e-3, np.radians(0.5)  # m and rad: an arm's own kinematics are wrong by as much
+_UNIT = 0.05  # tolerance of the logarithm of a factor between units
+_ROUGHLY = 0.4  # likewise where it is that of speeds, to which a marker adds some
+_ANGLES = 1.4  # likewise of angles, which in another unit are about other axes
 _OTHER = 0.02  # from which a scale is named: arms' own kinematics are wrong by a tenth of that
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "m": 1.0}  # in m
 
@@ -213,7 +217,9 @@ def _begun(
     if min(left, other) > _LEFT * spread:
         moves = about.correlation > _MOVES
         if moves:
-            found += [*_unit_named(about.scale * ahead), _unexplained(command, sensor, min(left, other) / spread)]
+            by_speeds = (ratio(command, sensor, about.lag, turns=False), _ROUGHLY)
+            named = _unit_named(about.scale * ahead) if np.isfinite(about.scale) else _unit_named(*by_speeds)
+            found += [*named, _unexplained(command, sensor, about.lag, min(left, other) / spread)]
         else:
             found.append(Found(finding=Finding.UNRELATED, size=about.correlation))
     elif other < _MIRROR * left:
@@ -343,12 +349,17 @@ def _unit_of(fit: Fit, ahead: float, loosely: bool) -> tuple[float, list[Found]]
     return (found[0].size or scale if found else 1.0), found
 
 
-def _unit_named(scale: float) -> list[Found]:
+def _unit_named(scale: float, within: float = _UNIT) -> list[Found]:
     """That lengths are of another unit, where a scale is that of two units."""
-    for (name, one), (read_as, other) in product(_UNITS.items(), _UNITS.items()):
-        if name != read_as and scale > 0.0 and abs(np.log(scale * other / one)) < _UNIT:
-            return [Found(finding=Finding.SCALE, size=one / other, unit=f"in {name}, read as {read_as}")]
-    return []
+    if not scale > 0.0:
+        return []
+    names = [(name, read_as) for name, read_as in product(_UNITS, repeat=2) if name != read_as]
+    factors = np.array([_UNITS[name] / _UNITS[read_as] for name, read_as in names])
+    apart = np.abs(np.log(scale / factors))
+    best = int(apart.argmin())
+    if apart[best] >= within:
+        return []
+    return [Found(finding=Finding.SCALE, size=float(factors[best]), unit="in {}, read as {}".format(*names[best]))]
 
 
 def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: bool) -> _Begin:
@@ -364,7 +375,8 @@ def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: b
         frame, left = aligned[told].attitude
         angle = float(Rotation.from_matrix(frame @ begin.state.rotation.T).magnitude())
         kind = Finding.ATTITUDE if left < _ALIKE else Finding.ATTITUDE_UNRELATED
-        return begin._replace(findings=[*begin.findings, Found(finding=kind, size=angle)])
+        unit = _angles_named(begin.command, begin.sensor, about.lag) if kind is Finding.ATTITUDE_UNRELATED else None
+        return begin._replace(findings=[*begin.findings, Found(finding=kind, size=angle, unit=unit)])
     frame = aligned[best].frame
     command, sensor = _read_as(begin.command, begin.sensor, *best)
     state, found = begin.state, list(begin.findings)
@@ -459,14 +471,26 @@ def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     most = (_LOOSELY if loosely else _ODD if odd else _UNEXPLAINED) * spread
     if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > most**2:
         said = [one for one in found if one.finding is Finding.SCALE and one.unit]
-        return Registration(findings=(*said, _unexplained(begin.command, begin.sensor, fit.left() / spread)))
+        unexplained = _unexplained(begin.command, begin.sensor, fit.state.angle.lag, fit.left() / spread)
+        return Registration(findings=(*said, unexplained))
     return _told(fit, begin, loose, blind, own)
 
 
-def _unexplained(command: Sequence[Motion], sensor: Sequence[Motion], share: float) -> Found:
+def _unexplained(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, share: float) -> Found:
     """That no frame explains a share of the motion, and whether it may be as the commands tell no orientation."""
     told_less = command[0].quaternion is None and sensor[0].quaternion is not None
-    return Found(finding=Finding.UNEXPLAINED, size=share, source="command" if told_less else None)
+    unit = _angles_named(command, sensor, lag)
+    return Found(finding=Finding.UNEXPLAINED, size=share, source="command" if told_less else None, unit=unit)
+
+
+def _angles_named(command: Sequence[Motion], sensor: Sequence[Motion], lag: float) -> str | None:
+    """That angles are of another unit, where the tool is told to turn as many times as far as deg are of rad."""
+    turns = ratio(command, sensor, lag, turns=True)
+    if turns > 0.0 and abs(abs(np.log(turns)) - np.log(DEG)) < _ANGLES:
+        told, seen = ("deg read as rad", "rad read as deg")[:: 1 if turns > 1.0 else -1]
+        asked = f"are its angles {seen}, or the commanded {told}?"
+        return f"the tool is told to turn {turns:.2g} times as far as is seen: {asked}"
+    return None
 
 
 def _jitter(sensor: Sequence[Motion]) -> float:
@@ -512,6 +536,8 @@ def _told(
     told = [Quantity(one, (one - by, one + by)) for one, by in zip(values.tolist(), half.tolist(), strict=True)]
     position, rotation = (Response(lag=a, delay=b, time_constant=c) for a, b, c in (told[12:15], told[15:18]))
     noise = fit.off.rms()
+    turned = values[3:6] - loose @ (loose.T @ values[3:6])
+    along = is_here(state.centre - begin.mean, turned)
     return Registration(
         frame=_registered(told[:6]),
         marker=_registered(told[6:12]),
@@ -520,8 +546,13 @@ def _told(
         rms=noise[0],
         rms_rotation=noise[1] if begin.attitude else None,
         rows=len(fit.off.blocks[0]),
-        findings=tuple(begin.findings),
+        findings=(*begin.findings, *([Found(finding=Finding.ALONG_BASE)] if along else [])),
     )
+
+
+def is_here(at: Vector | FloatArray, rotation: Vector | FloatArray) -> bool:
+    """Whether a place [m] and a rotation vector [rad] are zero, as nearly as an arm tells."""
+    return bool(np.linalg.norm(at) < _HERE and np.linalg.norm(rotation) < _AS_TURNED)
 
 
 def _registered(told: Sequence[Quantity]) -> Registered:

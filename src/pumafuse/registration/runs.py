@@ -15,6 +15,7 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray
 from ..discovery.guesses import guess
+from ..discovery.own_frames import own_frames
 from ..discovery.roles import relations
 from ..discovery.survey import Survey
 from ..errors import ConfigError, PumafuseWarning, RunError, UnknownNameError
@@ -32,12 +33,14 @@ from ..toml import Interval
 from ..tuning.latency import first_guess
 from ..units import Kind, seconds
 from .beside import later
-from .findings import AS_READ, Vector
+from .findings import AS_READ, Finding, Vector
 from .joints import Later, Told, joint_lags
 from .motion import Answer, Motion, Plant
-from .register import Quantity, Registered, Registration, Response, registered
+from .register import Quantity, Registered, Registration, Response, is_here, registered
 
 FIXED = ("marker", "latency")  # what can be left as it is
+_AS_CONFIGURED, _ALONG_BASE = "stays as configured", "is taken to measure along the base's axes"
+_LEFT_OUT = "is left out, as it seems to stand in a frame of its own"
 _DIGITS = 6  # of m and rad in a configuration: a micrometre
 _SHORTEST = 1e-3  # s, of a plant
 _SUREST = 1e-5  # s, of half the interval of a lag: no stamps are finer
@@ -48,7 +51,7 @@ class RegisteredSensor(msgspec.Struct, frozen=True, kw_only=True):
     """What was found of one sensor.
 
     Attributes:
-        frame: Where it stands; None where a finding prevents it.
+        frame: Where it stands; None where a finding prevents it. Of a sensor along the base's axes none is configured.
         marker: What it sees on the tool, likewise.
         lag: From a command to what the sensor tells of it, at constant velocity: the arm's lag and the sensor's latency
             together [s].
@@ -126,7 +129,7 @@ def register(
         runs: Recorded runs of one set-up.
         config: Arm and sensors, whose markers are where the search begins; the arm's lag is believed. None: the arm is
             found, too, and the earliest sensor is taken to have no latency.
-        sensor: The one to register; None: each that gives x, y and z.
+        sensor: The one to register; None: each that gives x, y and z. One that does not is named.
         fix: ``marker``: it stays as configured. ``latency``: likewise, and the arm's delay is what they leave.
         along_base: Sensors that measure along the base's axes, and are only compared.
 
@@ -146,27 +149,33 @@ def register(
     if fixed and config is None:
         raise ConfigError(f"--fix {fixed[0]}: as configured where? Give a configuration (-c)")
     names = _sensors(every, config, sensor)
-    joints = _joints(every, names) if config is None else config.arm.joints
+    left = [] if sensor else [name for name in _known(every, config) if name not in {*names, *along_base}]
+    aside = {name for run in every for name in own_frames(run)} & set(left) if left and config is None else set[str]()
+    instead = _AS_CONFIGURED if config else _ALONG_BASE
+    notes = [_not_registered(every, name, _LEFT_OUT if name in aside else instead) for name in left]
+    every = [_without(run, aside | (_incomplete(run) & set(names))) for run in every]
+    joints = _joints([_complete(run) for run in every], names) if config is None else config.arm.joints
     config = config and _with_joints(config, {})  # they are heeded in the commands from here on
     later = {name: joint.later for name, joint in joints.items()}
     every = [replace(run, command=run.command.delayed(later)) for run in every]
-    found = {name: _registered(every, name, config, fixed="marker" in fixed) for name in names}
+    whole = [_complete(run) for run in every]
+    found = {name: _registered(whole, name, config, fixed="marker" in fixed) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
+    placed |= {name: _without_frame(one) for name, one in placed.items() if _is_along_base(one)}
     placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
     said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
     if not placed:
-        raise RunError("; ".join(note for notes in said.values() for note in notes))
+        raise RunError("; ".join(note for mine in said.values() for note in mine))
     begun = _arm(every, placed) if config is None else with_tool(config, every[0])
     if "latency" in fixed:
         begun = _as_late(begun, placed)
         latencies = {name: _exactly(begun.sensors[name].latency) for name in placed if not _as_read(placed[name])}
     else:
-        latencies = _latencies(every, placed, begun, None if config is None else _lag(config.arm))
+        latencies = _latencies(whole, placed, begun, None if config is None else _lag(config.arm))
     details = {name: _details(one, latencies.get(name), said[name]) for name, one in found.items()}
     config = _configuration(every, placed, latencies, begun) if config is None else _placed(begun, placed, latencies)
-    for notes in said.values():
-        for note in notes:
-            warnings.warn(note, PumafuseWarning, stacklevel=2)
+    for note in (*(note for mine in said.values() for note in mine), *notes):
+        warnings.warn(note, PumafuseWarning, stacklevel=2)
     named = [run.name for run in every]
     summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=named, sensors=details, joints=joints)
     return Registrations(_with_joints(config, joints), summary)
@@ -223,19 +232,46 @@ def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | Non
                            f" {', '.join(run.command.values) or 'orientations'}")  # fmt: skip
     if config is not None and not set(CARTESIAN) <= config.arm.axes.keys():
         raise ConfigError(f"arm '{config.arm.name}': sensors are registered along axes x, y and z, which it has not")
-    every = dict.fromkeys(name for run in runs for name in run.sensors)
-    known = list(every) if config is None else [name for name in every if name in config.sensors]
+    known = _known(runs, config)
     if sensor is not None and sensor not in known:
         raise UnknownNameError("--sensor", "sensor", sensor, known)
-    names = [
-        name
-        for name in ([sensor] if sensor else known)
-        if any(name in run.sensors and set(CARTESIAN) <= run.sensors[name].values.keys() for run in runs)
-    ]
+    names = [name for name in ([sensor] if sensor else known) if any(name in _complete(run).sensors for run in runs)]
     if not names:
-        others = f"are: {', '.join(every)}" if every else "is none"
-        raise RunError(f"no sensor gives x, y and z, by which it could be registered; there {others}")
+        lacking = "; ".join(_lacking(runs, name) for name in ([sensor] if sensor else known))
+        raise RunError(f"no sensor gives x, y and z, by which it could be registered: {lacking or 'there is none'}")
     return names
+
+
+def _known(runs: Sequence[Run], config: FusionConfig | None) -> list[str]:
+    """The sensors of all runs; of a configuration only those in it."""
+    every = dict.fromkeys(name for run in runs for name in run.sensors)
+    return [name for name in every if config is None or name in config.sensors]
+
+
+def _complete(run: Run) -> Run:
+    """A run with the sensors that give x, y and z."""
+    return _without(run, _incomplete(run))
+
+
+def _incomplete(run: Run) -> set[str]:
+    """The sensors of a run that do not give x, y and z."""
+    return {name for name, one in run.sensors.items() if not set(CARTESIAN) <= one.values.keys()}
+
+
+def _without(run: Run, names: Collection[str]) -> Run:
+    return replace(run, sensors={name: one for name, one in run.sensors.items() if name not in names})
+
+
+def _lacking(runs: Sequence[Run], name: str) -> str:
+    """What a sensor lacks to be registered."""
+    given = {axis for run in runs if name in run.sensors for axis in run.sensors[name].values}
+    missing = [axis for axis in CARTESIAN if axis not in given]
+    return f"sensor '{name}' gives no {' and no '.join(missing)}"
+
+
+def _not_registered(runs: Sequence[Run], name: str, instead: str) -> str:
+    """What to say of a sensor that does not give x, y and z."""
+    return f"{_lacking(runs, name)}, without which it is not registered, and {instead}: add what is missing (run.toml)"
 
 
 def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, fixed: bool) -> Registration:
@@ -357,6 +393,17 @@ def _without_place(one: Registration) -> Registration:
     return msgspec.structs.replace(one, frame=None, marker=None)
 
 
+def _is_along_base(one: Registration) -> bool:
+    """Whether a sensor measures along the base's axes, as far as the motion tells."""
+    return any(found.finding is Finding.ALONG_BASE for found in one.findings)
+
+
+def _without_frame(one: Registration) -> Registration:
+    """The same of a sensor that needs no frame, nor a marker where that is the tool point."""
+    seen = one.marker if one.marker and not is_here(one.marker.at, one.marker.rotation) else None
+    return msgspec.structs.replace(one, frame=None, marker=seen)
+
+
 def _measured(source: Source) -> Motion:
     """What a sensor tells, without what is no news: values that it repeats, and zeros, as it writes them when lost."""
     motion = _motion(source)
@@ -406,7 +453,7 @@ def _placed(config: FusionConfig, found: Mapping[str, Registration], latencies: 
             frame=_placement(one.frame),
             marker=_placement(one.marker),
             latency=round(latencies[name].value, _DIGITS) if name in latencies else config.sensors[name].latency,
-            bias_sd=_biases(config.sensors[name], constants, count) if one.frame is not None else 0.0,
+            bias_sd=_biases(config.sensors[name], constants, count) if one.frame else config.sensors[name].bias_sd,
         )
         for name, one in found.items()
     }

@@ -25,6 +25,7 @@ _STANDS = 1e-9  # m
 _MOVED = 1e-3  # m, within a window
 _LEVER = 0.1  # m, about, from a tool point to what is seen: a tool that turns in place moves it
 _OUTLIER = 5  # rows of a running median
+_OVER = (0.6, 0.06)  # s: noise counts little beside lengths; degrees read as rad turn by less than half a turn
 _APART = (0.09, 0.21, 0.37)  # of all rows: between orientations that are compared
 _HALF_TURN = 2.6  # rad, beyond which the axis of a rotation may point either way
 
@@ -106,6 +107,21 @@ def _ratio(told: Sequence[list[FloatArray]], seen: Sequence[list[FloatArray]], s
     if all(len(one) > 1 for one in told):
         turned = _beside([(a[1], b[0], at) for a, b, at in zip(told, seen, starts, strict=True)], lag)[0]
         moved = np.hypot(moved, _LEVER * turned)
+    return median(moved[fast]) / max(median(distance[fast]), _STANDS)
+
+
+def ratio(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, *, turns: bool) -> float:
+    """How far the tool is told to move, or to turn, over how far it is seen to, where it is fast; NaN if untold."""
+    steps, place = round(_OVER[turns] / _TICK), int(turns)
+    told, seen = ([_speeds(one, steps, held=held) for one in of] for of, held in ((command, True), (sensor, False)))
+    if any(len(one) <= place for one in (*told, *seen)):
+        return np.nan
+    starts = [round((b.time[0] - a.time[0]) / _TICK) for a, b in zip(command, sensor, strict=True)]
+    pairs = [(a[place], b[place], at) for a, b, at in zip(told, seen, starts, strict=True)]
+    moved, distance = _beside(pairs, round(lag / _TICK))
+    if not len(moved):
+        return np.nan
+    fast = moved >= np.quantile(moved, _FAST)
     return median(moved[fast]) / max(median(distance[fast]), _STANDS)
 
 
