@@ -105,6 +105,7 @@ class Registration(msgspec.Struct, frozen=True, kw_only=True):
         position: The response of positions.
         rotation: That of orientations; None where it was taken to be that of positions.
         rms: What is left of positions [m].
+        noise: White noise of a coordinate, by second differences [m].
         rms_rotation: What is left of orientations [rad]; None where they were not used.
         rows: How many measurements were looked at.
         findings: What is wrong or not told.
@@ -115,6 +116,7 @@ class Registration(msgspec.Struct, frozen=True, kw_only=True):
     position: Response | None = None
     rotation: Response | None = None
     rms: float | None = None
+    noise: float = 0.0
     rms_rotation: float | None = None
     rows: int = 0
     findings: tuple[Found, ...] = ()
@@ -544,6 +546,7 @@ def _told(
         position=position,
         rotation=rotation if own else None,
         rms=noise[0],
+        noise=_jitter(begin.sensor),
         rms_rotation=noise[1] if begin.attitude else None,
         rows=len(fit.off.blocks[0]),
         findings=(*begin.findings, *([Found(finding=Finding.ALONG_BASE)] if along else [])),

@@ -14,6 +14,7 @@ import numpy as np
 
 from .. import toml
 from ..arrays import FloatArray
+from ..discovery.contents import period_of
 from ..discovery.guesses import guess
 from ..discovery.own_frames import own_frames
 from ..discovery.roles import relations
@@ -43,6 +44,7 @@ _AS_CONFIGURED, _ALONG_BASE = "stays as configured", "is taken to measure along 
 _LEFT_OUT = "is left out, as it seems to stand in a frame of its own"
 _DIGITS = 6  # of m and rad in a configuration: a micrometre
 _SHORTEST = 1e-3  # s, of a plant
+_FARTHEST = 1e6  # m: what is farther is a sentinel, no position
 _SUREST = 1e-5  # s, of half the interval of a lag: no stamps are finer
 _NO_EVIDENCE = 3.0  # times what the arm may be off: commands and sensors share it, and do not bear each other out
 
@@ -154,6 +156,8 @@ def register(
     instead = _AS_CONFIGURED if config else _ALONG_BASE
     notes = [_not_registered(every, name, _LEFT_OUT if name in aside else instead) for name in left]
     every = [_without(run, aside | (_incomplete(run) & set(names))) for run in every]
+    if config is not None and any(run.command.joints is None for run in every):
+        notes += config.arm.unheeded()
     joints = _joints([_complete(run) for run in every], names) if config is None else config.arm.joints
     config = config and _with_joints(config, {})  # they are heeded in the commands from here on
     later = {name: joint.later for name, joint in joints.items()}
@@ -173,12 +177,25 @@ def register(
     else:
         latencies = _latencies(whole, placed, begun, None if config is None else _lag(config.arm))
     details = {name: _details(one, latencies.get(name), said[name]) for name, one in found.items()}
-    config = _configuration(every, placed, latencies, begun) if config is None else _placed(begun, placed, latencies)
+    if config is None:
+        kept = placed.keys() if sensor else None
+        config = _configuration([_as_registered(run, placed, kept) for run in every], placed, latencies, begun)
+    else:
+        config = _placed(begun, placed, latencies)
     for note in (*(note for mine in said.values() for note in mine), *notes):
         warnings.warn(note, PumafuseWarning, stacklevel=2)
     named = [run.name for run in every]
     summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=named, sensors=details, joints=joints)
     return Registrations(_with_joints(config, joints), summary)
+
+
+def _as_registered(run: Run, found: Mapping[str, Registration], kept: Collection[str] | None) -> Run:
+    """The run without orientations that do not follow the commanded ones, and with some sensors alone, if any are."""
+    sensors = dict(run.sensors)
+    for name, one in found.items():
+        if name in sensors and one.rms_rotation is None and run.command.orientation is not None:
+            sensors[name] = replace(sensors[name], orientation=None)
+    return replace(run, sensors={name: one for name, one in sensors.items() if kept is None or name in kept})
 
 
 def _with_joints(config: FusionConfig, joints: dict[str, Joint]) -> FusionConfig:
@@ -407,8 +424,9 @@ def _without_frame(one: Registration) -> Registration:
 def _measured(source: Source) -> Motion:
     """What a sensor tells, without what is no news: values that it repeats, and zeros, as it writes them when lost."""
     motion = _motion(source)
+    far = ~(np.abs(motion.position) < _FARTHEST).all(axis=1)
     again = (np.diff(motion.position, axis=0, prepend=np.nan) == 0.0).all(axis=1)
-    return motion._replace(position=np.where((again | lost(motion.position))[:, None], np.nan, motion.position))
+    return motion._replace(position=np.where((far | again | lost(motion.position))[:, None], np.nan, motion.position))
 
 
 def _details(one: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:
@@ -468,10 +486,15 @@ def _constants(arm: ArmModel, found: Mapping[str, Registration]) -> dict[str, fl
     """
     placed = [one for one in found.values() if one.frame is not None]
     left: dict[Kind, float] = {
-        "length": max((one.rms or 0.0 for one in placed), default=0.0),
+        "length": max((_beyond_noise(one) for one in placed), default=0.0),
         "angle": max((one.rms_rotation or 0.0 for one in placed), default=0.0),
     }
     return {axis: left[arm.axes[axis].kind] for axis in (*CARTESIAN, *TURNING) if axis in arm.axes}
+
+
+def _beyond_noise(one: Registration) -> float:
+    """What a registration leaves of positions beyond the white noise of their three coordinates [m]."""
+    return float(np.sqrt(max((one.rms or 0.0) ** 2 - 3.0 * one.noise**2, 0.0)))
 
 
 def _biases(sensor: Sensor, constants: Mapping[str, float], count: int) -> dict[str, float]:
@@ -489,7 +512,7 @@ def _arm(runs: Sequence[Run], found: Mapping[str, Registration]) -> FusionConfig
     axes = {axis: AxisModel(plant=_plant(response)) for axis in CARTESIAN}
     if tool is not None:
         axes |= {axis: _turning(found.values(), response) for axis in TURNING}
-    period = float(np.median(np.diff(runs[0].command.stamp))) / 1e9
+    period = period_of(runs[0].command)
     arm = ArmModel(
         name="registered",
         update_period=float(f"{period:.4g}"),
