@@ -14,7 +14,7 @@ from pumafuse.model.arm import ArmModel, AxisModel, Gain, Validity, commanded_sp
 from pumafuse.model.plants import FirstOrder, SecondOrder
 from pumafuse.units import ending
 
-TOP = "name, update_period_ms, delay_ms, delay_ms_ci95, validity, axes, provenance"
+TOP = "name, update_period_ms, delay_ms, delay_ms_ci95, validity, axes, joints, provenance"
 
 ARM = """\
 name = "bench"
