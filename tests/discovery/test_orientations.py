@@ -286,3 +286,35 @@ def test_rows_of_a_sensor_that_is_lost_have_no_orientation(tmp_path: Path) -> No
     run, _ = check_follows(survey(log(tmp_path / "log", quaternion(told), lost)), tmp_path / "out")
     orientation = run.sensors["tracker"].orientation
     assert orientation is not None and np.isnan(orientation[:, 0]).sum() == 35
+
+
+def test_poses_without_a_header_are_poses(tmp_path: Path) -> None:
+    """Eight columns t x y z qx qy qz qw: four have norm 1. The second frame is seen."""
+    frame = Rotation.from_rotvec([0.3, -1.2, 2.0])
+    for name, late, where in (("command", 0.0, None), ("camera", LATE, frame)):
+        columns, rotation = poses(late=late, frame=where)
+        table = np.column_stack([*columns.values(), *quaternion(rotation).values()])
+        np.savetxt(tmp_path / f"{name}.csv", table, "%.7f", ",")
+    found = survey(tmp_path)
+    assert list(found.own_frames) == ["camera"]
+    assert found.roles is not None
+    for stream in (found.roles.command, *found.roles.sensors):
+        assert stream.attitude is not None
+        assert stream.attitude.columns.quaternion == ("column 5", "column 6", "column 7", "column 8")
+        assert stream.attitude.columns.order == "xyzw"
+        assert {axis: signals[0].column for axis, signals in stream.axes.items()} == {
+            "x": "column 2", "y": "column 3", "z": "column 4"
+        }  # fmt: skip
+    assert any("w the last of column 5" in question for question in asked(found))
+
+
+def test_seven_joints_without_a_header_are_no_pose(tmp_path: Path) -> None:
+    """Their norm is not 1."""
+    t = 0.02 * np.arange(700)
+    path = np.column_stack([np.sin(t * (0.4 + 0.1 * joint)) for joint in range(7)])
+    late = np.column_stack([np.interp(t - LATE, t, one) for one in path.T])
+    for name, value in (("command", path), ("encoder", late)):
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack([t, value]), "%.7f", ",")
+    found = survey(tmp_path)
+    assert found.roles is not None and found.roles.command.attitude is None
+    assert len(found.roles.command.axes) == 7

@@ -39,6 +39,7 @@ _QUATERNION = re.compile(
 _NAMED, _NUMBERED = "wxyz", ("0123", "1234")  # parts of a quaternion, in the order of letters
 _ANGLE = re.compile(rf"{_FRONT}(?P<part>(?i:r[xyz]|roll|pitch|yaw|[abcwprxyz])|[0-5]){_BACK}")
 _EULER = {("a", "b", "c"): "kuka", ("w", "p", "r"): "fanuc", ("roll", "pitch", "yaw"): "rpy"}
+_NAMELESS = re.compile(r"column \d+")
 _UR = re.compile(r"(?i)tcp_?pose[_\[]$")  # x, y, z in m and a rotation vector in rad
 
 
@@ -101,7 +102,7 @@ def may_be_part(name: str) -> bool:
 def attitudes_in(table: Table, paths: Iterable[str]) -> list[Attitude]:
     """The orientations of a table; ``paths`` are those of its numbers."""
     paths = list(paths)
-    return [*_quaternions(table, paths), *_angles(table, paths)]
+    return [*_quaternions(table, paths), *_without_header(table, paths), *_angles(table, paths)]
 
 
 def _plain(table: Table, columns: Sequence[str]) -> FloatArray | None:
@@ -136,6 +137,20 @@ def _quaternions(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
         doubt = f"is w the first of {x}, {y}, {z}, {w}? No name says it (run.toml, order)" if parts != _NAMED else ""
         quaternion = rotations.of_quaternions(value, made.order)
         yield Attitude(made, quaternion, "a guess: w first" if doubt else "by name", doubt=doubt)
+
+
+def _without_header(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
+    """Seven columns without names, x, y, z and four of norm 1, as TUM's and ETH's files of poses have them: w last."""
+    order = [path for path in paths if _NAMELESS.fullmatch(path)]
+    for first in range(len(order) - 6):
+        place, (x, y, z, w) = order[first : first + 3], order[first + 3 : first + 7]
+        position, value = _plain(table, place), _plain(table, [x, y, z, w])
+        if position is None or value is None or not _moves(position) or not _are_units(value):
+            continue
+        made = Orientation(quaternion=(x, y, z, w), order="xyzw")
+        doubt = f"is w the last of {x}, {y}, {z}, {w}? Their norm is 1, and no name says it (run.toml, order)"
+        axes = dict(zip(place, CARTESIAN, strict=True))
+        yield Attitude(made, rotations.of_quaternions(value, made.order), "a norm of 1: w last", axes, doubt=doubt)
 
 
 def _are_units(value: FloatArray) -> bool:

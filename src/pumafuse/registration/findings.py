@@ -84,6 +84,7 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
                     else f"{self.unit} (run.toml)"
                     if self.unit
                     else "are units, the order and the unit of orientations right, of the commands, too (run.toml)?"
+                    " A path that drifts, or poses that no arm commands, leave as much"
                 )
                 what = f"moves with the tool, and no frame explains how: {100.0 * size:.0f} % are left; {why}"
             case Finding.MIRRORED:
