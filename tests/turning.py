@@ -17,6 +17,7 @@ LATE = 0.060  # s, from a command to the tool
 LATENCY = 0.010  # s, of the camera
 CORNER, CORNER_TURNED = np.array([2.1, -1.3, 0.7]), Rotation.from_rotvec([-148.0, 52.0, -7.0], degrees=True)
 MARKER, MARKER_TURNED = np.array([0.03, -0.05, 0.12]), Rotation.from_rotvec([65.0, -41.0, -6.0], degrees=True)
+SHOWN = (("sensors", CORNER, CORNER_TURNED), ("tool/markers", MARKER, MARKER_TURNED))  # below /path of a picture in 3D
 SD, SD_DEG = 2e-4, 0.1  # m, of the camera
 COLUMNS = ("x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw")
 RUN = "".join(

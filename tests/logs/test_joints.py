@@ -86,7 +86,7 @@ def test_an_arm_whose_joints_lag_apart_says_where_they_are_not_heeded(tmp_path: 
     )
     assert pf.ArmModel.parse(arm.to_toml()) == arm
     run = read(tmp_path, ROBOT + HEAD + JOINTS)
-    heeded, posed = run.heeding(arm), replace(run, command=replace(run.command, joints=None)).heeding(arm)
+    heeded, posed = run.delayed(arm), replace(run, command=replace(run.command, joints=None)).delayed(arm)
     assert not any("heeded" in note for note in heeded.notes)
     np.testing.assert_array_equal(heeded.command.values["x"], run.command.delayed({"j2": 0.03}).values["x"])
     assert [note for note in posed.notes if "j2 30 ms" in note and "not heeded" in note]

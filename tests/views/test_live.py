@@ -189,10 +189,8 @@ def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(
     assert (turned * Rotation.from_quat(now["q"]).inv()).magnitude() < 1e-6
     half = newest(path, "/path/uncertainty", "Transform3D:mat3x3")[0].reshape(3, 3)
     assert np.allclose(half, np.diag(10.0 * np.sqrt(chi2.ppf(0.95, 3)) * sd), rtol=1e-5)
-    for entity, at, placed in (
-        ("/path/sensors/camera", turning.CORNER, turning.CORNER_TURNED),
-        ("/path/tool/markers/camera", turning.MARKER, turning.MARKER_TURNED),
-    ):
+    for place, at, placed in turning.SHOWN:
+        entity = f"/path/{place}/camera"
         assert np.allclose(newest(path, entity, "Transform3D:translation", static=True), at * 1e3, atol=1e-3)
         found = Rotation.from_quat(newest(path, entity, "Transform3D:quaternion", static=True)[0])
         assert (found * placed.inv()).magnitude() < 1e-6

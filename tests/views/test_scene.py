@@ -103,10 +103,8 @@ def test_measurements_lie_where_they_put_the_tool(fused: tuple[pf.Estimates, Pat
 def test_a_sensor_stands_in_the_scene_and_its_marker_on_the_tool(fused: tuple[pf.Estimates, Path]) -> None:
     """Both with their names, in mm and as they are turned."""
     _, path = fused
-    for entity, at, turned in (
-        ("/path/sensors/camera", turning.CORNER, turning.CORNER_TURNED),
-        ("/path/tool/markers/camera", turning.MARKER, turning.MARKER_TURNED),
-    ):
+    for place, at, turned in turning.SHOWN:
+        entity = f"/path/{place}/camera"
         assert np.allclose(numbers(path, entity, "Transform3D:translation", static=True), at * 1e3, atol=1e-3)
         found = Rotation.from_quat(numbers(path, entity, "Transform3D:quaternion", static=True)[0])
         assert (found * turned.inv()).magnitude() < 1e-6

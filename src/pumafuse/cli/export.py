@@ -33,7 +33,7 @@ def run(config: Path, output: Path, force: bool) -> None:
     if not known.sensors:
         raise ConfigError(f"{config}: has no sensor: without one there is nothing to fuse")
     LiveEstimator(known)  # refuses what it cannot follow
-    warn(known.arm.doubts() + known.arm.unheeded())
+    warn(known.arm.doubts() + known.arm.joint_doubts())
     write_file(output, header(known, name, str(config)), replace=force)
     axes = ", ".join(known.arm.axes)
     typer.echo(f"{name}_model, of {axes} measured by {', '.join(known.sensors)}, written to {output}")

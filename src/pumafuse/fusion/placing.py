@@ -48,7 +48,7 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
             no orientation in a row of a piece.
         ConfigError: The tool's orientation is needed and nothing tells it.
     """
-    run = without_strays(run).heeding(config.arm)
+    run = without_strays(run).delayed(config.arm)
     config = with_tool(config, run)
     tool = config.tool.reference if config.tool else None
     of_tool = {
@@ -155,8 +155,7 @@ def _check_turned(name: str, source: Source, oriented: FloatArray, run: Run) -> 
     if not len(known) or not len(seen):
         return
     last = np.clip(np.searchsorted(given[known], source.stamp[seen], side="right") - 1, 0, None)
-    alike = np.abs(np.sum(command[known[last]] * oriented[seen], axis=1))
-    off = float(np.median(2.0 * np.arccos(np.clip(alike, 0.0, 1.0))))
+    off = float(np.median(rotations.angle_between(oriented[seen], command[known[last]])))
     if off > _ELSEWHERE:
         raise RunError(
             f"{source.label_for(name)}: it tells the tool to be turned {np.degrees(off):.0f}° from where it is"

@@ -125,7 +125,7 @@ def verify(
     names = (sensors,) if isinstance(sensors, str) else sensors
     chosen = _with_sources(run, None if names is None else tuple(names))
     config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
-    parts, jumps = segments(in_axes(chosen.heeding(arm), None)[0])
+    parts, jumps = segments(in_axes(chosen.delayed(arm), None)[0])
     found: list[tuple[AxisVerification, Trace]] = []
     for number, part in enumerate(parts, 1):
         name = run.name if len(parts) == 1 else f"{run.name}, part {number}"

@@ -57,7 +57,7 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
     """
     if run.clock != "stamps" and run.has_orientation:
         raise RunError(f"run '{run.name}': with orientations its clock = '{run.clock}' cannot be replayed; fuse it")
-    for part in segments(run.heeding(config.arm))[0]:
+    for part in segments(run.delayed(config.arm))[0]:
         yield from _paced(*_arrivals(part, config), speed)
 
 

@@ -362,10 +362,10 @@ class Run:
         since, until = self.ends(origin)
         return (stamp >= since) & (stamp <= until) if self.interval else np.ones(len(stamp), dtype=np.bool_)
 
-    def heeding(self, arm: ArmModel) -> Run:
+    def delayed(self, arm: ArmModel) -> Run:
         """The run with joints told as much later as they answer, with a note where this would need other commands."""
         if self.command.joints is None:
-            return replace(self, notes=tuple(dict.fromkeys([*self.notes, *arm.unheeded()])))
+            return replace(self, notes=tuple(dict.fromkeys([*self.notes, *arm.joint_doubts()])))
         return replace(self, command=self.command.delayed(arm.later))
 
     def each(self, change: Callable[[str, Source], Source]) -> Run:

@@ -256,7 +256,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """By how much each joint answers later than the first [s]."""
         return {name: joint.later for name, joint in self.joints.items()}
 
-    def unheeded(self) -> list[str]:
+    def joint_doubts(self) -> list[str]:
         """A sentence if joints answer later than the axes do, of which commands that are not in joints tell nothing."""
         late = ", ".join(f"{name} {by * MS:.3g} ms" for name, by in self.later.items() if by)
         return [f"joints that answer later ({late}) are not heeded: the commands are not in joints"] if late else []

@@ -14,10 +14,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray
-from .intervals import Blocks, blocks, inverse
+from .intervals import inverse
 from .motion import Motion, Plant
 from .register import Quantity, Registration, rows_of, thinned, within
-from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, residual, slopes, weights
+from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, residual, slopes, tell
 
 Later = Mapping[str, float]  # of each joint [s]
 Told = Callable[[Later], Sequence[Motion]]  # the commands of each run, with joints told later [s]
@@ -98,20 +98,13 @@ def _step(told: Told, later: Later, sensor: Sequence[Motion], found: Registratio
         np.concatenate([one[:, :, _BESIDE], by], axis=2)
         for one, by in zip(slopes(rows, state, off.poses), by_joint, strict=True)
     ]
-    before = _told(slope, off.blocks, off.noise())
+    before = tell(slope, off.blocks, off.noise(), expected=False)
     step = -inverse(before.information.sum(axis=0)) @ before.score.sum(axis=0)
-    after = _told(slope, [one + by @ step for one, by in zip(off.blocks, slope, strict=True)], off.noise())
+    after = tell(
+        slope, [one + by @ step for one, by in zip(off.blocks, slope, strict=True)], off.noise(), expected=True
+    )
     own = slice(-len(later), None)
     return _Step(step[own], after.half_widths(np.eye(len(step))[own]), off.noise())
-
-
-def _told(slope: Sequence[FloatArray], off: Sequence[FloatArray], noise: FloatArray) -> Blocks:
-    """What rows tell of a step that are so far off and change so with it, positions and orientations."""
-    parts = list[Blocks]()
-    for by, one, sd in zip(slope, off, noise.tolist(), strict=True):
-        weight = weights(np.linalg.norm(one, axis=1), sd) / sd**2
-        parts.append(blocks(by, one, weight, weight))
-    return Blocks(*(np.sum(one, axis=0) for one in zip(*parts, strict=True)))
 
 
 def _seen(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:

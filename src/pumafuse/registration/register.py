@@ -16,7 +16,7 @@ from ..fusion.config import Placement
 from ..space.rotations import crossed, left_jacobian
 from ..toml import Interval
 from ..units import DEG
-from .findings import Finding, Found, Reading, Vector
+from .findings import AS_READ, Finding, Found, Reading, Vector
 from .motion import Answer, Motion, Plant
 from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, fitted
 from .start import Rough, aligned_turns, despiked, kabsch, ratio, read, rough, unit
@@ -120,6 +120,16 @@ class Registration(msgspec.Struct, frozen=True, kw_only=True):
     rms_rotation: float | None = None
     rows: int = 0
     findings: tuple[Found, ...] = ()
+
+    @property
+    def read_otherwise(self) -> bool:
+        """Whether rows had to be read otherwise than run.toml says, which is to be mended first."""
+        return any(found.finding in AS_READ for found in self.findings)
+
+    @property
+    def along_base(self) -> bool:
+        """Whether the sensor measures along the base's axes, as far as the motion tells."""
+        return any(found.finding is Finding.ALONG_BASE for found in self.findings)
 
 
 def registered(

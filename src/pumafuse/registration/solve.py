@@ -8,6 +8,7 @@ Cauchy's distribution would have it, by how far it is off as a whole: no axes ar
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -193,11 +194,17 @@ def _normal(rows: Rows, state: State, off: Off, noise: FloatArray, free: FloatAr
         expected: Whether the information is that of Cauchy's curvature, of which intervals are made, or the larger one
             of Gauss and Newton, which leads down more safely.
     """
+    inner = [slope @ free for slope in slopes(rows, state, off.poses)]
+    return tell(inner, off.blocks, noise, expected=expected)
+
+
+def tell(slope: Sequence[FloatArray], off: Sequence[FloatArray], noise: FloatArray, *, expected: bool) -> Blocks:
+    """What rows tell of a step that are so far off and change so with it, positions and orientations together."""
     parts = list[Blocks]()
-    for slope, one, sd in zip(slopes(rows, state, off.poses), off.blocks, noise.tolist(), strict=True):
+    for inner, one, sd in zip(slope, off, noise.tolist(), strict=True):
         weight = weights(_length(one), sd)
         told = curvature(weight) if expected else weight
-        parts.append(blocks(slope @ free, one, told / sd**2, weight / sd**2))
+        parts.append(blocks(inner, one, told / sd**2, weight / sd**2))
     return Blocks(*(np.sum(one, axis=0) for one in zip(*parts, strict=True)))
 
 
