@@ -189,3 +189,12 @@ def test_the_validation_figure_draws_what_it_judges() -> None:
         assert len(mine.value) == len(run.sensors["camera"].stamp) - 1
         assert series.get_title(loc="left") == f"{name}, camera. {found.verdict}"
         np.testing.assert_allclose([bar.get_height() for bar in correlation.patches[:20]], found.correlation)
+
+
+def test_the_title_names_the_sensors_that_are_fused() -> None:
+    """One that the configuration has not is in the run, and not in the title."""
+    _, run = case(sensors=("camera", "tracker"))
+    est, _ = case(sensors=("camera",))
+    with pytest.warns(pf.PumafuseWarning, match="tracker"):
+        title = fused_figure(pf.fuse(run, est.config)).get_suptitle()
+    assert "camera" in title and "tracker" not in title

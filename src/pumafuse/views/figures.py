@@ -326,7 +326,8 @@ def _figure(est: Estimates, rows: int, labels: Sequence[str], ratios: Sequence[f
         yield canvas
         for axes, label in zip(canvas.axes[-len(labels) :], labels, strict=True):
             axes.set_xlabel(label)
-        sensors = ", ".join(est.measurements.sensors) or "commands only"
+        used = [name for name in est.measurements.sensors if name in est.config.sensors]
+        sensors = ", ".join(used) or "commands only"
         canvas.figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
 
 
