@@ -351,6 +351,23 @@ def test_the_lag_is_that_of_the_arm_and_the_latency_together() -> None:
     assert found.position.lag.value == pytest.approx(sum(setup.plants[0]) + setup.latency, abs=3e-4)
 
 
+def test_along_the_one_axis_of_a_tool_the_frame_makes_up_for_the_marker() -> None:
+    """It turns about the base's z only: across that the frame's place is told, within its interval, and along it not.
+
+    Nor are the marker's numbers, which lies along an axis of its own that is askew; its turn is.
+    """
+    setup = Setup(3, seconds=20.0, axes=np.array([[0.0, 0.0, 1.0]]))
+    found = registered(*([one] for one in setup.run()))
+    assert [one.finding for one in found.findings] == [Finding.ONE_AXIS]
+    assert found.frame is not None and found.marker is not None
+    assert np.isfinite([*found.frame.at_ci95, *found.marker.at_ci95]).all(axis=1).tolist() == [True, True] + 4 * [False]
+    np.testing.assert_allclose(found.frame.at[:2], setup.at[:2], atol=1e-3)
+    along = setup.start.inv().apply([0.0, 0.0, 1.0])
+    moved, lifted = np.array(found.marker.at) - setup.marker, found.frame.at[2] - setup.at[2]
+    np.testing.assert_allclose(moved, lifted * along, atol=1e-3)
+    assert np.isfinite([*found.frame.rotation_ci95, *found.marker.rotation_ci95]).all()
+
+
 def columns(path: Path, *names: str) -> np.ndarray:
     table = np.genfromtxt(path, delimiter=",", names=True)
     return np.stack([table[name] for name in names], axis=-1)
