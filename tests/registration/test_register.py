@@ -324,7 +324,8 @@ def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None
     for turn, move in ((0.0, 0.0), (1.0, 0.0), (0.0, 5e-3)):
         setup = Setup(6, seconds=20.0, orientation=orientation, shared=not orientation, wrong=1.0)
         setup.frame = Rotation.from_rotvec([0.0, 0.0, turn], degrees=True)
-        middle = np.array([0.5, -0.2, 0.4])  # of the motion, about which the sensor is turned
+        setup.marker = np.zeros(3)
+        middle = np.array([0.5, -0.2, 0.4])  # of what it sees, about which the sensor is turned: that stays in place
         setup.at = middle - setup.frame.apply(middle) + [move, 0.0, 0.0]
         found = registered(*([one] for one in setup.run()))
         assert (Finding.ALONG_BASE in [one.finding for one in found.findings]) is (turn == move == 0.0)

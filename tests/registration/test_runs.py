@@ -423,6 +423,15 @@ def test_the_delay_that_latencies_leave_is_that_of_the_surer_sensor(both: Regist
     assert moved == pytest.approx([found.config.arm.delay_of("x") - given.arm.delay_of("x")], abs=2e-6)
 
 
+def test_an_arm_that_is_configured_leaves_the_latencies(both: Registrations) -> None:
+    """One that is 20 ms earlier than the earliest sensor saw it: its latency is these, and the other's 30 ms more."""
+    earlier = msgspec.structs.replace(both.config.arm, delay=both.config.arm.delay - 0.02)
+    found = pf.register(two_sensors(), msgspec.structs.replace(both.config, arm=earlier))
+    late = [found.config.sensors[name].latency for name in ("early", "late")]
+    assert late == pytest.approx([0.02, 0.05], abs=3e-4)
+    assert found.config.arm == earlier
+
+
 def test_orientations_that_do_not_follow_are_not_fused() -> None:
     """Those in a frame of their own are named, and the configuration that is written has no noise of them."""
     with pytest.warns(
