@@ -28,11 +28,13 @@ from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.questions import decisions, questions
 from pumafuse.discovery.survey import Survey, survey
 from pumafuse.errors import RunError
+from pumafuse.space.kinematics import Chain
 from pumafuse.units import wraps
 from refusals import one_line
 
 START = 1_790_000_000  # s
 LAG = 0.1  # s
+URDF = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"
 
 
 def path(t: FloatArray) -> FloatArray:
@@ -1134,3 +1136,48 @@ def test_whole_turns_that_are_commanded_and_a_fast_rotation_are_no_restart() -> 
     fast = 0.93 * turn * np.arange(400.0)
     wild = np.repeat(rng.uniform(-3.0, 3.0, 40) * turn, 20) + rng.normal(0.0, 1e-3, 800)
     assert [len(wraps(one)) for one in (steps, fast, wild)] == [0, 0, 0]
+
+
+def test_a_run_in_joints_is_drafted_for_another_folder(tmp_path: Path) -> None:
+    """The tables and the robot of the log's own run.toml are found from there: the commands are the same poses."""
+    folder = tmp_path / "log"
+    folder.mkdir()
+    (folder / "arm.urdf").write_text(URDF.read_text(encoding="utf-8"), encoding="utf-8")
+    t = 0.02 * np.arange(1000)
+    at = np.radians([107.0, 45.0, 161.0, 19.0, 64.0, -98.0]) + 0.4 * np.sin(np.outer(t, np.arange(3.0, 9.0) / 5.0))
+    joints = [f"j{one}" for one in range(1, 7)]
+    write(folder / "told.csv", {"t_s": t} | dict(zip(joints, np.degrees(at).T, strict=True)))
+    chain = Chain.load(folder / "arm.urdf", "base_link", "tool0")
+    seen = np.column_stack([np.interp(t - LAG, t, one) for one in chain.pose(at)[0].T])
+    write(folder / "camera.csv", {"t_s": t} | dict(zip(("x_m", "y_m", "z_m"), seen.T, strict=True)))
+    lines = [
+        *("[robot]", 'urdf = "arm.urdf"', 'base = "base_link"', 'tip = "tool0"'),
+        *("[command]", 'file = "told.csv"', 'time = "t_s"'),
+        "joints = { " + ", ".join(f'{one} = {{ column = "{one}", unit = "deg" }}' for one in joints) + " }",
+        *("[sensors.camera]", 'file = "camera.csv"', 'time = "t_s"', 'x = "x_m"', 'y = "y_m"', 'z = "z_m"'),
+    ]
+    (folder / "run.toml").write_text("\n".join(lines))
+    run, config = written(survey(folder), tmp_path / "beside" / "out")
+    given = pf.Run.read(folder)
+    for axis in "xyz":
+        np.testing.assert_array_equal(run.command.values[axis], given.command.values[axis])
+    np.testing.assert_array_equal(run.command.orientation, given.command.orientation)
+    assert config.arm.lag_of("x") == pytest.approx(LAG, abs=0.02)
+
+
+@pytest.mark.parametrize("given", ["xy", "xyz"])
+def test_a_sensor_that_lacks_what_a_frame_is_found_by_is_told_so(given: str, tmp_path: Path) -> None:
+    """One that does not follow and gives no z; not one that gives all three."""
+    t, u, s, z = recorded()
+    turned = z[:, [1, 2, 0]]
+    write(tmp_path / "goal.csv", {"t_s": t} | {f"{axis}_m": one for axis, one in zip("xyz", u.T, strict=True)})
+    write(tmp_path / "camera.csv", {"t_s": s} | {f"{axis}_m": one for axis, one in zip("xyz", turned.T, strict=True)})
+    tables = {"command": ("goal", "xyz"), "sensors.camera": ("camera", given)}
+    text = "".join(
+        f'[{table}]\nfile = "{file}.csv"\ntime = "t_s"\n' + "".join(f'{axis} = "{axis}_m"\n' for axis in axes)
+        for table, (file, axes) in tables.items()
+    )
+    (tmp_path / "run.toml").write_text(text)
+    said = "\n".join(asked(survey(tmp_path)))
+    assert ("It gives no z, without which no frame of its own is found" in said) is (given == "xy")
+    assert "camera does not follow the commands on x" in said

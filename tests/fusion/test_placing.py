@@ -113,6 +113,28 @@ def test_zeros_of_a_sensor_that_lost_its_target_are_not_followed() -> None:
         np.testing.assert_array_equal(zeros[axis].position, nothing[axis].position)
 
 
+@pytest.mark.parametrize("degrees", [-180.0, -35.0, -25.0, 0.0, 25.0, 35.0])
+def test_a_sensor_by_which_the_tool_is_turned_as_no_arm_is_is_refused(degrees: float) -> None:
+    """Beyond 30 degrees from where it is commanded to be for most of the run: with that angle, and what to give."""
+    run, _, oriented = pose_run()
+    wrong = Rotation.from_rotvec([0.0, degrees, 0.0], degrees=True)
+    marker = PLACE["marker"] | {"rotation_vector_deg": (MARKER * wrong).as_rotvec(degrees=True).tolist()}
+    given = config(camera=CAMERA | PLACE | {"marker": marker})
+    last = np.searchsorted(run.command.stamp, run.sensors["camera"].stamp, side="right") - 1
+    told = oriented * MARKER * (MARKER * wrong).inv()
+    apart = Rotation.from_quat(run.command.orientation[last]).inv() * told
+    median = float(np.degrees(np.median(apart.magnitude())))
+    assert (median > 30.0) is (abs(degrees) > 30.0)
+    if median > 30.0:
+        what = (
+            rf"turned {median:.0f}° from where it is commanded to be: give rotation_vector_deg of sensors.camera.mark"
+        )
+        with pytest.raises(pf.RunError, match=what):
+            in_base(run, given)
+    else:
+        in_base(run, given)
+
+
 @pytest.mark.parametrize("mode", ["filtered", "smoothed", "as-live"])
 def test_a_run_that_is_turned_as_a_whole_gives_the_turned_estimate(mode: pf.fusion.estimates.Mode) -> None:
     """Commands, frame and reference orientation turned by Q: p becomes Q p and θ Q θ, to 1e-9."""

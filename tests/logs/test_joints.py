@@ -12,6 +12,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.axes import in_axes
+from pumafuse.space.kinematics import Joints
 
 RECORDED = Path(__file__).parents[1] / "space" / "commands.csv"  # joints and the poses that they are, of a PUMA 560
 URDF = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"
@@ -102,3 +103,42 @@ def test_a_clock_that_is_set_back_begins_anew(tmp_path: Path) -> None:
     parts = [command.rows(rows).delayed({"j2": 0.05}).joints for rows in (slice(None, half), slice(half, None))]
     assert whole is not None
     np.testing.assert_allclose(whole.values, np.concatenate([part.values for part in parts if part]), atol=1e-12)
+
+
+def test_rows_in_any_order_and_rows_without_a_value_are_told_later_all_the_same(tmp_path: Path) -> None:
+    """Two neighbours that are exchanged have what they have in order; a row without a joint is as if it were not."""
+    command = read(tmp_path, ROBOT + HEAD + JOINTS).command
+    rows = np.arange(len(command.stamp))
+    exchanged, others, late = rows.copy(), np.delete(rows, 60), {"j2": 0.05, "j5": 0.01}
+    exchanged[[40, 41]] = 41, 40
+    assert command.joints is not None
+    values = command.joints.values.copy()
+    values[60, 3] = np.nan
+    whole, mixed, lacking, without = (
+        one.delayed(late).joints
+        for one in (
+            command,
+            command.rows(exchanged),
+            command.posed(Joints(command.joints.chain, values)),
+            command.rows(others),
+        )
+    )
+    assert whole is not None and mixed is not None and lacking is not None and without is not None
+    np.testing.assert_array_equal(mixed.values, whole.values[exchanged])
+    np.testing.assert_array_equal(lacking.values[others], without.values)
+    assert np.isnan(lacking.values[60, 3])
+
+
+def test_commands_between_commands_are_on_the_line_of_joints(tmp_path: Path) -> None:
+    """Half-way the joints are at their mean, and the tool is where these put it: on an arc, not on the chord."""
+    command = read(tmp_path, ROBOT + HEAD + JOINTS).command
+    finer = command.interpolated(0.5 / 36.0)
+    assert command.joints is not None and finer.joints is not None
+    between = 0.5 * (command.joints.values[1:] + command.joints.values[:-1])
+    np.testing.assert_allclose(finer.joints.values[1::2], between, atol=1e-12)
+    position, orientation = command.joints.chain.pose(between)
+    np.testing.assert_allclose(np.column_stack([finer.values[axis] for axis in "xyz"])[1::2], position, atol=1e-9)
+    assert finer.orientation is not None
+    np.testing.assert_allclose(finer.orientation[1::2], orientation, atol=1e-9)
+    chord = 0.5 * (command.values["x"][1:] + command.values["x"][:-1])
+    assert np.abs(chord - position[:, 0]).max() > 1e-6

@@ -9,7 +9,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.arrays import FloatArray
-from pumafuse.logs.screening import Habit
+from pumafuse.logs.screening import Habit, lost
 
 PERIOD, LAG = 0.025, 0.075  # s
 TIME = PERIOD * np.arange(2400)
@@ -177,3 +177,9 @@ def test_live_a_sensor_that_froze_is_held(stuck: float | None) -> None:
     assert np.abs(found - clean).max() < 5e-3
     assert estimator.health().sensors["rule"].outcomes["held"] >= 398
     assert any("'rule' repeats its value of slide" in one for one in said)
+
+
+def test_a_coordinate_that_is_zero_is_no_lost_target() -> None:
+    """Only all three are, which a sensor does not measure of what is in front of it; nor is what has no value."""
+    position = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3], [0.0, -0.2, 0.3], [np.nan, 0.0, 0.0]])
+    assert lost(position).tolist() == [True, False, False, False]

@@ -53,6 +53,16 @@ def test_what_is_later_is_told_with_its_sign() -> None:
     assert found.value == pytest.approx(0.012, abs=5e-4)
 
 
+def test_a_frame_that_is_wrong_costs_nothing() -> None:
+    """By 3 % of its lengths and 2 degrees, which is 5 mm at the ends of the path: as sure as beside a right one."""
+    first, second = pair(0.012, 7)
+    wrong = np.eye(3) + 0.03 * np.random.default_rng(8).normal(size=(3, 3))
+    found, right = (later([first], [second._replace(position=second.position @ by)]) for by in (wrong, np.eye(3)))
+    assert found is not None and right is not None
+    assert found.value == pytest.approx(right.value, abs=5e-5)
+    assert found.half < 2.0 * right.half < 4e-4
+
+
 def test_too_little_in_common_tells_nothing() -> None:
     """Sensors of different times, or of half a second, are not compared."""
     first, second = pair(0.0, 3)

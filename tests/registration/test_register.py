@@ -324,7 +324,8 @@ def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None
     for turn, move in ((0.0, 0.0), (1.0, 0.0), (0.0, 5e-3)):
         setup = Setup(6, seconds=20.0, orientation=orientation, shared=not orientation, wrong=1.0)
         setup.frame = Rotation.from_rotvec([0.0, 0.0, turn], degrees=True)
-        middle = np.array([0.5, -0.2, 0.4])  # of the motion, about which the sensor is turned
+        setup.marker = np.zeros(3)
+        middle = np.array([0.5, -0.2, 0.4])  # of what it sees, about which the sensor is turned: that stays in place
         setup.at = middle - setup.frame.apply(middle) + [move, 0.0, 0.0]
         found = registered(*([one] for one in setup.run()))
         assert (Finding.ALONG_BASE in [one.finding for one in found.findings]) is (turn == move == 0.0)
@@ -349,6 +350,23 @@ def test_the_lag_is_that_of_the_arm_and_the_latency_together() -> None:
     found = registered([command], [sensor])
     assert found.position is not None
     assert found.position.lag.value == pytest.approx(sum(setup.plants[0]) + setup.latency, abs=3e-4)
+
+
+def test_along_the_one_axis_of_a_tool_the_frame_makes_up_for_the_marker() -> None:
+    """It turns about the base's z only: across that the frame's place is told, within its interval, and along it not.
+
+    Nor are the marker's numbers, which lies along an axis of its own that is askew; its turn is.
+    """
+    setup = Setup(3, seconds=20.0, axes=np.array([[0.0, 0.0, 1.0]]))
+    found = registered(*([one] for one in setup.run()))
+    assert [one.finding for one in found.findings] == [Finding.ONE_AXIS]
+    assert found.frame is not None and found.marker is not None
+    assert np.isfinite([*found.frame.at_ci95, *found.marker.at_ci95]).all(axis=1).tolist() == [True, True] + 4 * [False]
+    np.testing.assert_allclose(found.frame.at[:2], setup.at[:2], atol=1e-3)
+    along = setup.start.inv().apply([0.0, 0.0, 1.0])
+    moved, lifted = np.array(found.marker.at) - setup.marker, found.frame.at[2] - setup.at[2]
+    np.testing.assert_allclose(moved, lifted * along, atol=1e-3)
+    assert np.isfinite([*found.frame.rotation_ci95, *found.marker.rotation_ci95]).all()
 
 
 def columns(path: Path, *names: str) -> np.ndarray:

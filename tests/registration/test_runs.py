@@ -20,8 +20,9 @@ from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
 from bag_files import definition_of
+from pumafuse.registration.motion import Motion
 from pumafuse.registration.register import registered as registration
-from pumafuse.registration.runs import RegisteredSensor
+from pumafuse.registration.runs import RegisteredSensor, Registrations
 from setups import Setup
 
 RUNS = Path(__file__).parents[2] / "examples" / "pose-virtual"
@@ -353,3 +354,89 @@ def test_a_motion_along_one_axis_is_registered_as_far_as_it_tells() -> None:
         found = pf.register(run).details.sensors["camera"]
     assert {"line", "along-base"} <= {*found.findings}
     assert found.lag == pytest.approx(0.09, abs=1e-3)  # 0.1 s behind the path, half a period less behind held commands
+
+
+def of_columns(motion: Motion) -> dict[str, np.ndarray]:
+    """What a motion has for :meth:`pumafuse.Run.from_arrays`."""
+    turns = {} if motion.quaternion is None else {"orientation": motion.quaternion}
+    return dict(zip("xyz", motion.position.T, strict=True)) | turns
+
+
+SETUP = partial(Setup, 5, seconds=30.0, wrong=1.0, outliers=0.0)
+
+
+def two_sensors(turned: Rotation | None = None) -> pf.Run:
+    """One that sees the tool point alone, and a noisier one 30 ms later that sees a marker and how it is turned."""
+    early, late = SETUP(orientation=False), SETUP(sd=0.5e-3)
+    early.marker = np.zeros(3)
+    (command, pose), point = late.run(), early.run()[1]
+    if turned is not None:
+        pose = pose._replace(quaternion=(turned * Rotation.from_quat(pose.quaternion)).as_quat())
+    sensors = {"early": (point.time, of_columns(point)), "late": (pose.time + 0.03, of_columns(pose))}
+    return pf.Run.from_arrays(command.time, of_columns(command), sensors)
+
+
+@pytest.fixture(scope="module")
+def both() -> Registrations:
+    return pf.register(two_sensors())
+
+
+def test_the_arm_answers_as_the_earliest_sensor_saw_it(both: Registrations) -> None:
+    """In position; in orientation as the later one saw it, less what that is later. Its latency is 30 ms, to 0.1 ms."""
+    (of_points, of_turns), arm = SETUP().lags, both.config.arm
+    assert [arm.lag_of(axis) for axis in "xyz"] == pytest.approx([of_points] * 3, abs=3e-4)
+    assert [arm.lag_of(axis) for axis in ("rx", "ry", "rz")] == pytest.approx([of_turns] * 3, abs=3e-4)
+    assert both.config.sensors["early"].latency == 0.0
+    assert both.config.sensors["late"].latency == pytest.approx(0.03, abs=1e-4)
+
+
+def test_white_noise_is_no_error_of_the_arm(both: Registrations) -> None:
+    """It errs by 0.5 mm and 0.2 degrees, of which each of two sensors has √2 times as much: the noise is left out.
+
+    An offset to begin with is three times as unsure as the arm is off.
+    """
+    told, config = both.details.sensors["late"], both.config
+    assert told.angular_rms is not None
+    for sensor in config.sensors.values():
+        for axis in "xyz":
+            assert 0.6 < sensor.bias_sd_of(axis) / (np.sqrt(2.0) * 0.5e-3) < 1.4
+        for axis in ("rx", "ry", "rz"):
+            assert sensor.bias_sd_of(axis) == pytest.approx(np.sqrt(2.0) * told.angular_rms, rel=0.05)
+            assert config.start.offset_sd_of(axis) == pytest.approx(3.0 * told.angular_rms, rel=1e-3)
+
+
+def test_the_delay_that_latencies_leave_is_that_of_the_surer_sensor(both: Registrations) -> None:
+    """Where fixed latencies contradict each other each counts as its lag is sure; on axes with own delays, too."""
+    latencies = {"early": 0.01, "late": 0.06}  # s; as they are one is 30 ms later
+    sensors = {name: msgspec.structs.replace(one, latency=latencies[name]) for name, one in both.config.sensors.items()}
+    given = msgspec.structs.replace(both.config, sensors=sensors)
+    found = pf.register(two_sensors(), given, fix=["latency"])
+    of_arm, weight = list[float](), list[float]()
+    for name, one in found.details.sensors.items():
+        assert one.lag is not None and one.lag_ci95 is not None
+        of_arm.append(one.lag - latencies[name])
+        weight.append((one.lag_ci95[1] - one.lag_ci95[0]) ** -2)
+    wanted = np.average(of_arm, weights=weight)
+    assert abs(wanted - np.mean(of_arm)) > 3e-3
+    assert found.config.arm.lag_of("x") == pytest.approx(wanted, abs=2e-6)
+    moved = [after.delay_of("rx") - before.delay_of("rx") for after, before in [(found.config.arm, given.arm)]]
+    assert moved == pytest.approx([found.config.arm.delay_of("x") - given.arm.delay_of("x")], abs=2e-6)
+
+
+def test_an_arm_that_is_configured_leaves_the_latencies(both: Registrations) -> None:
+    """One that is 20 ms earlier than the earliest sensor saw it: its latency is these, and the other's 30 ms more."""
+    earlier = msgspec.structs.replace(both.config.arm, delay=both.config.arm.delay - 0.02)
+    found = pf.register(two_sensors(), msgspec.structs.replace(both.config, arm=earlier))
+    late = [found.config.sensors[name].latency for name in ("early", "late")]
+    assert late == pytest.approx([0.02, 0.05], abs=3e-4)
+    assert found.config.arm == earlier
+
+
+def test_orientations_that_do_not_follow_are_not_fused() -> None:
+    """Those in a frame of their own are named, and the configuration that is written has no noise of them."""
+    with pytest.warns(
+        pf.PumafuseWarning, match="another frame than positions, turned by 5[78].*: its orientations are not"
+    ):
+        found = pf.register(two_sensors(Rotation.from_rotvec([0.0, 1.0, 0.0])), sensor="late")
+    assert list(found.config.sensors) == ["late"]
+    assert "x" in found.config.sensors["late"].sd and "rx" not in found.config.sensors["late"].sd

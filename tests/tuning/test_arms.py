@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -122,6 +124,24 @@ def test_what_an_arm_leaves_is_found(number: int, kind: str) -> None:
         assert likely.walk == pytest.approx(5e-3, rel=0.2)
     else:
         assert (likely.disturbance_sd, likely.disturbance_time) == pytest.approx((0.02, 0.3), rel=0.35)
+
+
+@pytest.mark.parametrize("believed", [False, True])
+def test_noise_is_believed_to_be_nine_tenths_of_what_second_differences_show(believed: bool) -> None:
+    """Within a factor of 1.9: log-posteriors are the likelihood less half the square of that, at a maximum."""
+    one, arm = recording(3), Arm(0.05, 0.08)
+    measured = Measured([one], T, ["a"])
+    left = one.value - response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+    shown = np.median(np.abs(np.diff(left, 2))) / (0.6745 * np.sqrt(6.0))
+
+    def posterior(rest: Rest) -> float:
+        x = np.log(rest.sd[0] / (0.9 * shown)) / np.log(1.9)
+        return float(measured.weighed([arm], rest)[0][0]) - 0.5 * x**2 * believed
+
+    for rest, log in rests(measured, arm, 0.04, [1e-6], believed):
+        assert log == pytest.approx(posterior(rest), abs=1e-3)
+        beside = [posterior(replace(rest, sd=rest.sd * by)) for by in (0.7, 1.4)]
+        assert max(beside) < log + 0.05
 
 
 def test_jitter_is_white_noise_beside_a_smooth_motion() -> None:

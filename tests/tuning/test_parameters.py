@@ -71,6 +71,19 @@ def test_what_can_be_fitted() -> None:
     assert parameters(SHARED, SHARED, SENSORS, ["bias"]) == []  # no bias drifts
 
 
+def test_a_noise_is_believed_within_a_factor_and_not_below_what_is_resolved() -> None:
+    """The prior is of the ratio: 1.9 times as much costs ½, as does a 1.9th; only of the sensor and axis it is of."""
+    at, fine, coarse = ("tracker", "radial"), {("camera", "radial"): 2e-5}, {("camera", "vertical"): 1e-12}
+    free = {one.key: one for one in parameters(CONFIG, CONFIG, SENSORS, FITS, (), fine | coarse, {at: 4e-5})}
+    noise = free["sensors.tracker.sd_mm.radial"]
+    for factor, log in ((1.0, 0.0), (1.9, -0.5), (1.0 / 1.9, -0.5), (1.9**2, -2.0)):
+        assert noise.log_prior(noise.put(CONFIG, factor * 4e-5)) == pytest.approx(log, abs=1e-9)
+    assert all(one.prior is None for one in free.values() if one.is_noise and one is not noise)
+    unbounded = of("sensors.camera.sd_mm.radial").bounds
+    assert free["sensors.camera.sd_mm.radial"].bounds == (2e-5, unbounded[1])
+    assert free["sensors.camera.sd_mm.vertical"].bounds == noise.bounds == unbounded
+
+
 @pytest.mark.parametrize("scale", [1.0, -1.0, 0.06, 1e3])
 def test_a_scale_stays_within_half_of_what_is_configured(scale: float) -> None:
     """So it is never 0, and never turns its sign."""

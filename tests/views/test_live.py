@@ -194,6 +194,9 @@ def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(
         assert np.allclose(newest(path, entity, "Transform3D:translation", static=True), at * 1e3, atol=1e-3)
         found = Rotation.from_quat(newest(path, entity, "Transform3D:quaternion", static=True)[0])
         assert (found * placed.inv()).magnitude() < 1e-6
+    away = np.linalg.norm(point - 1e3 * turning.CORNER)
+    length = newest(path, "/path/sensors/camera", "TransformAxes3D:axis_length", static=True)[0]
+    assert length == pytest.approx(0.15 * away, rel=0.2)  # it stood there when the first estimate came
 
     _, z, turn = given["camera"]
     lever = (turning.CORNER_TURNED * turn * turning.MARKER_TURNED.inv()).apply(turning.MARKER)

@@ -14,8 +14,10 @@ from scipy.stats import chi2
 
 import pumafuse as pf
 import turning
+from pumafuse.fusion.config import Placement
 from pumafuse.logs.frames import Cylindrical
 from pumafuse.views.rerun import to_rerun
+from pumafuse.views.scene import cell_eye
 from recordings import columns, times
 
 VIEWER = Path(sys.executable).parent / "rerun"
@@ -101,14 +103,18 @@ def test_measurements_lie_where_they_put_the_tool(fused: tuple[pf.Estimates, Pat
 
 
 def test_a_sensor_stands_in_the_scene_and_its_marker_on_the_tool(fused: tuple[pf.Estimates, Path]) -> None:
-    """Both with their names, in mm and as they are turned."""
-    _, path = fused
+    """Both with their names, in mm and as they are turned; the axes of a sensor as long as 0.15 of its distance."""
+    est, path = fused
     for place, at, turned in turning.SHOWN:
         entity = f"/path/{place}/camera"
         assert np.allclose(numbers(path, entity, "Transform3D:translation", static=True), at * 1e3, atol=1e-3)
         found = Rotation.from_quat(numbers(path, entity, "Transform3D:quaternion", static=True)[0])
         assert (found * turned.inv()).magnitude() < 1e-6
         assert numbers(path, entity, "Points3D:labels", static=True).tolist() == ["camera"]
+        length = numbers(path, entity, "TransformAxes3D:axis_length", static=True)[0]
+        away = np.linalg.norm(est.pose.position.mean(axis=0) - turning.CORNER)
+        tool = numbers(path, "/path/tool", "TransformAxes3D:axis_length", static=True)[0]
+        assert length == pytest.approx(0.5 * tool if "markers" in entity else 0.15 * 1e3 * away, rel=1e-4)
 
 
 def test_a_robot_whose_joints_are_commanded_moves(tmp_path: Path) -> None:
@@ -139,6 +145,23 @@ def test_a_robot_whose_joints_are_commanded_moves(tmp_path: Path) -> None:
     still = replace(run, command=replace(run.command, joints=None))
     to_rerun(pf.fuse(still, config), still, tmp_path / "still.rrd")
     assert not columns(tmp_path / "still.rrd", "/path/robot") and "cell [mm]" not in layout(tmp_path / "still.rrd")
+
+
+@pytest.mark.parametrize("at", [(2.1, -1.3, 0.7), (-3.0, 0.4, -0.2)])
+def test_the_eye_sees_the_whole_cell(at: tuple[float, float, float]) -> None:
+    """Path, base, sensor and robot lie within 30 degrees of where it looks, in mm; it stands on the right and above."""
+    path = 0.4 + 0.1 * np.random.default_rng(1).normal(size=(50, 3))
+    links = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.6], [0.4, 0.4, 0.4]])
+    eye = cell_eye(path, [Placement(at=at), None], links)
+    assert eye is not None and eye.position is not None and eye.look_target is not None
+    place, target = (np.array(one.as_arrow_array().to_pylist()[0]) for one in (eye.position, eye.look_target))
+    towards, all_of = target - place, 1e3 * np.vstack([path, links, [at], np.zeros((1, 3))])
+    rays = all_of - place
+    cosine = rays @ towards / (np.linalg.norm(rays, axis=1) * np.linalg.norm(towards))
+    assert np.degrees(np.arccos(cosine)).max() < 30.0
+    assert np.linalg.norm(towards) < 1.5 * np.linalg.norm(np.ptp(all_of, axis=0))  # no farther than it needs
+    assert np.sign(-towards).tolist() == [1.0, -1.0, 1.0]
+    assert cell_eye(path, [None]) is None
 
 
 def test_the_layout_opens_on_the_tool_and_the_cell(fused: tuple[pf.Estimates, Path]) -> None:
