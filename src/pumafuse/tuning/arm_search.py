@@ -125,15 +125,15 @@ class ArmSearch:
         """
         self._measured, self.freedom, self.sensors = measured, freedom, measured.sensors
         self._longest = longest_delay(measured.period)
-        self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
-        self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
-        self._fits = self._by_least_squares() if near is None else near._fits
-        still = {model: fit for model, fit in self._fits.items() if model.gain == "static"}
-        gain = self._best(still).arm.gain if still else 1.0
-        low, high = _USUAL_GAIN
-        gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
-        self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
-        peaks, branches = self._peaks(least, believed), list[Branch]()
+        self.plain = plain_arm(measured)
+        self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS) if near is None else near.limits
+        self._fits = dict[Model, Fit]() if near is None else near._fits
+        begin = self._by_least_squares() if near is None else near.best
+        if near is None:
+            (low, high), gain = _USUAL_GAIN, begin.gain
+            gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
+            self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
+        peaks, branches = self._peaks(begin, least, believed), list[Branch]()
         for evidence, model, peak in peaks:
             walked = (one for one in branches if one.model == model)
             if evidence > peaks[0][0] - _FORLORN and not any(
@@ -144,15 +144,20 @@ class ArmSearch:
         self.posterior = AxisPosterior(branches)
 
     @property
+    def best(self) -> Arm:
+        """The most likely arm of all models."""
+        return max(self._fits.values(), key=lambda one: one.log_posterior).arm
+
+    @property
     def likely_noise(self) -> dict[str, float]:
         """The white noise that each sensor is believed to have [m]."""
-        found = SHOWN * self._measured.jitter(self._best(self._fits).arm)
+        found = SHOWN * self._measured.jitter(self.best)
         return dict(zip(self.sensors, found.tolist(), strict=True))
 
     @property
     def spread(self) -> float:
         """How far the measurements are from the best arm, as a standard deviation [m]."""
-        return float(self._measured.white(self._best(self._fits).arm).sd[0])
+        return float(self._measured.white(self.best).sd[0])
 
     def arm(self, model: Model, delay: float | None = None) -> Arm:
         """The most likely arm of a model; the one with this dead time [s]."""
@@ -178,15 +183,16 @@ class ArmSearch:
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
-    def _by_least_squares(self) -> dict[Model, Fit]:
-        """Each model, from the grid: noise that is fitted to a poor arm explains what a better one would."""
+    def _by_least_squares(self) -> Arm:
+        """The arm of the largest model without a recovery: noise that is fitted to a poorer one explains its errors."""
         whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
+        self.rest = Rest(np.ones(len(self.sensors)))
         self.rest = self._measured.white(self._on_grid(1)[0])
-        found = self._fitted(self._on_grid(_STARTS))
-        self.rest = self._measured.white(self._best(found).arm)
-        found = self._fitted([self._best(found).arm], found)
+        model = [one for one in self.freedom.models if one.gain != "recovering" or len(self.freedom.gains) == 1][-1]
+        starts = self._likeliest(model, self._on_grid(_STARTS), _STARTS)
+        found = max((self._fit(model, arm) for arm in starts), key=lambda one: one.log_posterior)
         self._measured = whole
-        return found
+        return found.arm
 
     def _likely(self, found: Mapping[Model, Fit]) -> dict[Model, Fit]:
         """Those models that a better noise could still bring near the best."""
@@ -194,14 +200,14 @@ class ArmSearch:
         least = max(evidence.values()) - _NEARLY
         return {model: fit for model, fit in found.items() if evidence[model] > least}
 
-    def _peaks(self, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
+    def _peaks(self, begin: Arm, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
         for _ in range(_GATED):
-            self.rest = self._likely_rest(self._best(self._fits).arm, least, believed)
-            self._measured = self._measured.gated(self._best(self._fits).arm, self.rest, _GATE)
-        self._fits = self._likely(self._fitted([self._best(self._fits).arm, *self._on_grid(1)], self._fits))
-        self.rest = self._likely_rest(self._best(self._fits).arm, least, believed)
-        self._fits = self._likely(self._fitted([self._best(self._fits).arm], self._fits))
+            self.rest = self._likely_rest(begin, least, believed)
+            self._measured = self._measured.gated(begin, self.rest, _GATE)
+        self._fits = self._likely(self._fitted([begin, *self._on_grid(1)], self._fits))
+        self.rest = self._likely_rest(self.best, least, believed)
+        self._fits = self._likely(self._fitted([self.best], self._fits))
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
         highest = max(one[0] for one in every)
         for evidence, model, fit in list(every) if "delay" in self.freedom.free else ():
@@ -240,15 +246,14 @@ class ArmSearch:
         prices = [WANDERS, dearer + SMOOTHER, dearer]
         return max(zip(found, prices, strict=True), key=lambda one: one[0][1] - one[1])[0][0]
 
-    def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None) -> dict[Model, Fit]:
+    def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit]) -> dict[Model, Fit]:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
-        found = dict[Model, Fit]()
+        found, arms = dict[Model, Fit](), list(starts)
         for model in known or self.freedom.models:
-            arms = starts if not found else [self._best(found).arm]
-            tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, 1 if known else 2)]
-            if known:
-                tries.append(self._fit(model, known[model].arm))
-            found[model] = max(tries, key=lambda one: one.log_posterior)
+            tries = self._likeliest(model, arms, 1 if known else 2)
+            tries += [known[model].arm] if known else []
+            found[model] = max((self._fit(model, arm) for arm in tries), key=lambda one: one.log_posterior)
+            arms = [*starts, max(found.values(), key=lambda one: one.log_posterior).arm]
         best = max(found, key=lambda model: found[model].log_posterior)
         for ticks in _TICKS if "delay" in self.freedom.free else ():
             there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)
@@ -302,9 +307,6 @@ class ArmSearch:
     def _fit(self, model: Model, start: Arm) -> Fit:
         names = self.freedom.names(model)
         return self._measured.fitted(start, names, self.rest, self.limits)
-
-    def _best(self, found: Mapping[Model, Fit]) -> Fit:
-        return max(found.values(), key=lambda one: one.log_posterior)
 
     def _evidence(self, model: Model, fit: Fit) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly."""
