@@ -45,8 +45,9 @@ _GATED = 2  # times: outliers widen the noise by which they are told
 _GATE = 6.0  # standard deviations, from which a measurement does not count
 _EARLIER, _DAMPED = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no dead time, ζ
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
-WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
-SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
+_WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
+_SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
+_SLOWER = 1.001  # times the quickest disturbance, which is a bound
 _DOUBT = 20.0  # log-likelihood that a recovery at a bound must gain: mostly another model says the same
 _FORLORN = 8.0  # log-likelihood behind the best, from which a model or a dead time counts for nothing
 # Update periods, by which a dead time may be on a wrong bump of the likelihood
@@ -102,7 +103,7 @@ class ArmSearch:
         plain: The arm of least squares; None where nothing moves.
         limits: Where its numbers may lie.
         rest: What the best arm leaves.
-        rests: Likewise, without a disturbance, with a smooth one and with a rough one.
+        disturbed: What the rest gains by a disturbance in log-posterior, after the penalty for its numbers.
         posterior: All models that count, along their dead times.
     """
 
@@ -191,6 +192,8 @@ class ArmSearch:
         model = [one for one in self.freedom.models if one.gain != "recovering" or len(self.freedom.gains) == 1][-1]
         starts = self._likeliest(model, self._on_grid(_STARTS), _STARTS)
         found = max((self._fit(model, arm) for arm in starts), key=lambda one: one.log_posterior)
+        self.rest = self._measured.white(found.arm)  # beside which what is believed of a gain weighs less
+        found = self._fit(model, found.arm)
         self._measured = whole
         return found.arm
 
@@ -239,12 +242,20 @@ class ArmSearch:
         return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
 
     def _likely_rest(self, arm: Arm, least: Sequence[float], believed: bool) -> Rest:
-        """The most likely of what an arm leaves, after the penalty for its numbers."""
-        found = list(rests(self._measured, arm, QUICKEST * self._measured.period, least, believed))
-        self.rests = [rest for rest, _ in found]
+        """The most likely of what an arm leaves, after the penalty for its numbers.
+
+        A disturbance that is forgotten within two update periods is no motion of an arm, but noise of its sensors.
+        """
+        quickest = QUICKEST * self._measured.period
+        (without, height), *others = rests(self._measured, arm, quickest, least, believed)
         dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
-        prices = [WANDERS, dearer + SMOOTHER, dearer]
-        return max(zip(found, prices, strict=True), key=lambda one: one[0][1] - one[1])[0][0]
+        gains = [log - height - dearer + _WANDERS - _SMOOTHER * (rest.smoothness > 1.0) for rest, log in others]
+        gains = [
+            gain if rest.disturbance_time > _SLOWER * quickest else -np.inf
+            for gain, (rest, _) in zip(gains, others, strict=True)
+        ]
+        self.disturbed = max(gains)
+        return others[gains.index(self.disturbed)][0] if self.disturbed > 0.0 else without
 
     def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit]) -> dict[Model, Fit]:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
