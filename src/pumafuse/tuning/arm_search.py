@@ -128,13 +128,8 @@ class ArmSearch:
         self._longest = longest_delay(measured.period)
         self.plain = plain_arm(measured)
         self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS) if near is None else near.limits
-        self._fits = dict[Model, Fit]() if near is None else near._fits
-        begin = self._by_least_squares() if near is None else near.best
-        if near is None:
-            (low, high), gain = _USUAL_GAIN, begin.gain
-            gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
-            self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
-        peaks, branches = self._peaks(begin, least, believed), list[Branch]()
+        self._fits = self._on_excerpt(least, believed) if near is None else near._fits
+        peaks, branches = self._peaks(least, believed), list[Branch]()
         for evidence, model, peak in peaks:
             walked = (one for one in branches if one.model == model)
             if evidence > peaks[0][0] - _FORLORN and not any(
@@ -184,18 +179,36 @@ class ArmSearch:
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
+    def _on_excerpt(self, least: Sequence[float], believed: bool) -> dict[Model, Fit]:
+        """Each model, fitted to the part with the most motion."""
+        whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
+        begin = self._by_least_squares()
+        (low, high), gain = _USUAL_GAIN, begin.gain
+        gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
+        self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
+        self._gate(begin, least, believed)
+        found = self._fitted([begin, *self._on_grid(1)], {})
+        self._measured = whole
+        return found
+
     def _by_least_squares(self) -> Arm:
         """The arm of the largest model without a recovery: noise that is fitted to a poorer one explains its errors."""
-        whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
-        self.rest = Rest(np.ones(len(self.sensors)))
-        self.rest = self._measured.white(self._on_grid(1)[0])
+        arms = [] if self.plain is None or not {"delay", "lag", "gain"} <= {*self.freedom.free} else [self.plain.arm]
+        if not arms:
+            self.rest = Rest(np.ones(len(self.sensors)))
+            arms = self._on_grid(_STARTS)
+        self.rest = self._measured.white(arms[0])
         model = [one for one in self.freedom.models if one.gain != "recovering" or len(self.freedom.gains) == 1][-1]
-        starts = self._likeliest(model, self._on_grid(_STARTS), _STARTS)
+        starts = self._likeliest(model, arms, _STARTS)
         found = max((self._fit(model, arm) for arm in starts), key=lambda one: one.log_posterior)
         self.rest = self._measured.white(found.arm)  # beside which what is believed of a gain weighs less
-        found = self._fit(model, found.arm)
-        self._measured = whole
-        return found.arm
+        return self._fit(model, found.arm).arm
+
+    def _gate(self, arm: Arm, least: Sequence[float], believed: bool) -> None:
+        """Leave out what is far from an arm, beside the most likely rest."""
+        for _ in range(_GATED):
+            self.rest = self._likely_rest(arm, least, believed)
+            self._measured = self._measured.gated(arm, self.rest, _GATE)
 
     def _likely(self, found: Mapping[Model, Fit]) -> dict[Model, Fit]:
         """Those models that a better noise could still bring near the best."""
@@ -203,14 +216,12 @@ class ArmSearch:
         least = max(evidence.values()) - _NEARLY
         return {model: fit for model, fit in found.items() if evidence[model] > least}
 
-    def _peaks(self, begin: Arm, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
+    def _peaks(self, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
-        for _ in range(_GATED):
-            self.rest = self._likely_rest(begin, least, believed)
-            self._measured = self._measured.gated(begin, self.rest, _GATE)
-        self._fits = self._likely(self._fitted([begin, *self._on_grid(1)], self._fits))
-        self.rest = self._likely_rest(self.best, least, believed)
+        self._gate(self.best, least, believed)
         self._fits = self._likely(self._fitted([self.best], self._fits))
+        self.rest = self._likely_rest(self.best, least, believed)
+        self._fits = self._likely({model: self._fit(model, fit.arm) for model, fit in self._fits.items()})
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
         highest = max(one[0] for one in every)
         for evidence, model, fit in list(every) if "delay" in self.freedom.free else ():
