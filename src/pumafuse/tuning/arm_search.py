@@ -180,29 +180,21 @@ class ArmSearch:
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
     def _on_excerpt(self, least: Sequence[float], believed: bool) -> dict[Model, Fit]:
-        """Each model, fitted to the part with the most motion."""
+        """Each model, fitted to the part with the most motion: by least squares, then under what the best one leaves.
+
+        Noise that is fitted to a poor arm explains what a better one would.
+        """
         whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
-        begin = self._by_least_squares()
-        (low, high), gain = _USUAL_GAIN, begin.gain
+        self.rest = Rest(np.ones(len(self.sensors)))
+        self.rest = self._measured.white(self._on_grid(1)[0])
+        self._fits = self._fitted(self._on_grid(_STARTS), {})
+        still = {model: fit for model, fit in self._fits.items() if model.gain == "static"}
+        gain = max(still.values(), key=lambda one: one.log_posterior).arm.gain if still else 1.0
+        low, high = _USUAL_GAIN
         gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
         self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
-        self._gate(begin, least, believed)
-        found = self._fitted([begin, *self._on_grid(1)], {})
         self._measured = whole
-        return found
-
-    def _by_least_squares(self) -> Arm:
-        """The arm of the largest model without a recovery: noise that is fitted to a poorer one explains its errors."""
-        arms = [] if self.plain is None or not {"delay", "lag", "gain"} <= {*self.freedom.free} else [self.plain.arm]
-        if not arms:
-            self.rest = Rest(np.ones(len(self.sensors)))
-            arms = self._on_grid(_STARTS)
-        self.rest = self._measured.white(arms[0])
-        model = [one for one in self.freedom.models if one.gain != "recovering" or len(self.freedom.gains) == 1][-1]
-        starts = self._likeliest(model, arms, _STARTS)
-        found = max((self._fit(model, arm) for arm in starts), key=lambda one: one.log_posterior)
-        self.rest = self._measured.white(found.arm)  # beside which what is believed of a gain weighs less
-        return self._fit(model, found.arm).arm
+        return self._fits
 
     def _gate(self, arm: Arm, least: Sequence[float], believed: bool) -> None:
         """Leave out what is far from an arm, beside the most likely rest."""
@@ -219,7 +211,7 @@ class ArmSearch:
     def _peaks(self, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
         self._gate(self.best, least, believed)
-        self._fits = self._likely(self._fitted([self.best], self._fits))
+        self._fits = self._likely(self._fitted([self.best, *self._on_grid(1)], self._fits))
         self.rest = self._likely_rest(self.best, least, believed)
         self._fits = self._likely({model: self._fit(model, fit.arm) for model, fit in self._fits.items()})
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
