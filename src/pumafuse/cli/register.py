@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from .. import folders
-from ..fusion.config import FusionConfig
+from ..fusion.config import ARM_FILE, ROBOT_FILE, FusionConfig
 from ..logs.run import Run
 from ..registration.findings import AS_READ
 from ..registration.register import Registered
@@ -20,7 +20,7 @@ from ..units import DEG, MM, MS
 from .tables import print_tables, table
 
 SUMMARY = "registration.json"
-_OURS = frozenset({SUMMARY, "fusion.toml", "arm.toml"})
+_OURS = frozenset({SUMMARY, "fusion.toml", ARM_FILE, ROBOT_FILE})
 _MENDED = {one.value for one in AS_READ}  # findings after which run.toml is to be mended
 _NOT_ALL = 3  # exit code: some sensor was not registered
 

@@ -7,7 +7,7 @@ n configurations a vector is (3, n) in here and a quaternion x, y, z, w (4, n): 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray
-from ..errors import ConfigError
+from ..errors import ConfigError, UnknownNameError
 from ..units import Kind
 from .urdf import MOST, Joint, read
 
@@ -51,6 +51,21 @@ class Chain:
     def joints(self) -> tuple[str, ...]:
         """The joints that must be known."""
         return tuple(self.kinds)
+
+    def columns(self, later: Mapping[str, float], where: str) -> dict[int, int]:
+        """Which joints are later, by their places among ``joints``, and by how much [ns].
+
+        Args:
+            later: By name [s].
+            where: The file, for errors.
+
+        Raises:
+            UnknownNameError: There is no joint of such a name.
+        """
+        if unknown := next((name for name in later if name not in self.kinds), None):
+            raise UnknownNameError(f"{where}: joints of the arm", "joint", unknown, self.joints)
+        by = {self.joints.index(name): round(one * 1e9) for name, one in later.items()}
+        return {column: one for column, one in by.items() if one}
 
     @classmethod
     def load(cls, path: str | Path, base: str, tip: str) -> Chain:
