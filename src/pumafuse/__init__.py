@@ -114,9 +114,9 @@ __all__ = [
     "RegistrationSummary", "Registrations", "Robot", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary",
     "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill",
     "Source", "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis",
-    "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize",
-    "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score", "simulate", "summarise",
-    "to_rerun", "tune", "validation_figure", "verify",
+    "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary",
+    "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score",
+    "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 
