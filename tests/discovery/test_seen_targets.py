@@ -81,7 +81,7 @@ def test_what_cannot_be_registered_leaves_a_run_toml_to_be_mended(tmp_path: Path
     drift = 0.06 * np.sin(0.11 * time[:, None] * [1.0, 1.3, 0.7])
     write(log / "command.csv", time, path(time))
     write(log / "camera.csv", time, seen(time, 0.06) + drift)
-    line = refused("init", log, "-o", tmp_path / "made")
+    line = pumafuse("init", log, "-o", tmp_path / "made", code=1).stderr
     assert "no frame explains how" in line and f"{tmp_path / 'made' / 'run.toml'}: mend it" in line
     assert [one.name for one in (tmp_path / "made").iterdir()] == ["run.toml"]
     assert tuple(pf.Run.read(tmp_path / "made").sensors) == ("camera",)
