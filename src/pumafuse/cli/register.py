@@ -86,6 +86,16 @@ def _show(name: str, one: RegisteredSensor) -> None:
     if one.latency is not None:
         rows.append(["latency_ms", f"{one.latency * MS:.2f}", _limits(one.latency_ci95, MS, ".2f")])
     print_tables([table(["number", "found", "95 % interval"], rows)])
+    if one.latency is not None and one.latency_ci95 == (one.latency, one.latency):
+        typer.echo(taken(name, one.latency))
+
+
+def taken(name: str, latency: float) -> str:
+    """What to say of a latency [s] that nothing in a run tells."""
+    return (
+        f"the latency of {name} is taken to be {latency * MS:.4g} ms, not found: error bars do not count how far off"
+        " that is; by each ms the position is off by what the tool moves in it (fusion.toml, latency_ms)"
+    )
 
 
 def _places(what: str, found: Registered) -> list[list[str]]:

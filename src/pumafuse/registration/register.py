@@ -25,6 +25,7 @@ _SETTLED = 6.0  # rough lags after the first command: how the arm moved before i
 _AT_LEAST, _FEWEST = 5.0, 60  # s and rows of a sensor beside commands
 _ROWS, _COARSE = 8000, 1000  # that are looked at, evenly, in the end and to begin with
 _DEAD, _SMOOTH = 0.6, 0.02  # of the lag, to begin with; s: a shorter τ is stuck among the steps of held commands
+_GAP = 5.0  # usual intervals of the commands, from which one is a gap
 _AROUND_ROW, _RESTS, _AGAIN = 0.25, 0.02, 1.0  # s; of the speed of the motion; s, within which a rest counts once
 _FOLLOWS, _MOVES = 0.3, 0.8  # correlation of speeds: it may follow; it surely moves with the tool
 _LEFT = 0.5  # of what a sensor saw, which no frame explains: it does not move with the tool
@@ -159,7 +160,8 @@ def registered(
     about = rough(told, seen)
     if about.correlation < _FOLLOWS:
         return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
-    seen = [news(a, within(b, a.time, _SETTLED * max(about.lag, 0.0))) for a, b in both]
+    settling = _SETTLED * max(about.lag, 0.0)
+    seen = [news(a, without_gaps(a.time, within(b, a.time, settling), settling)) for a, b in both]
     begun = _begun(told, seen, about, marker or Placement(), fix_marker, loosely)
     return _fitted(begun, fix_marker, loosely)
 
@@ -169,6 +171,21 @@ def within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
     if not len(given):
         return sensor.only(np.zeros(0, np.int64))
     return sensor.only((sensor.time >= given[0] + settling) & (sensor.time <= given[-1]))
+
+
+def without_gaps(given: FloatArray, sensor: Motion, settling: float) -> Motion:
+    """What a sensor told, but for gaps of the commands: where the tool was told to be then is not known.
+
+    Args:
+        given: When commands came [s], (n,).
+        sensor: What it told.
+        settling: For how long [s] after a gap the tool may still move as was told in it.
+    """
+    interval = np.diff(given)
+    usual, lost = median(interval), np.zeros(len(sensor.time), dtype=np.bool_)
+    for row in np.flatnonzero(interval > _GAP * usual).tolist():
+        lost |= (sensor.time > given[row] + usual) & (sensor.time < given[row + 1] + settling)
+    return sensor.only(~lost) if np.count_nonzero(~lost) >= _FEWEST else sensor
 
 
 def news(command: Motion, sensor: Motion) -> Motion:
