@@ -25,6 +25,7 @@ _SETTLED = 6.0  # rough lags after the first command: how the arm moved before i
 _AT_LEAST, _FEWEST = 5.0, 60  # s and rows of a sensor beside commands
 _ROWS, _COARSE = 8000, 1000  # that are looked at, evenly, in the end and to begin with
 _DEAD, _SMOOTH = 0.6, 0.02  # of the lag, to begin with; s: a shorter τ is stuck among the steps of held commands
+_MANY_AT_REST = 0.25  # of the rows
 _GAP = 5.0  # usual intervals of the commands, from which one is a gap
 _AROUND_ROW, _RESTS, _AGAIN = 0.25, 0.02, 1.0  # s; of the speed of the motion; s, within which a rest counts once
 _FOLLOWS, _MOVES = 0.3, 0.8  # correlation of speeds: it may follow; it surely moves with the tool
@@ -189,9 +190,9 @@ def without_gaps(given: FloatArray, sensor: Motion, settling: float) -> Motion:
 
 
 def news(command: Motion, sensor: Motion) -> Motion:
-    """What a sensor told around a motion of the commands, and now and then at rest.
+    """What a sensor told; where much of it was at rest, that around a motion of the commands, and now and then at rest.
 
-    Rows at rest say the same again. Where they are most, what one pose errs by would decide, and rows in motion, which
+    Rows at rest say the same again. Where they are many, what one pose errs by would decide, and rows in motion, which
     alone tell a lag, would be the outliers.
     """
     ends = [sensor.time - _AROUND_ROW, sensor.time + _AROUND_ROW]
@@ -202,7 +203,8 @@ def news(command: Motion, sensor: Motion) -> Motion:
         moved += _LEVER * (turned[after] * turned[before].inv()).magnitude()
     moving = moved >= _RESTS * float(moved @ moved) / max(float(moved.sum()), 1e-300)  # the mean over the path
     kept = moving | (np.diff(sensor.time // _AGAIN, prepend=-np.inf) > 0.0)
-    return sensor.only(kept) if np.count_nonzero(kept) >= _FEWEST else sensor
+    many = np.count_nonzero(~moving) > _MANY_AT_REST * len(moving)
+    return sensor.only(kept) if many and np.count_nonzero(kept) >= _FEWEST else sensor
 
 
 def thinned(sensor: Sequence[Motion], rows: int) -> list[Motion]:
