@@ -331,8 +331,7 @@ def _coarse(
         sign: −1: the sensor is mirrored.
         first: By which to turn the rotation that fits the path, to begin elsewhere.
     """
-    period = median(np.concatenate([np.diff(one.time) for one in command]))
-    plant = _plant(about.lag, period)
+    plant = _plant(about.lag)
     rows = rows_of(command, sensor, mean, attitude=False)
     poses, rows = rows.answer.poses(plant, plant), rows._replace(centred=rows.centred * [1.0, 1.0, sign])
     known = np.array(marker.at)
@@ -346,14 +345,14 @@ def _coarse(
     begin = State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant)
     held, free = (_free(np.eye(3), markers, turn=False, scale=one, own=False) for one in (False, moves))
     nearer = fitted(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
-    again = _plant(nearer.position.lag, period)
+    again = _plant(nearer.position.lag)
     both = (fitted(rows, one, free) for one in (begin, nearer._replace(position=again, angle=again)))
     return min(both, key=lambda one: one.left() / one.state.scale)
 
 
-def _plant(lag: float, period: float) -> Plant:
-    """A plant to begin with, where commands come every so often [s]."""
-    time_constant = max((1.0 - _DEAD) * lag, period, _SMOOTH)
+def _plant(lag: float) -> Plant:
+    """A plant to begin with."""
+    time_constant = max((1.0 - _DEAD) * lag, _SMOOTH)
     return Plant(lag - time_constant, time_constant)
 
 
