@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .live.health import Health, SensorHealth
     from .live.results import AxisNow, LiveEstimate, UpdateResult
     from .logs.frames import Cylindrical, Placed, Rotated
+    from .logs.manifest import Robot
     from .logs.run import Run, Source
     from .model.arm import ArmModel, AxisModel, Gain, Joint, Validity
     from .model.discrete import DiscreteModel, discretize
@@ -81,6 +82,7 @@ _NAMES = {
     "live.health": ["Health", "SensorHealth"],
     "live.results": ["AxisNow", "LiveEstimate", "UpdateResult"],
     "logs.frames": ["Cylindrical", "Placed", "Rotated"],
+    "logs.manifest": ["Robot"],
     "logs.run": ["Run", "Source"],
     "model.arm": ["ArmModel", "AxisModel", "Gain", "Joint", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
@@ -109,12 +111,12 @@ __all__ = [
     "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
     "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process",
     "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
-    "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen",
-    "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source",
-    "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError",
-    "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize",
-    "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score", "simulate", "summarise",
-    "to_rerun", "tune", "validation_figure", "verify",
+    "RegistrationSummary", "Registrations", "Robot", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary",
+    "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill",
+    "Source", "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis",
+    "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary",
+    "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score",
+    "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from .guesses import ArmGuess, SensorGuess
 from .roles import Stream
 from .survey import Survey
 
-FILES = ("run.toml", "arm.toml", "fusion.toml")
+FILES = MANIFEST, *_ = ("run.toml", "arm.toml", "fusion.toml")
 BASES = {"name": "by name", "type": "by type of message", "turn": "by its turn", "range": "guessed by range"}
 _COMMENT = 48  # column at which comments begin
 

@@ -35,7 +35,9 @@ _ROLES: dict[Role, frozenset[str]] = {
 # In the name of a topic or file these are something else.
 _OF_COLUMNS = words_in("set sp pv fb current present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
-_OF_PLACES = words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in that of a column
+_SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
+_MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
+_OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in a column's
 _PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
 _SILENT = (
     _OF_ROLES
@@ -112,6 +114,12 @@ def words(name: str) -> list[str]:
 def role_of(name: str) -> Role | None:
     """What the name of a topic or a file says its numbers are."""
     return _role([word for word in words(name) if word not in _OF_COLUMNS], _OF_PLACES)
+
+
+def may_be_seen(name: str) -> bool:
+    """Whether a name calls its numbers commands by nothing but a word for what a camera looks at, too."""
+    found = {word.rstrip(_DIGITS) for word in words(name)} & _ROLES["command"]
+    return bool(found) and found <= _SEEN
 
 
 def role_words(column: str) -> list[str]:
@@ -268,7 +276,10 @@ def plain(name: str) -> str:
 
 
 def _role(found: list[str], more: frozenset[str]) -> Role | None:
+    plainly = {word.rstrip(_DIGITS) for word in found}
+    if not plainly.isdisjoint(_MARKERS | _DEVICES):  # camera_target is what a camera looks at
+        plainly -= _SEEN
     for role, known in _ROLES.items():
-        if not known.isdisjoint(word.rstrip(_DIGITS) for word in found):
+        if not known.isdisjoint(plainly):
             return role
     return None if more.isdisjoint(found) else "sensor"

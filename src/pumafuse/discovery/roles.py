@@ -154,7 +154,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             + (f", but {there}" if there else "")
             + f";{at_a_rate} {_and_then(no_commands(parts))}say in run.toml where they are"
         )
-    streams = _uniquely_named(_apart(streams[0]) if len(streams) == 1 else streams)
+    streams = _looked_at(_uniquely_named(_apart(streams[0]) if len(streams) == 1 else streams))
     command, why = _command(streams, log, _and_then(no_commands(parts)))
     left_out: list[tuple[Stream, str]] = []
     kept: list[Stream] = []
@@ -400,6 +400,20 @@ def _uniquely_named(streams: Iterable[Stream]) -> list[Stream]:
     return list(found.values())
 
 
+def _looked_at(streams: Sequence[Stream]) -> list[Stream]:
+    """Streams of which one that is called target, but moves after another that nothing names, is a sensor's."""
+    found = list[Stream]()
+    for stream in streams:
+        columns = [one.column for signals in stream.axes.values() for one in signals]
+        seen = stream.role == "command" and any(map(names.may_be_seen, [stream.part.stem, *columns]))
+        led = [one for one in streams if one.role is None and _followers(one, [replace(stream, role=None)])[0]]
+        if seen and led:
+            why = f"it is called target, but follows '{printable(led[0].name)}': it is what a sensor looks at"
+            stream = replace(stream, role="sensor", why=why)
+        found.append(stream)
+    return found
+
+
 def _and_then(advice: str) -> str:
     return f"{advice}; or " if advice else ""
 
@@ -429,13 +443,16 @@ def _command(streams: Sequence[Stream], log: str, advice: str) -> tuple[Stream, 
 def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]:
     """How many axes of others run behind a stream, each as far as its motion is the same; and by how much, in all [s].
 
-    The number is rounded: of commands and the same ones later on, those that are sent first are followed as well.
+    Of one in a frame of its own the speed does.
     """
     count = late = 0.0
     for other in streams:
         if other is not leader and other.role != "command":
             axes, _ = _matched(leader, other)
-            for found in _relations(leader, replace(other, axes=axes)):
+            relations = _relations(leader, replace(other, axes=axes))
+            if not any(abs(found.correlation) >= _SAME for found in relations):
+                relations = list(filter(None, [speeds_follow(leader.source, other.source)]))
+            for found in relations:
                 if abs(found.correlation) >= _SAME and found.lag > _AT_ONCE:
                     count, late = count + abs(found.correlation), late + found.lag
     return round(count, 1), late

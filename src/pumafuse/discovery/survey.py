@@ -20,7 +20,7 @@ from ..logs.run import Run, Source
 from ..space.rotations import TURNING
 from ..units import MS
 from .contents import Part, parts_of, period_of, without_clock
-from .following import Following
+from .following import LATEST, Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
 from .roles import GUESSED_LAG, Roles, relations, roles_of
@@ -97,7 +97,10 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     lags, least = [one.lag for one in related.values() if abs(one.correlation) >= _SURELY], least_lag(run)
     surely = _SURELY if max(lags, default=0.0) < least else math.inf
     bad = {key: why for key, one in related.items() if lags and (why := _does_not_follow(one, least, surely))}
+    bad |= {(name, axis): why for name, why in _without_lag(related).items() for axis in (*run.axes, *TURNING)}
     roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
+    if not roles.sensors:
+        raise RunError(f"{log}: commands, but nothing that surely follows them: {_reasons(roles, parts)}")
     kept = {(one.name, axis) for one in roles.sensors for axis in (*one.axes, *TURNING)}
     kept |= {(REFERENCE, axis) for axis in (*roles.reference.axes, *TURNING)} if roles.reference else set()
     related = {key: one for key, one in related.items() if key in kept}
@@ -156,6 +159,21 @@ def _does_not_follow(one: Following, least: float, surely: float) -> str:
     return ""
 
 
+def _without_lag(related: _Relations) -> dict[str, str]:
+    """Sources of which an axis surely moves alike, but as late as lags are looked for: that is no following."""
+    late: dict[str, list[str]] = {}
+    for (name, axis), one in related.items():
+        if one.lag >= LATEST and abs(one.correlation) >= _SURELY:
+            late.setdefault(name, []).append(axis)
+    return {
+        name: (
+            f"no lag up to {LATEST:g} s explains its motion on {', '.join(axes)}: is it another robot's, or its clock"
+            f" another one? If it follows, say so in run.toml: [sensors.{name}], with shift_s = SECONDS in its time"
+        )
+        for name, axes in late.items()
+    }
+
+
 def least_lag(run: Run) -> float:
     """The least lag behind the path through a run's commands that an arm may have [s]: between them it is guessed."""
     return -max(AHEAD, _OF_PERIOD * period_of(run.command))
@@ -201,4 +219,4 @@ def soonest(found: Survey) -> float:
 def _reasons(roles: Roles, parts: Sequence[Part]) -> str:
     reasons = [f"{stream.name}: {why}" for stream, why in roles.left_out]
     reasons += [f"{part.label}: {without_clock(part)}" for part in parts if part.signals and part.clock is None]
-    return "; ".join(reasons) or "nothing else is in the log"
+    return "; ".join(dict.fromkeys(reasons)) or "nothing else is in the log"

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import ALWAYS, NO_STAMP, IntArray, TimeArray, median
+from ..arrays import NO_STAMP, IntArray, TimeArray, median
 from ..errors import RunError
 from ..units import TIMES, mistaken
 from .run import Run, Source, note_rows
@@ -27,6 +27,7 @@ _FEW, _MANY = 30, 10_000  # stamps, below which nothing is said about their unit
 _SCATTERED, _JUMP = 5, 3.0  # periods of a short gap, and steps as large as a usual one that a long one hides
 _MANY_LOST, _OFF_TICK = 0.03, 0.25  # shares: of commands in motion, above which it is said; of a period
 _CORRECT = "Correct the unit of its time in run.toml"
+_LONG_GAP = 1.0  # s, of commands in motion, from which one gap is said
 _EVEN = 0.1  # spread of intervals over the usual one, up to which commands are a steady stream
 _HOUR_NS = 3_600_000_000_000
 _LONG_NS = 87_660 * _HOUR_NS  # ten years: no log is as long
@@ -228,7 +229,7 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
             raise RunError(f"{label}: {sentence} Log every command, or correct update_period_ms in arm.toml")
         found.append(f"{label}: {sentence}")
     if (missing := missing_commands(run.command)) is not None:
-        found.append(f"{label}: {missing}; log every command")
+        found.append(f"{label}: {missing}: the model holds the one before; log every command")
     for name in sensors:
         stamp = _ascending(run.sensors[name].stamp)
         if len(stamp):
@@ -274,14 +275,18 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit"
     return f"commands come every {times}: {lost}", "lost" if is_lost else "other"
 
 
-def missing_commands(command: Source) -> str | None:
-    """A sentence if commands of a steady stream are missing where they move.
+def missing_commands(command: Source, origin: int | None = None) -> str | None:
+    """A sentence if commands of a steady stream are missing where they move: many, or for longer than a second.
 
     Short gaps count in mid-motion, long ones if the command jumps: who sends a command only when it changes leaves the
     others out on purpose.
+
+    Args:
+        command: The commands.
+        origin: Since when times are told [ns]; None: the first command.
     """
     rows = np.flatnonzero(command.stamp != NO_STAMP)
-    rows = rows[np.diff(command.stamp[rows], prepend=ALWAYS) > 0]
+    rows = rows[np.append(True, np.diff(command.stamp[rows]) > 0)[: len(rows)]]
     intervals = np.diff(command.stamp[rows]) / 1e9
     if len(intervals) < _FEW or (intervals <= 0.0).any():
         return None
@@ -296,11 +301,13 @@ def missing_commands(command: Source) -> str | None:
     moving, on = moving[1:-1], moving[:-2] & moving[1:-1] & moving[2:]
     gaps = (ticks > 1) & np.where(ticks > _SCATTERED, jumps, on)
     missing, sent = int(np.sum(ticks[gaps] - 1)), int(np.count_nonzero(moving))
-    if missing < _FEW or missing <= _MANY_LOST * (missing + sent):
+    longest = int(np.argmax(np.where(gaps, intervals, 0.0)))
+    if missing < _FEW or (missing <= _MANY_LOST * (missing + sent) and intervals[longest] < _LONG_GAP):
         return None
+    begin = (command.stamp[rows[longest]] - (command.stamp[rows[0]] if origin is None else origin)) / 1e9
     return (
         f"{missing} of {missing + sent} commands are missing while the arm moves (one is due every"
-        f" {usual * 1e3:.4g} ms), the longest gap is {intervals[gaps].max():.3g} s: the model holds the one before"
+        f" {usual * 1e3:.4g} ms), the longest gap is {intervals[longest]:.3g} s, from {begin:.2f} s on"
     )
 
 

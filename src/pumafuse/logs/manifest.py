@@ -15,6 +15,7 @@ from .. import toml
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..space import rotations
+from ..space.kinematics import Chain
 from ..space.rotations import CONVENTIONS, TURNING
 from ..toml import NotNegative
 from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
@@ -152,7 +153,7 @@ class Robot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """A serial chain of a URDF, by which joints are a pose.
 
     Attributes:
-        urdf: The file, beside ``run.toml``.
+        urdf: The file; in ``run.toml`` and ``fusion.toml`` beside these.
         base: The link that stands.
         tip: The link whose pose it is: the tool.
     """
@@ -160,6 +161,19 @@ class Robot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     urdf: str
     base: str
     tip: str
+
+    def beside(self, folder: Path) -> Robot:
+        """The same with its file in a folder."""
+        return msgspec.structs.replace(self, urdf=str(folder / self.urdf))
+
+
+def chain_of(robot: Robot) -> Chain:
+    """The kinematics of a robot.
+
+    Raises:
+        PumafuseError: See :meth:`pumafuse.space.kinematics.Chain.load`.
+    """
+    return Chain.load(robot.urdf, robot.base, robot.tip)
 
 
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):

@@ -111,17 +111,24 @@ class Source:
         """
         if self.joints is None or not any(later.values()):
             return self
-        told, names = self.joints.values.copy(), self.joints.chain.joints
-        if unknown := next((name for name in later if name not in names), None):
-            raise UnknownNameError(f"{self.label}: joints of the arm", "joint", unknown, names)
+        told, late = self.joints.values.copy(), self.joints.chain.columns(later, self.label)
         known = np.flatnonzero(np.isfinite(told).all(axis=1) & (self.stamp != NO_STAMP))
         set_back = np.flatnonzero(np.diff(self.stamp[known]) < -_OUT_OF_ORDER_NS) + 1
         for part in np.split(known, set_back):
             rows = part[np.argsort(self.stamp[part], kind="stable")]
-            time = (self.stamp[rows] - self.stamp[rows[:1]]) / 1e9
-            for column, by in ((names.index(name), by) for name, by in later.items()):
-                told[rows, column] = np.interp(time - by, time, told[rows, column])
+            time = self.stamp[rows]
+            last = np.flatnonzero(np.diff(time, append=NEVER))  # of a stamp the last command counts
+            for column, by in late.items():
+                told[rows, column] = _on_the_line(time[last], told[rows[last], column], time - by)
         return self.posed(Joints(self.joints.chain, told))
+
+    def in_joints(self) -> Source:
+        """The source with joints as its axes, in the place of the pose to which they move the tool."""
+        if self.joints is None:
+            return self
+        values = {axis: value for axis, value in self.values.items() if axis not in CARTESIAN}
+        values |= dict(zip(self.joints.chain.joints, self.joints.values.T.copy(), strict=True))
+        return replace(self, values=values, orientation=None, joints=None)
 
     def ordered(self, axis: str) -> IntArray:
         """The rows that have a stamp and a value of an axis, by stamp, (n,)."""
@@ -264,6 +271,7 @@ class Run:
         kinds: Of what kind the axes are, where the units of a log say so.
         notes: What was wrong with the files, a sentence each.
         recording: The Rerun recording that it was read from, if it was one.
+        robot: The chain by which its joints are poses, where there are any.
         without_strays: Whether stray stamps are removed already, see :func:`pumafuse.logs.clock.without_strays`.
         since: Where the part to use begins [s after the first command], see :meth:`between`; None: with the log.
         until: Where it ends, likewise.
@@ -279,6 +287,7 @@ class Run:
     kinds: Mapping[str, Kind] = field(default_factory=dict[str, Kind])
     notes: tuple[str, ...] = ()
     recording: Recording | None = None
+    robot: manifest.Robot | None = None
     without_strays: bool = False
     tool: tuple[float, float, float] | None = None
     since: float | None = None
@@ -428,6 +437,22 @@ class Run:
         if reference is not None:
             scored = replace(_from_arrays("reference", *_pair("reference", reference), notes), sd=reference_sd)
         return Run(name, commands, streams, scored, dict(start or {}), clock, frame, notes=tuple(notes))
+
+
+def _on_the_line(stamp: TimeArray, value: FloatArray, at: TimeArray) -> FloatArray:
+    """Values at some instants on the lines from one to the next, (m,); before the first that.
+
+    No bit of it depends on other values than the two beside an instant: a stream tells the same of what it has by then.
+
+    Args:
+        stamp: Int ns, ascending, (n,).
+        value: (n,).
+        at: The instants, int ns, (m,).
+    """
+    before = np.clip(np.searchsorted(stamp, at, side="right") - 1, 0, None)
+    after = np.minimum(before + 1, len(stamp) - 1)
+    share = np.clip(at - stamp[before], 0, None) / np.maximum(stamp[after] - stamp[before], 1)
+    return value[before] + share * (value[after] - value[before])
 
 
 def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: str = "") -> None:
@@ -613,8 +638,8 @@ def of_tables(
     """
     scored, notes, units = listed.reference, list[str](), dict(listed.command.kinds)
     entries, read = listed.entries, dict[tuple[str, ...], tables.Table]()
-    robot = listed.robot
-    chain = None if robot is None else Chain.load(folder / robot.urdf, robot.base, robot.tip)
+    robot = None if listed.robot is None else listed.robot.beside(folder)
+    chain = None if robot is None else manifest.chain_of(robot)
     naive, zoned = list[str](), list[str]()
 
     def source(name: str) -> Source:
@@ -656,7 +681,7 @@ def of_tables(
     if naive and zoned:
         notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
     name, start, clock = listed.name or folder.resolve().name, listed.command.start, listed.command.clock
-    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
+    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes), robot=robot)
 
 
 def _on_ticks(source: Source, notes: list[str]) -> Source:
