@@ -344,9 +344,9 @@ class Measured:
                 step = bounded_step(best.score, best.information, *ends, np.full(len(names), damping))
                 if float(best.score @ step) - 0.5 * float(step @ best.information @ step) < _CLOSE:
                     return Fit(best.arm, best.log_posterior, best.information)
-                trial = best.arm.moved(names, (here + step).tolist())
-                if self._linear(trial, [], rest, limits, names).log_posterior > best.log_posterior:
-                    best = self._linear(trial, names, rest, limits)
+                trial = self._linear(best.arm.moved(names, (here + step).tolist()), names, rest, limits)
+                if trial.log_posterior > best.log_posterior:
+                    best = trial
                     break
             else:
                 break
@@ -361,10 +361,8 @@ class Measured:
         scores = np.add.reduceat(slopes * left, begins, axis=1)
         return self._linear(arm, names, rest, limits).information, scores @ scores.T
 
-    def _linear(
-        self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits, believed: Coordinates | None = None
-    ) -> _Linear:
-        """Posterior, score and information at an arm; with the priors of other coordinates where ``believed`` is."""
+    def _linear(self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits) -> _Linear:
+        """Posterior, score and information at an arm."""
         left, slopes, log_determinant = self._sloped(arm, names, rest)
         information, score = slopes @ slopes.T, slopes @ left
         for place, name in enumerate(names):
@@ -373,7 +371,7 @@ class Measured:
                 information[place, place] += 1.0 / sd**2
                 score[place] -= (arm.coordinate(name) - mean) / sd**2
         log = -0.5 * (float(left @ left) + log_determinant + self.count * _LOG_2PI)
-        return _Linear(arm, log + limits.log_prior(arm, believed or names), score, information)
+        return _Linear(arm, log + limits.log_prior(arm, names), score, information)
 
     def _sloped(self, arm: Arm, names: Coordinates, rest: Rest) -> tuple[FloatArray, FloatArray, float]:
         """What an arm leaves and how it changes with each coordinate, whitened, without biases; the sum of log S."""
