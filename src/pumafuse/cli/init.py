@@ -126,8 +126,7 @@ def _part_row(part: Part) -> list[str]:
 
 def _described_rows(found: Survey) -> list[list[str]]:
     """Of a log whose run.toml says what is where."""
-    run = found.run
-    sources = {"command": run.command, **run.sensors, **({} if run.reference is None else {"reference": run.reference})}
+    sources = {"command": found.run.command, **found.run.measured}
     return [
         [printable(source.label_for(name)), "", str(len(source.stamp)), *_rate(source.stamp), "run.toml", ""]
         for name, source in sources.items()

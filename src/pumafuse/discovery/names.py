@@ -38,10 +38,10 @@ _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
 _OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in a column's
-_PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
+PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
 _SILENT = (
     _OF_ROLES
-    | _PARTS
+    | PARTS
     | words_in(
         "pose poses position positions pos point points data translation transform value values scalar scalars joint"
         " jnt dof qpos controller robot arm tool tcp ee flange coordinates axis"
@@ -70,17 +70,17 @@ _TIME_UNITS = {
 _TIMES = frozenset(one for one in _TIME_UNITS if len(one) > 2) | words_in(
     "t time times stamp stamps timestamp timestamps date datetime clock ts arrival arrived zeit"
 )
-_COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
-_WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")
+COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
+WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")  # a row may be of one of many
 EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
 VALID = words_in("valid tracked visible detected")  # of columns that say whether a row of a sensor means anything
-_TELLING = _TIMES | _COUNTERS | _WHOSE | VALID | words_in("episode run trial")
+_TELLING = _TIMES | COUNTERS | WHOSE | VALID | words_in("episode run trial")
 _DIGITS = "0123456789"
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _BRACKETED = re.compile(rf"[\[(] *(mm|m|um|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
-_SLIDING = words_in("slide slider prismatic linear rail gantry")
+SLIDING = words_in("slide slider prismatic linear rail gantry")  # joints in metres, where others turn
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
     **dict.fromkeys(words_in("m meter meters metre metres"), "m"),
@@ -132,9 +132,9 @@ def column_role(column: str) -> Role | None:
     return _role(words(leaf(column)), frozenset())
 
 
-def is_part(column: str) -> bool:
-    """Whether a column is one of several that are added up."""
-    return not _PARTS.isdisjoint(words(column))
+def has_word(name: str, known: frozenset[str]) -> bool:
+    """Whether one of these words is in a name."""
+    return not known.isdisjoint(words(name))
 
 
 def is_time(column: str) -> bool:
@@ -146,16 +146,6 @@ def time_unit_of(column: str) -> str:
     """The unit of stamps that a name says otherwise than by its ending, ``micros`` or ``t [ms]``; empty without one."""
     *before, last = words(leaf(column)) or [""]
     return _TIME_UNITS.get(last, "") if before or len(last) > 2 else ""
-
-
-def is_counter(column: str) -> bool:
-    """Whether a column is called as numbers of frames are."""
-    return not _COUNTERS.isdisjoint(words(leaf(column)))
-
-
-def tells_apart(column: str) -> bool:
-    """Whether a column of numbers is called as those are that say whose a row is."""
-    return not _WHOSE.isdisjoint(words(leaf(column)))
 
 
 def likeliest_first(columns: Iterable[str]) -> list[str]:
@@ -227,11 +217,6 @@ def unit_of(column: str) -> str:
 def is_turning(axis: str) -> bool:
     """Whether an axis is called as joints are."""
     return _TURNING.search(axis) is not None
-
-
-def is_sliding(joint: str) -> bool:
-    """Whether a joint is called as those are that slide, in metres, where others turn."""
-    return not _SLIDING.isdisjoint(words(joint))
 
 
 def axis_of(column: str, labels: list[str]) -> str:

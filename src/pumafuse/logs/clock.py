@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ..arrays import NO_STAMP, IntArray, TimeArray, median
 from ..errors import RunError
 from ..units import TIMES, mistaken
-from .run import Run, Source, note_rows
+from .run import REFERENCE, Run, Source, note_rows
 from .screening import without_stray_values
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
@@ -170,19 +170,13 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
             )
         return [source.rows(slice(*edges)) for edges in pairwise([0, *jumps, len(source.stamp)])]
 
-    sensors = {name: pieces(source) for name, source in run.sensors.items()}
-    references = [None] * (len(cuts) + 1) if run.reference is None else pieces(run.reference)
-    parts = [
-        replace(
-            run,
-            command=command,
-            sensors={name: parts[index] for name, parts in sensors.items()},
-            reference=references[index],
-            start=run.start if index == 0 else {},
-            notes=run.notes if index == 0 else (),
-        )
-        for index, command in enumerate(pieces(run.command))
-    ]
+    measured = {name: pieces(source) for name, source in run.measured.items()}
+    parts = list[Run]()
+    for index, command in enumerate(pieces(run.command)):
+        mine = {name: parts[index] for name, parts in measured.items()}
+        reference = None if run.reference is None else mine.pop(REFERENCE)
+        begin: dict[str, Any] = {} if index == 0 else {"start": {}, "notes": ()}
+        parts.append(replace(run, command=command, sensors=mine, reference=reference, **begin))
     lag, label = behind(run.command.stamp) / 1e9, run.command.label
     notes = [
         f"{label}: the clock is set back by {lag[row]:.3f} s in row {row + 1}: new segment, filter restarted"
@@ -219,8 +213,8 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
         RunError: The stamps of a source are in another unit than they are taken to be in.
     """
     found, label, stamp = list[str](), run.command.label, run.command.stamp
-    command = _ascending(stamp)
-    first = _ascending(stamp[np.isfinite(run.command.values[run.axes[0]])]) if run.command.apart else command
+    command = np.sort(stamp[stamp != NO_STAMP], kind="stable")
+    first = run.command.series(run.axes[0])[0] if run.command.apart else command
     if (other := other_interval(first, period)) is not None:
         sentence, kind = other
         if kind == "unit":
@@ -231,17 +225,18 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
     if (missing := missing_commands(run.command)) is not None:
         found.append(f"{label}: {missing}: the model holds the one before; log every command")
     for name in sensors:
-        stamp = _ascending(run.sensors[name].stamp)
-        if len(stamp):
-            _check_span(run.sensors[name].label_for(name), stamp, command)
-            found += [f"{name}: {one}" for one in _apart(stamp, int(command[0]), int(command[-1]))]
+        stamp = run.sensors[name].stamp
+        stamp = np.sort(stamp[stamp != NO_STAMP], kind="stable")  # fast where they are in order
+        if not len(stamp):
+            continue
+        span, commanded = (float(part[-1] - part[0]) / 1e9 for part in (stamp, command))
+        if min(len(stamp), len(command)) >= _FEW and (units := mistaken(span / max(commanded, 1e-9), TIMES)):
+            raise RunError(
+                f"{run.sensors[name].label_for(name)}: measurements go on for {span:.4g} s, the commands for"
+                f" {commanded:.4g} s: {_taken(units)} {_CORRECT}"
+            )
+        found += [f"{name}: {one}" for one in _apart(stamp, int(command[0]), int(command[-1]))]
     return found
-
-
-def _ascending(stamp: TimeArray) -> TimeArray:
-    """The stamps that there are, in order."""
-    known = stamp[stamp != NO_STAMP]
-    return known[in_order(known)]
 
 
 def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit", "lost", "other"]] | None:
@@ -311,16 +306,6 @@ def missing_commands(command: Source, origin: int | None = None) -> str | None:
     )
 
 
-def _check_span(label: str, stamp: TimeArray, command: TimeArray) -> None:
-    """Refuse measurements that last as long as the commands in another unit."""
-    span, commanded = (float(part[-1] - part[0]) / 1e9 for part in (stamp, command))
-    if min(len(stamp), len(command)) >= _FEW and (units := mistaken(span / max(commanded, 1e-9), TIMES)):
-        raise RunError(
-            f"{label}: measurements go on for {span:.4g} s, the commands for {commanded:.4g} s: {_taken(units)}"
-            f" {_CORRECT}"
-        )
-
-
 def _taken(units: Sequence[tuple[str, str]]) -> str:
     words = " or ".join(f"{true} that are called {called}" for true, called in units)
     return f"are its stamps {words}?"
@@ -335,18 +320,15 @@ def _apart(stamp: TimeArray, first: int, last: int) -> list[str]:
         return [f"measurements go on for {_duration(tail)} after the last command: are both stamped by one clock?"]
     every = stamp[-1] < first or stamp[0] > last
     side, apart = "before the first" if middle < first else "after the last", int(stamp[0]) - first
+    hours, why = round(abs(apart) / _HOUR_NS), ""
+    if abs(apart) > _LONG_NS:
+        why = " One may count from 1970, the other from when a computer was switched on"
+    elif hours and abs(abs(apart) - hours * _HOUR_NS) < 60 * _TAIL_NS:
+        why = " Is one of another time zone?"
     return [
         f"{'all' if every else 'most'} measurements lie {side} command, their stamps begin {_duration(abs(apart))}"
-        f" {'before' if apart < 0 else 'after'} those of the commands: are both stamped by one clock?{_why(abs(apart))}"
+        f" {'before' if apart < 0 else 'after'} those of the commands: are both stamped by one clock?{why}"
     ]
-
-
-def _why(apart: int) -> str:
-    """What two clocks that differ by that [ns] may be; empty without an idea."""
-    if apart > _LONG_NS:
-        return " One may count from 1970, the other from when a computer was switched on"
-    hours = round(apart / _HOUR_NS)
-    return " Is one of another time zone?" if hours and abs(apart - hours * _HOUR_NS) < 60 * _TAIL_NS else ""
 
 
 def _duration(time: int) -> str:

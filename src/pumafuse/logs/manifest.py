@@ -283,26 +283,20 @@ def load(path: Path) -> Manifest:
     Raises:
         ConfigError: The file is no manifest; names the key and the accepted ones.
     """
-    return _manifest(toml.read(path), str(path))
+    return of_tables(toml.read(path), str(path))
 
 
-def parse(text: str) -> Manifest:
-    """The same of the text of a ``run.toml``.
+def of_tables(tree: dict[str, Any], where: str = "run.toml") -> Manifest:
+    """What the tables of a ``run.toml`` say, with every number in SI.
 
     Raises:
-        ConfigError: It is no manifest; names the key and the accepted ones.
+        ConfigError: They are no manifest; names the key and the accepted ones.
     """
-    return _manifest(toml.parsed(text, "run.toml"), "run.toml")
-
-
-def _manifest(tree: dict[str, Any], where: str) -> Manifest:
-    for key, kind in (("command", CommandEntry), ("reference", ReferenceEntry)):
-        if key in tree:
-            tree[key] = _source(tree[key], kind, where, key)
-    sensors: Any = tree.get("sensors", {})
-    if not isinstance(sensors, dict):
+    kinds = {"command": CommandEntry, "reference": ReferenceEntry}
+    tree |= {key: _source(tree[key], kind, where, key) for key, kind in kinds.items() if key in tree}
+    if not isinstance(tree.setdefault("sensors", {}), dict):
         raise ConfigError(f"{where}: sensors: expected a table for each sensor, as in [sensors.tracker]")
-    named = cast(dict[str, Any], sensors)
+    named = cast(dict[str, Any], tree["sensors"])
     for name in named:
         refuse_name(f"{where}: sensor", name)
     tree["sensors"] = {name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in named.items()}
