@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from .live.results import AxisNow, LiveEstimate, UpdateResult
     from .logs.frames import Cylindrical, Placed, Rotated
     from .logs.run import Run, Source
-    from .model.arm import ArmModel, AxisModel, Gain, Joint, Validity
+    from .model.arm import ArmModel, AxisModel, Gain, Joint, Sag, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, Plant, SecondOrder
     from .registration.register import Registered
@@ -82,7 +82,7 @@ _NAMES = {
     "live.results": ["AxisNow", "LiveEstimate", "UpdateResult"],
     "logs.frames": ["Cylindrical", "Placed", "Rotated"],
     "logs.run": ["Run", "Source"],
-    "model.arm": ["ArmModel", "AxisModel", "Gain", "Joint", "Validity"],
+    "model.arm": ["ArmModel", "AxisModel", "Gain", "Joint", "Sag", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
     "model.plants": ["FirstOrder", "Plant", "SecondOrder"],
     "registration.register": ["Registered"],
@@ -107,14 +107,14 @@ __all__ = [
     "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog", "Events",
     "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification", "Joint",
     "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
-    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process",
-    "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
-    "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen",
-    "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source",
-    "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError",
-    "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize",
-    "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score", "simulate", "summarise",
-    "to_rerun", "tune", "validation_figure", "verify",
+    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose",
+    "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
+    "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError", "Sag", "Scenario", "Score", "ScoreSummary",
+    "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill",
+    "Source", "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis",
+    "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary",
+    "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score",
+    "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 
