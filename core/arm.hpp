@@ -32,16 +32,21 @@ Real clip(const Real& a, const Real& low, const Real& high) {
     return value_of(a) < value_of(low) ? low : value_of(a) > value_of(high) ? high : a;
 }
 
+inline bool changes(double first, double last) { return (first > 0.0) != (last > 0.0); }  // the sign
+
 // Just behind the only instant in (0, end) at which f changes its sign (Illinois; Dowell & Jarratt, BIT 11, 1971).
-double behind_change(auto f, double end, double first, double last) {
+// Every fourth step halves the bracket, whatever f is.
+double behind_change(auto f, double end, double last) {
     constexpr double WIDTH = 1e-7;  // of the interval: its square is what x can be wrong by, of what it moves
-    constexpr int MOST = 100;       // steps; seldom more than six are taken
     const double width = WIDTH * end;
-    double begin = 0.0;
-    for (int k = 0; k < MOST && end - begin > 2.0 * width; ++k) {
-        const double t = clip(end - last * (end - begin) / (last - first), begin + width, end - width), now = f(t);
-        if (now * last > 0.0) end = t, last = now, first *= 0.5;
-        else begin = t, first = now, last *= 0.5;
+    double begin = 0.0, first = f(begin);
+    for (int k = 1, before = 0; end - begin > 2.0 * width; ++k) {  // before: which end was last moved
+        const double secant = end - last * (end - begin) / (last - first);
+        const bool halve = k % 4 == 0 || last == first;  // both may be 0 where f has faded away
+        const double t = halve ? 0.5 * (begin + end) : clip(secant, begin + width, end - width), now = f(t);
+        const int moved = changes(now, last) ? -1 : 1;
+        (moved < 0 ? begin : end) = t, (moved < 0 ? first : last) = now;
+        if (moved == std::exchange(before, moved)) (moved < 0 ? last : first) *= 0.5;
     }
     return end;
 }
@@ -88,7 +93,11 @@ struct Arm {
         const int side = this->side(d);
         if (side != 0) at_limit(d, side, dt);
         else free(d, plant.over(dt), dt);
-        if (value_of(dt) > half_swing || turns(motion(before, side), motion(d, side)) || this->side(d) != side)
+        const Motion m = motion(before, side), n = motion(d, side);
+        const auto slope_then = [&] { return later_slope(side, m, d, plant.over(dt)); };
+        if (value_of(dt) > half_swing || this->side(d) != side ||
+            (value_of(half_play) > 0.0 && turns(m, m.rate, n.rate, slope_then)) ||
+            (value_of(max_speed) > 0.0 && turns(m, m.closing, n.closing, slope_then)))
             d = before, in_pieces(d, slack, dt);
         else slack = pushed(slack, before, d);
     }
@@ -143,9 +152,9 @@ struct Arm {
         return clip<Real>(slack + (before.x - after.x), -half_play, half_play);
     }
 
-    // How fast drive and gap change, the gap downward, and x" + b x'. Of these the first two together with a factor of
-    // exp(bt) have the third as their slope, which is free of the gain error: it changes its sign once at most within
-    // half a swing.
+    // How fast the drive goes and the gap closes. With a factor of exp(bt) both have the slope x" + b x', which is free
+    // of the gain error and moves as the free plant does: it changes its sign once at most within half a swing, and on
+    // either side of that each of the two does (Rolle).
     struct Motion { double rate, closing, slope; };
 
     Motion motion(const Drive<Real>& d, int side) const {
@@ -155,17 +164,18 @@ struct Arm {
         return {rate, closing, decay * rate - (side == 0 ? fast * closing : 0.0)};
     }
 
-    // Whether a rate changes its sign between two motions at most half a swing apart, or may do so and back.
-    static bool changes(double first, double last) { return (first > 0.0) != (last > 0.0); }
-    static bool dips(double first, double slope, double last, double last_slope) {
-        return first * slope < 0.0 && last * last_slope > 0.0;
+    // The slope `then`, by the transition f to there; by the gain error it would be rounding, once it is small.
+    double later_slope(int side, const Motion& m, const Drive<Real>& then, const Transition<Real>& f) const {
+        if (side != 0) return motion(then, side).slope;
+        if (plant.order == 1) return m.slope;  // of one sign
+        const double decay = value_of(plant.decay), speeding = m.slope - decay * m.rate;
+        const double change = (decay - 2.0 * value_of(plant.sigma)) * speeding - square(fast) * m.closing;
+        return value_of(f.f11) * m.slope + value_of(f.f12) * change;
     }
-    bool turns(const Motion& m, const Motion& n) const {
-        const bool decays = m.closing != m.rate;
-        return (value_of(half_play) > 0.0 &&
-                (changes(m.rate, n.rate) || (decays && dips(m.rate, m.slope, n.rate, n.slope)))) ||
-               (value_of(max_speed) > 0.0 &&
-                (changes(m.closing, n.closing) || (decays && dips(m.closing, m.slope, n.closing, n.slope))));
+
+    // Whether a rate changes its sign on the way, or may do so and back. `slope_then` says the slope at the end.
+    static bool turns(const Motion& m, double first, double last, auto slope_then) {
+        return changes(first, last) || (m.closing != m.rate && first * m.slope < 0.0 && last * slope_then() > 0.0);
     }
 
     // The path, cut where the drive turns, and where it meets or leaves its limit.
@@ -186,31 +196,35 @@ struct Arm {
         const int side = this->side(d);
         const auto moved = [&](const Real& t) {
             Drive<Real> then = d;
+            if (value_of(t) == 0.0) return then;
             if (side != 0) at_limit(then, side, t);
             else free(then, plant.computed(t), t);
             return then;
         };
         Real taken = whole || value_of(left) <= half_swing ? left : Real(half_swing);
         Drive<Real> then = moved(taken);
-        const auto up_to_change_of = [&](auto of) {
-            const double first = of(d), last = of(then);
-            if (whole || !changes(first, last)) return;
-            taken = behind_change([&](double t) { return of(moved(t)); }, value_of(taken), first, last);
+        const auto up_to_change_of = [&](auto f, double last) {
+            if (whole || !changes(f(0.0), last)) return;
+            taken = behind_change(f, value_of(taken), last);
             then = moved(taken);
         };
-        const auto up_to_turn = [&](double Motion::*rate) {
-            const Motion m = motion(d, side), n = motion(then, side);
-            if (m.closing != m.rate && dips(m.*rate, m.slope, n.*rate, n.slope))
-                up_to_change_of([&](const Drive<Real>& at) { return motion(at, side).slope; });
-            up_to_change_of([&](const Drive<Real>& at) { return motion(at, side).*rate; });
+        const auto up_to_turn = [&](double Motion::*of) {
+            const Motion m = motion(d, side);
+            const auto rate = [&](double t) { return motion(moved(t), side).*of; };
+            const auto slope_at = [&](double t) { return later_slope(side, m, moved(t), plant.computed(t)); };
+            const double last = motion(then, side).*of, end = value_of(taken);
+            if (!changes(m.*of, last) && turns(m, m.*of, last, [&] { return slope_at(end); }))
+                up_to_change_of(slope_at, slope_at(end));
+            up_to_change_of(rate, motion(then, side).*of);
         };
         if (value_of(half_play) > 0.0) up_to_turn(&Motion::rate);
         if (value_of(max_speed) > 0.0) {
             up_to_turn(&Motion::closing);
-            up_to_change_of([&](const Drive<Real>& at) {
+            const auto beyond = [&](const Drive<Real>& at) {
                 const double gap = value_of(at.gap());
                 return (side == 0 ? std::fabs(gap) : side * gap) - farthest;
-            });
+            };
+            up_to_change_of([&](double t) { return beyond(moved(t)); }, beyond(then));
         }
         d = then;
         return taken;

@@ -136,7 +136,8 @@ class Filter {
             AxisState<N, Real> now = state.axes[a];
             const Time next = follow(now, a, rows, pending, end, time, stamped);
             double found[PF_OUTPUTS];
-            const ByDoubt<> left = describe(axis, now.response.position(axis.arm), axis.doubt(now.response), now.residual, found);
+            const double r = now.response.position(axis.arm);
+            const ByDoubt<> left = describe(axis, r, axis.doubt(now.response), now.residual, found);
             const double known = now.residual.variance(axis.motion);
             now.residual.P = {};  // what comes is noise alone
             follow(now, a, rows, next, end, time + axis.ahead, stamped);

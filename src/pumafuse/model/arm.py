@@ -15,7 +15,7 @@ from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
 from ..toml import Interval, NotNegative, Positive, Time
-from ..units import AN, KINDS, MM, MS, SCREEN, Kind, Screen, refuse_name
+from ..units import AN, KINDS, MM, MS, SCREEN, Kind, Screen, of_kind, refuse_name
 from .plants import PLANTS, Delay
 from .presets import PRESETS
 
@@ -343,8 +343,9 @@ def _axis(table: Any, where: str, path: str) -> AxisModel:
         raise ConfigError(f"{where}: {path}.plant: unknown plant '{name}'; {suggestion(name, plants)}")
     plant = [field.encode_name for field in msgspec.structs.fields(plants[name])]
     kind: Kind = "angle" if keys.get("kind") == "angle" else "length"
-    accepted = dict.fromkeys(["plant", *plant, *(field.encode_name for field in msgspec.structs.fields(AxisModel))])
-    for key in keys.keys() - accepted.keys():
+    own = [field.encode_name for field in msgspec.structs.fields(AxisModel)]
+    accepted = dict.fromkeys(["plant", *plant, *(of_kind(key, kind) for key in own)])
+    for key in keys.keys() - accepted.keys() - {of_kind(key, other) for key in own for other in KINDS}:
         raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, accepted)}")
     parameters = {key: keys.pop(key) for key in plant if key in keys}
     made = toml.struct(parameters, plants[name], where, path)
