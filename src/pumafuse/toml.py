@@ -231,7 +231,7 @@ def _words(kind: Any) -> tuple[str, ...]:
 def _problems(tree: Any, kind: Any, path: str, axis: Kind = "length") -> Iterator[str]:
     """The faults of ``tree``, the deepest first, each with its key."""
     prefix = f"{path}." if path else ""
-    if isinstance(tree, Mapping) and len(structs := _structs(kind)) == 1:
+    if isinstance(tree, Mapping) and type(None) in get_args(kind) and len(structs := _structs(kind)) == 1:
         kind = structs[0]  # of a table that may be absent
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and isinstance(tree, Mapping):
         fields = {of_kind(field.encode_name, axis): field for field in msgspec.structs.fields(kind)}
