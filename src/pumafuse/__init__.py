@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from .logs.frames import Cylindrical, Placed, Rotated
     from .logs.manifest import Robot
     from .logs.run import Run, Source
-    from .model.arm import ArmModel, AxisModel, Gain, Joint, Validity
+    from .model.arm import ArmModel, AxisModel, Gain, Joint, Sag, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, Plant, SecondOrder
     from .registration.register import Registered
@@ -84,7 +84,7 @@ _NAMES = {
     "logs.frames": ["Cylindrical", "Placed", "Rotated"],
     "logs.manifest": ["Robot"],
     "logs.run": ["Run", "Source"],
-    "model.arm": ["ArmModel", "AxisModel", "Gain", "Joint", "Validity"],
+    "model.arm": ["ArmModel", "AxisModel", "Gain", "Joint", "Sag", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
     "model.plants": ["FirstOrder", "Plant", "SecondOrder"],
     "registration.register": ["Registered"],
@@ -111,7 +111,7 @@ __all__ = [
     "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
     "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process",
     "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
-    "RegistrationSummary", "Registrations", "Robot", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary",
+    "RegistrationSummary", "Registrations", "Robot", "Rotated", "Run", "RunError", "Sag", "Scenario", "Score", "ScoreSummary",
     "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill",
     "Source", "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis",
     "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary",
