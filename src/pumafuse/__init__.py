@@ -106,17 +106,17 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
-    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog", "Events",
-    "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification", "Joint",
-    "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
-    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process",
-    "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
-    "RegistrationSummary", "Registrations", "Robot", "Rotated", "Run", "RunError", "Sag", "Scenario", "Score", "ScoreSummary",
-    "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill",
-    "Source", "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis",
-    "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary",
-    "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score",
-    "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
+    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
+    "Events", "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification",
+    "Joint", "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
+    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose",
+    "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
+    "RegistrationSummary", "Registrations", "Robot", "Rotated", "Run", "RunError", "Sag", "Scenario", "Score",
+    "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary",
+    "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult",
+    "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult",
+    "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency",
+    "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 
