@@ -136,11 +136,12 @@ class Filter {
             AxisState<N, Real> now = state.axes[a];
             const Time next = follow(now, a, rows, pending, end, time, stamped);
             double found[PF_OUTPUTS];
-            const ByDoubt<> left = describe(axis, now.response.x, axis.doubt(now.response), now.residual, found);
+            const double r = now.response.position(axis.arm);
+            const ByDoubt<> left = describe(axis, r, axis.doubt(now.response), now.residual, found);
             const double known = now.residual.variance(axis.motion);
             now.residual.P = {};  // what comes is noise alone
             follow(now, a, rows, next, end, time + axis.ahead, stamped);
-            const double later = now.response.x + now.residual.along(axis.noise.position);
+            const double later = now.response.position(axis.arm) + now.residual.along(axis.noise.position);
             found[PF_VELOCITY] = (later - found[PF_POSITION]) / axis.arm.period;
             const ByDoubt<> then = now.residual.left(axis.doubt(now.response), 1.0, axis.noise.position);
             const double doubted = axis.variance({then[LAG] - left[LAG], then[GAIN] - left[GAIN]});
@@ -166,7 +167,7 @@ class Filter {
 
     // Response and residual to an instant.
     void advance(AxisState<N, Real>& state, Time a, const Instant<Real>& to) const {
-        state.response.predict(axes[a].arm.plant, to);
+        state.response.predict(axes[a].arm, to);
         state.residual.predict(axes[a].arm.plant, axes[a].noise, to);
     }
 
@@ -183,7 +184,7 @@ class Filter {
         const Known<N, Real>& axis = axes[a];
         const Instant<Real> acts{event.time, axis.delayed};
         Residual<N, Real>& xi = state.residual;
-        state.response.predict(axis.arm.plant, acts);
+        state.response.predict(axis.arm, acts);
         const double maneuver = state.response.command(axis.arm, event.value[a]);
         if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
         if (history) (*history)[a].push_back({event.time, value_of(xi.q), value_of(xi.drift)});
@@ -246,7 +247,8 @@ class Filter {
         const Time at = event.source * size() + a;
         const Residual<N, Real>& xi = state.residual;
         const Real R = noise_of(state, event, a), scale = sensors[event.source].scale;
-        const Real expected = scale * state.response.start + scale * state.response.x + xi.along(H[at]);
+        const Real r = state.response.position(axes[a].arm);
+        const Real expected = scale * state.response.start + scale * r + xi.along(H[at]);
         return {nearest(event.value[a] - expected, value_of(views[at].turn)), R,
                 xi.left(axes[a].doubt(state.response), value_of(scale), H[at]),
                 {xi.P, H[at], R}};

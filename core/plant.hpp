@@ -79,6 +79,18 @@ class Plant {
         return remembered;
     }
 
+    // Of an interval that will not come again.
+    Transition<Real> computed(Real t) const {
+        using std::expm1;
+        if (order == 1) {
+            const Real lost = expm1(-rate * t);
+            return {1.0 + lost, 0.0, 0.0, 0.0, -0.5 * rate * lost * (2.0 + lost), 0.0, 0.0};
+        }
+        const auto [g, g_rate, energy, h] = free(t);
+        const Real w2 = omega * omega, x = w2 * g, q11 = w2 * w2 * energy, q12 = 0.5 * x * x;
+        return {g_rate + 2.0 * sigma * g, g, -x, g_rate, q11, q12, w2 * q11 + 2.0 * sigma * q12 + x * w2 * g_rate};
+    }
+
     // Of an input that decays by `decay`; f is the plant's transition over t.
     Decay<Real> decaying(const Transition<Real>& f, Real t) const {
         using std::exp;
@@ -106,17 +118,6 @@ class Plant {
     mutable Real last = -1.0;          // s
     mutable Transition<Real> remembered{};
     std::array<Free, TERMS> series{};  // coefficients of g / u, g', ∫ g^2 / u^3 and h / u^2
-
-    Transition<Real> computed(Real t) const {
-        using std::expm1;
-        if (order == 1) {
-            const Real lost = expm1(-rate * t);
-            return {1.0 + lost, 0.0, 0.0, 0.0, -0.5 * rate * lost * (2.0 + lost), 0.0, 0.0};
-        }
-        const auto [g, g_rate, energy, h] = free(t);
-        const Real w2 = omega * omega, x = w2 * g, q11 = w2 * w2 * energy, q12 = 0.5 * x * x;
-        return {g_rate + 2.0 * sigma * g, g, -x, g_rate, q11, q12, w2 * q11 + 2.0 * sigma * q12 + x * w2 * g_rate};
-    }
 
     Free free(Real t) const {
         return far_apart && fastest * value_of(t) > SHORT ? by_exponentials(t) : by_doubling(t);

@@ -65,10 +65,11 @@ void pf_response(const pf_axis* axis, int64_t commands, const int64_t* given, co
 void pf_follow(const pf_axis* axis, pf_motion* motion, int64_t commands, const int64_t* given, const double* command,
                int64_t n, const int64_t* time, double* position) {
     const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
-    Response<double> response{{motion->time}, axis->start, motion->command, motion->step, motion->error,
-                              motion->position, motion->rate};
+    const Drive<double> drive{motion->command, motion->error, motion->position, motion->rate};
+    Response<double> response{{motion->time}, axis->start, motion->step, drive, motion->slack};
     follow(response, arm, std::llround(axis->delay * 1e9), commands, given, command, n, time, position);
-    *motion = {response.time.ns, response.u, response.step, response.error, response.x, response.rate};
+    const auto& [u, e, x, rate] = response.drive;
+    *motion = {response.time.ns, u, response.step, e, x, rate, response.slack};
 }
 
 void pf_whiten(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,

@@ -82,11 +82,11 @@ inline void respond(const Arm<double>& arm, double start, Time delay, Time comma
     if (commands > 0 && n > 0) response.time.ns = std::min(given[0] + delay, time[0]);
     for (Time k = 0, c = 0; k < n; ++k) {
         for (; c < commands && given[c] + delay <= time[k]; ++c) {
-            response.predict(arm.plant, {given[c] + delay, 0.0});
+            response.predict(arm, {given[c] + delay, 0.0});
             response.command(arm, command[c]);
         }
-        response.predict(arm.plant, {time[k], 0.0});
-        position[k] = response.x;
+        response.predict(arm, {time[k], 0.0});
+        position[k] = response.position(arm);
     }
 }
 
@@ -106,7 +106,9 @@ inline void weigh(const pf_axis& axis, const Whitening& whitening, Time commands
         whitening(raw.data(), found.data());
     };
     of(1.0, plain);
-    if (axis.slope == 0.0 && axis.recovery == 0.0) more = plain;
+    const bool straight = axis.max_speed == 0.0 && axis.play == 0.0 && axis.sag_offset == 0.0 &&
+                          axis.sag_slope == 0.0 && axis.sag_slope_beyond == 0.0;
+    if (straight && axis.slope == 0.0 && axis.recovery == 0.0) more = plain;
     else {
         of(2.0, more);
         for (Time k = 0; k < n; ++k) more[k] -= plain[k];

@@ -182,7 +182,8 @@ void run_smoothed(const Filter<N>& filter, State<N, double>& state, const Table&
         for (Time a = 0; a < A && k < n; ++a) {
             AxisState<N, double> now = state.axes[a];
             filter.advance(now, a, {times[k], 0.0});
-            at.push_back({now.response.x, filter.axes[a].doubt(now.response), now.residual});
+            const Response<double>& r = now.response;
+            at.push_back({r.position(filter.axes[a].arm), filter.axes[a].doubt(r), now.residual});
         }
     }
     for (Time a = 0; a < A; ++a) {

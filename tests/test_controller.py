@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 from unittest import mock
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -36,12 +37,15 @@ natural_frequency_rad_s = 41.7
 damping = 1.3
 gain = { slope_s_rad = 0.07, intercept = 0.9 }
 gain_recovery_ms = 90.0
+max_speed_deg_s = 123.4
 lag_ms_ci95 = [95.0, 105.0]
 [axes."1_ arm"]
 kind = "angle"
 plant = "first-order"
 time_constant_ms = 33.3
 delay_ms = 12.3
+play_deg = 0.7
+sag = { offset_deg = 0.1, slope = -0.02, knee_deg = 33.0, slope_beyond = 0.3 }
 gain = { intercept = 0.9, intercept_ci95 = [0.88, 0.93] }
 """
 CONFIG = """
@@ -103,11 +107,15 @@ def said(program: Path, lines: str) -> tuple[str, str]:
     return done.stdout, done.stderr
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With the loop, and the shipped scan's configuration as a header beside it."""
+@pytest.fixture(scope="module", params=[False, True], ids=["as shipped", "bent"])
+def folder(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+    """With the loop, and the shipped scan's configuration, or with a fastest speed, play and sag, as a header."""
     folder = tmp_path_factory.mktemp("controller")
-    export.run(DATA / "scan" / "fusion.toml", folder / "filter.h", force=False)
+    config = pf.FusionConfig.load(DATA / "scan" / "fusion.toml")
+    bends = {"max_speed": 0.05, "play": 2e-4, "sag": pf.Sag(slope=-1e-3)} if request.param else {}
+    axes = {name: msgspec.structs.replace(axis, **bends) for name, axis in config.arm.axes.items()}
+    msgspec.structs.replace(config, arm=msgspec.structs.replace(config.arm, axes=axes)).save(folder)
+    export.run(folder / "fusion.toml", folder / "filter.h", force=False)
     shutil.copy(ROOT / "examples" / "controller.c", folder)
     return folder
 
@@ -146,7 +154,7 @@ def test_the_loop_knows_what_live_knows(folder: Path, arrivals: list[tuple[int, 
     It is fed late measurements, some too late for the window, and doubled ones.
     """
     printed, summary = said(compiled(folder, folder / "controller.c"), lines_of(arrivals))
-    live = pf.LiveEstimator(pf.FusionConfig.load(DATA / "scan" / "fusion.toml"))
+    live = pf.LiveEstimator(pf.FusionConfig.load(folder / "fusion.toml"))
     outcomes = dict.fromkeys(pf.Outcome, 0)
     came, ticks, different = iter(arrivals), 0, []
     arrival, event = next(came)
@@ -211,7 +219,7 @@ def test_the_header_has_the_numbers_that_live_has(tmp_path: Path) -> None:
     model = window.call_args.args[0]
     done = subprocess.run([compiled(tmp_path, source)], capture_output=True, check=True)
     expected = np.concatenate([part.ravel().view(np.float64) for part in model])
-    assert len(expected) == 2 * 19 + 2 * 5 + 4 * 5
+    assert len(expected) == 2 * 25 + 2 * 5 + 4 * 5
     np.testing.assert_array_equal(np.frombuffer(done.stdout), expected)
     assert np.count_nonzero(np.isnan(expected)) == 3
     assert done.stderr == b"1 1"

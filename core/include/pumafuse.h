@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 6              /* of this interface: a program and its library must agree */
+#define PF_VERSION 7              /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -52,6 +52,10 @@ typedef struct {
     double natural_frequency, damping;     /* omega [rad/s] and zeta */
     double slope, intercept;               /* a [s/m] and b of the gain K = a * speed + b */
     double recovery;                       /* Tr [s], of the gain error; 0: it stays */
+    double max_speed;                      /* V [m/s], the fastest that the drive goes; 0: as fast as it is asked to */
+    double play;                           /* between drive and tool [m] */
+    double sag_offset, sag_slope;          /* where the tool hangs at a level p as logged: offset + slope p [m, 1] */
+    double sag_knee, sag_slope_beyond;     /* level [m] above which the slope is this one */
     double input_noise, drift;             /* densities: white noise on the input [m/sqrt(Hz)]; offset [m/sqrt(s)] */
     double maneuver_noise, maneuver_drift; /* what each m/s of maneuver adds to them, likewise */
     double disturbance_sd, disturbance_time; /* [m], 0: there is none; [s] */
@@ -115,11 +119,11 @@ PF_API void pf_response(const pf_axis *axis, int64_t commands, const int64_t *gi
                         const int64_t *time, double *position);
 
 /* What an axis without noise does just after a command, relative to its start level: when it acts [ns], the command in
- * force and the step that it was [m], the gain error [m], position [m] and rate [m/s]. At rest before any: PF_ALWAYS and
- * zeros. */
+ * force and the step that it was [m], the gain error [m], position [m] and rate [m/s] of the drive, and what the tool is
+ * ahead of it [m]. At rest before any: PF_ALWAYS and zeros. */
 typedef struct {
     int64_t time;
-    double command, step, error, position, rate;
+    double command, step, error, position, rate, slack;
 } pf_motion;
 
 /* The same as pf_response from a motion on, which becomes that after the commands. Each position follows from the last

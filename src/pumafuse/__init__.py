@@ -34,8 +34,9 @@ if TYPE_CHECKING:
     from .live.health import Health, SensorHealth
     from .live.results import AxisNow, LiveEstimate, UpdateResult
     from .logs.frames import Cylindrical, Placed, Rotated
+    from .logs.manifest import Robot
     from .logs.run import Run, Source
-    from .model.arm import ArmModel, AxisModel, Gain, Joint, Validity
+    from .model.arm import ArmModel, AxisModel, Gain, Joint, Sag, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, Plant, SecondOrder
     from .registration.register import Registered
@@ -81,8 +82,9 @@ _NAMES = {
     "live.health": ["Health", "SensorHealth"],
     "live.results": ["AxisNow", "LiveEstimate", "UpdateResult"],
     "logs.frames": ["Cylindrical", "Placed", "Rotated"],
+    "logs.manifest": ["Robot"],
     "logs.run": ["Run", "Source"],
-    "model.arm": ["ArmModel", "AxisModel", "Gain", "Joint", "Validity"],
+    "model.arm": ["ArmModel", "AxisModel", "Gain", "Joint", "Sag", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
     "model.plants": ["FirstOrder", "Plant", "SecondOrder"],
     "registration.register": ["Registered"],
@@ -104,17 +106,17 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
-    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog", "Events",
-    "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification", "Joint",
-    "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
-    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose", "Process",
-    "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
-    "RegistrationSummary", "Registrations", "Rotated", "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen",
-    "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source",
-    "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError",
-    "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize",
-    "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "register", "score", "simulate", "summarise",
-    "to_rerun", "tune", "validation_figure", "verify",
+    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
+    "Events", "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification",
+    "Joint", "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
+    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose",
+    "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
+    "RegistrationSummary", "Registrations", "Robot", "Rotated", "Run", "RunError", "Sag", "Scenario", "Score",
+    "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary",
+    "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult",
+    "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult",
+    "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency",
+    "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Array types, the special stamps, and a median."""
+"""Array types, the special stamps, rows that are known, and a median."""
 
 from __future__ import annotations
 
@@ -18,6 +18,13 @@ TimeArray: TypeAlias = npt.NDArray[np.int64]  # absolute stamps, int64 ns
 NO_STAMP = -(2**63)  # in a TimeArray: a row without a readable stamp (numpy's NaT)
 NEVER, ALWAYS = 2**63 - 1, 1 - 2**63  # in a TimeArray: after all stamps, before all stamps
 REACH_NS = 4.6e18  # |stamp| whose differences int64 ns can hold: the years 1824 to 2115
+
+
+def known_rows(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
+    """Stamps and values of the rows that have both, in the order of time; of one stamp the first, (n,) and (n, …)."""
+    there = (stamp != NO_STAMP) & np.isfinite(value).reshape(len(stamp), -1).all(axis=1)
+    known, first = np.unique(stamp[there], return_index=True)
+    return known, value[there][first]
 
 
 def median(values: FloatArray) -> float:

@@ -215,8 +215,12 @@ def _renamed(tree: Any, name: Callable[[str], str]) -> Any:
 
 def _tagged(kind: Any) -> dict[str, type[msgspec.Struct]]:
     """The structs of a union by their tags."""
-    structs = [part for part in get_args(kind) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
-    return {str(part.__struct_config__.tag): part for part in structs if part.__struct_config__.tag is not None}
+    return {str(part.__struct_config__.tag): part for part in _structs(kind) if part.__struct_config__.tag is not None}
+
+
+def _structs(kind: Any) -> list[type[msgspec.Struct]]:
+    """The structs of a union."""
+    return [part for part in get_args(kind) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
 
 
 def _words(kind: Any) -> tuple[str, ...]:
@@ -227,6 +231,8 @@ def _words(kind: Any) -> tuple[str, ...]:
 def _problems(tree: Any, kind: Any, path: str, axis: Kind = "length") -> Iterator[str]:
     """The faults of ``tree``, the deepest first, each with its key."""
     prefix = f"{path}." if path else ""
+    if isinstance(tree, Mapping) and type(None) in get_args(kind) and len(structs := _structs(kind)) == 1:
+        kind = structs[0]  # of a table that may be absent
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and isinstance(tree, Mapping):
         fields = {of_kind(field.encode_name, axis): field for field in msgspec.structs.fields(kind)}
         of_others = {of_kind(one.encode_name, other): name for name, one in fields.items() for other in KINDS}

@@ -430,7 +430,11 @@ def test_a_long_gap_of_commands_is_told_where_they_jump_over_it() -> None:
     run, config = logged("scan1")
     kept = run.command.rows(np.r_[:500, 900 : len(run.command.stamp)])
     (note,) = clock_faults(replace(run, command=kept), config.arm.update_period, [])
-    assert "400 of " in note and "the longest gap is 11.2 s" in note
+    begin = (run.command.stamp[499] - run.command.stamp[0]) / 1e9
+    assert "400 of " in note and f"the longest gap is 11.2 s, from {begin:.2f} s on" in note
+    kept = run.command.rows(np.r_[:500, 540 : len(run.command.stamp)])  # a gap of 1.1 s is said, too few or not
+    (note,) = clock_faults(replace(run, command=kept), config.arm.update_period, [])
+    assert "40 of " in note and f"from {begin:.2f} s on" in note
 
 
 def test_every_other_command_alone_is_told() -> None:

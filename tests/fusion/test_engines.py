@@ -131,9 +131,21 @@ def logged(
 
 
 @st.composite
-def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
-    """A run of 2 to 4 s with its configuration, and the rate of the estimates."""
-    axes = AXES[: draw(st.integers(1, 3))]
+def bends(draw: st.DrawFn) -> dict[str, object]:
+    """A fastest speed, play and sag, one of them at least."""
+    curve = pf.Sag(offset=1e-3, slope=-0.05, knee=0.5, slope_beyond=0.1)
+    one = {
+        "max_speed": some(draw, 0.01, 0.05),
+        "play": some(draw, 0.2e-3, 3e-3),
+        "sag": some(draw, pf.Sag(slope=0.2), curve),
+    }
+    return {key: one[key] for key in draw(st.sets(st.sampled_from(sorted(one)), min_size=1))}
+
+
+@st.composite
+def logs(draw: st.DrawFn, bent: bool = False) -> tuple[Run, pf.FusionConfig, float | None]:
+    """A run of 2 to 4 s with its configuration, and the rate of the estimates; of one axis that is ``bent``."""
+    axes = AXES[: 1 if bent else draw(st.integers(1, 3))]
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     period = some(draw, 28 * MS, 20 * MS + 1)
     gaps = rng.choice([period, period, period, period + 3 * MS, 5, 4 * period], draw(st.integers(60, 110)))
@@ -145,6 +157,7 @@ def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
             gain_recovery=some(draw, None, 0.1, 0.004, 3.0),
             delay=some(draw, None, 0.0, 0.033),
             lag_ci95=some(draw, None, (0.08, 0.12)),
+            **(draw(bends()) if bent else {}),
         )
         for axis in axes
     }
@@ -207,6 +220,14 @@ def test_both_engines_make_the_same_of_any_log() -> None:
     check()
     decided_before = {Outcome.TOO_LATE, Outcome.STRAY, Outcome.HELD}
     assert all(seen[outcome] for outcome in set(Outcome) - decided_before)
+
+
+@pytest.mark.long
+@settings(max_examples=6)
+@given(logs(bent=True))
+def test_both_engines_make_the_same_of_an_axis_that_bends(log: tuple[Run, pf.FusionConfig, float | None]) -> None:
+    """A fastest speed, play and sag in closed form and by an ODE solver: every fate and estimate, to 1e-4 sd."""
+    agree(*both(*log), 1e-4)
 
 
 @pytest.mark.parametrize(("lasts", "pause"), [(0.3, 200.0), (0.001, 0.0), (1e-6, 0.0)])

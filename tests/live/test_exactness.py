@@ -39,7 +39,10 @@ def test_in_any_order(name: str, longest: float) -> None:
     fused_in_any_order(run, offline, live, longest)
 
 
-@pytest.mark.parametrize("name", ["scan1", "panel-vision", "cylindrical-cartesian"])
+BENT = ["saturating-servo", "tool-with-play", "sagging-lever"]
+
+
+@pytest.mark.parametrize("name", ["scan1", "panel-vision", "cylindrical-cartesian", *BENT])
 def test_estimates_at_the_time_are_as_live(name: str) -> None:
     """Fed in order, the estimate at each command is that of `fuse --as-live`."""
     run, config = recorded(name)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pumafuse.errors import ConfigError, UnknownNameError
-from pumafuse.model.arm import ArmModel, AxisModel, Gain, Validity, commanded_speed
+from pumafuse.model.arm import ArmModel, AxisModel, Gain, Sag, Validity, commanded_speed
 from pumafuse.model.plants import FirstOrder, SecondOrder
 from pumafuse.units import ending
 
@@ -47,6 +47,10 @@ word = st.text(max_size=8)
 
 ascending = st.none() | st.tuples(finite, finite).map(lambda ends: (min(ends), max(ends)))
 gains = st.builds(Gain, slope=finite, intercept=finite, slope_ci95=interval, intercept_ci95=ascending)
+slopes = st.floats(-1.0, 1e3, exclude_min=True)
+sags = st.builds(Sag, offset=finite, slope=slopes) | st.builds(
+    Sag, offset=finite, slope=slopes, knee=finite, slope_beyond=slopes
+)
 first_order = st.builds(FirstOrder, time_constant=positive, time_constant_ci95=interval)
 second_order = st.builds(
     SecondOrder,
@@ -61,6 +65,9 @@ axis_models = st.builds(
     gain=gains,
     gain_recovery=st.none() | not_tiny,
     delay=st.none() | st.floats(0.0, 1e4),
+    max_speed=st.none() | positive,
+    play=st.floats(0.0, 1e6),
+    sag=st.none() | sags,
     delay_ci95=interval,
     lag_ci95=ascending,
 )
@@ -192,6 +199,15 @@ REFUSED = {
                                "axes.tangential.natural_frequency_rad_s", ">= 1e-06"),
     "a recovery of nothing": ("100.0", "1e-160", "axes.radial.gain_recovery_ms", ">= 0.001"),
     "negative": ("60.45", "-1.0", "delay_ms", ">= 0"),
+    "a speed of nothing": ("42.5", "42.5\nmax_speed_mm_s = 0.0", "axes.radial.max_speed_mm_s", "> 0"),
+    "a speed of an angle": ("42.5", "42.5\nmax_speed_deg_s = 9.0", "axes.radial.max_speed_deg_s: for a length",
+                            "max_speed_mm_s"),
+    "a speed in m/s": ("42.5", "42.5\nmax_speed_m_s = 0.3", "'axes.radial.max_speed_m_s'", "max_speed_mm_s"),
+    "play below nothing": ("42.5", "42.5\nplay_mm = -0.1", "axes.radial.play_mm", ">= 0"),
+    "play that is no number": ("42.5", "42.5\nplay_mm = nan", "axes.radial.play_mm", "not a finite number"),
+    "unknown key of a sag": ("42.5", "42.5\nsag = { knee = 3.0 }", "'axes.radial.sag.knee'", "knee_mm"),
+    "a tool that goes backwards": ("42.5", "42.5\nsag = { slope = -1.0 }", "axes.radial.sag.slope", "> -1"),
+    "a knee without a slope": ("42.5", "42.5\nsag = { knee_mm = 3.0 }", "sag: a knee", "slope_beyond"),
     "not TOML": ("name = ", "name = = ", "not valid TOML", ""),
 }  # fmt: skip
 

@@ -21,7 +21,7 @@ from pumafuse.folders import FolderError
 from pumafuse.fusion import results
 from pumafuse.fusion.summary import Summary
 from pumafuse.logs import tables
-from pumafuse.model.arm import AxisModel
+from pumafuse.model.arm import AxisModel, Sag
 from pumafuse.model.plants import FirstOrder, SecondOrder
 from pumafuse.pieces import fusing, reading
 from pumafuse.pieces.reading import rows_of
@@ -36,8 +36,8 @@ CONFIG = pf.FusionConfig(
         update_period=0.028,
         delay=0.06,
         axes={
-            "x": AxisModel(plant=SecondOrder(natural_frequency=20.0, damping=0.8), gain_recovery=0.1),
-            "y": AxisModel(plant=FirstOrder(time_constant=0.05), delay=0.02),
+            "x": AxisModel(plant=SecondOrder(natural_frequency=20.0, damping=0.8), gain_recovery=0.1, max_speed=0.044),
+            "y": AxisModel(plant=FirstOrder(time_constant=0.05), delay=0.02, play=2e-4, sag=Sag(slope=1e-3)),
         },
     ),
     process={

@@ -416,3 +416,39 @@ def motion(path: Path) -> Motion:
     position = np.stack([table[one] for one in ("x_mm", "y_mm", "z_mm")], axis=-1) / 1e3
     turned = np.stack([table[one] for one in ("qx", "qy", "qz", "qw")], axis=-1) if "qw" in names else None
     return Motion(table["time_s"], position, turned)
+
+
+def rests_and_moves(period: float, late: float) -> tuple[Motion, Motion]:
+    """Samples of a path from pose to pose, at rest for most of the time, and a sensor that errs with the pose."""
+    chance = np.random.default_rng(11)
+    poses = np.vstack([[0.5, 0.0, 0.4, 0.0, 0.0, 0.0], chance.uniform(-0.25, 0.25, (12, 6))])
+    begin = 5.0 * np.arange(len(poses))
+
+    def path(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
+        share = np.clip((time[:, None] - begin[1:]) / 1.5, 0.0, 1.0)  # 1.5 s of motion, 3.5 s of rest
+        at = poses[0] + (share * share * (3.0 - 2.0 * share)) @ np.diff(poses, axis=0)
+        return at[:, :3], Rotation.from_rotvec(at[:, 3:])
+
+    told, time = np.arange(0.0, 64.0, period), np.arange(0.5, 64.0, 1.0 / 30.0)
+    (where, turned), (at, seen) = path(told), path(time - late)
+    error = 3e-3 * np.sin(8.0 * at + [0.3, 1.1, 2.3])
+    frame, marker = Rotation.from_rotvec([0.2, -0.9, 1.5]), Rotation.from_rotvec([-1.1, 0.8, 0.3])
+    point = frame.inv().apply(at + error + seen.apply([-0.01, -0.02, 0.03]) - [1.0, -0.5, 0.2])
+    point += chance.normal(0.0, 1e-4, point.shape)
+    return Motion(told, where, turned.as_quat()), Motion(time, point, (frame.inv() * seen * marker).as_quat())
+
+
+def test_rests_do_not_decide_the_lag() -> None:
+    """Of a motion that mostly rests the lag holds to 2 ms; a sensor as early as samples of a path allow is named."""
+    late = registered(*([one] for one in rests_and_moves(0.02, 0.06)))
+    assert late.position is not None
+    assert late.position.lag.value == pytest.approx(0.05, abs=2e-3)  # commands that are held are half a period late
+    assert late.findings == ()
+    early = registered(*([one] for one in rests_and_moves(0.02, 0.0)))
+    assert early.position is not None
+    assert early.position.lag.value == pytest.approx(-0.01, abs=2e-3)
+    (found,) = early.findings
+    assert found.finding is Finding.AHEAD and "interpolation_ms" in found.sentence("sensor")
+    finely = registered(*([one] for one in rests_and_moves(0.002, 0.0)))
+    assert finely.position is not None
+    assert finely.position.lag.value == pytest.approx(-0.001, abs=2e-3)

@@ -223,6 +223,20 @@ def test_rows_that_are_no_news_change_no_frame(change: Callable[[np.ndarray], np
     np.testing.assert_allclose(found.rotation, whole.rotation, atol=np.radians(0.1))
 
 
+def test_a_gap_of_the_commands_is_named_and_costs_nothing_else() -> None:
+    """When it is and how long is said; orientations are used, and the frame stays within 1 mm and 0.1°."""
+    whole = recorded(as_it_is)
+    time = (whole.command.stamp - whole.command.stamp[0]) / 1e9
+    run = replace(whole, command=whole.command.rows((time < 11.0) | (time > 26.0)))
+    with pytest.warns(pf.PumafuseWarning, match=r"the longest gap is 15 s, from 1[01]\.\d\d s on: what sensors saw in"):
+        found = pf.register(run)
+    assert found.details.sensors["camera"].angular_rms is not None
+    frame, expected = found.config.sensors["camera"].frame, pf.register(whole).config.sensors["camera"].frame
+    assert frame is not None and expected is not None
+    np.testing.assert_allclose(frame.at, expected.at, atol=1e-3)
+    np.testing.assert_allclose(frame.rotation, expected.rotation, atol=np.radians(0.1))
+
+
 def along_base(marker: float) -> pf.Run:
     """A run beside a sensor that measures along the base's axes, so many times the marker of a set-up on the tool."""
     setup = Setup(3, seconds=20.0, wrong=1.0)

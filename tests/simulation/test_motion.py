@@ -18,12 +18,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from pumafuse.filter.response import response
 from pumafuse.fusion.config import Process
-from pumafuse.model.arm import Gain
+from pumafuse.model.arm import AxisModel, Gain, Sag
 from pumafuse.model.plants import FirstOrder, SecondOrder
 from pumafuse.simulation.grid import POINTS, grid
 from pumafuse.simulation.motion import Motion, simulate_axis
-from pumafuse.simulation.true_arm import GainCurve, TrueAxis
+from pumafuse.simulation.true_arm import GainCurve, TrueArm, TrueAxis
 
 Floats = NDArray[np.float64]
 PERIOD = 0.028
@@ -206,6 +207,34 @@ def test_backlash_is_the_play_operator(width: float, noise: float) -> None:
     plain, loose = (motion(true_axis(WEAK, delay=0.03, backlash=gap), command, process) for gap in (0.0, width))
     assert (plain.time == loose.time).all()
     assert np.abs(loose.position - play(plain.position, width)).max() <= 1e-12 * np.abs(command).max()
+
+
+@pytest.mark.parametrize("plant", [FIRST, WEAK], ids=["first order", "second order"])
+@pytest.mark.parametrize("recovery", [None, 0.1])
+def test_a_limited_drive_and_a_load_are_the_responses(plant: FirstOrder | SecondOrder, recovery: float | None) -> None:
+    """A fastest speed, play and sag without noise: what the core's closed forms say, to 1e-6 of a metre of motion.
+
+    The drive is to 1e-9; play is followed from event to event.
+    """
+    command, sag = 20.0 * random_walk(40), Sag(offset=0.002, slope=-0.05, knee=0.01, slope_beyond=0.1)
+    gain, speed = Gain(slope=0.05, intercept=0.9), {"max_speed": 0.3}
+    for bends, within in ((speed, 1e-8), (speed | {"play": 0.002, "sag": sag}, 2e-6)):
+        model = AxisModel(plant=plant, gain=gain, gain_recovery=recovery, **bends)
+        true = TrueArm().over(model, 0.03, "true_arm")
+        found = simulate_axis(true, QUIET, 0.0, ticks(40), command, PERIOD, np.random.default_rng(1), start=0.5)
+        expected = response(model, PERIOD, 0.03, ticks(40), 0.5 + command, 0.5, found.time)
+        assert np.abs(found.position - expected).max() < within
+        linear = response(AxisModel(plant=plant, gain=gain), PERIOD, 0.03, ticks(40), command, 0.0, found.time)
+        assert np.abs(linear - expected).max() > 0.01
+
+
+def test_a_true_arm_may_have_no_limit_no_play_and_another_load() -> None:
+    """What is absent is as in the model; "none", 0 and a table of its own are not."""
+    model = AxisModel(plant=FIRST, max_speed=0.3, play=0.002, sag=Sag(slope=0.1))
+    same = TrueArm().over(model, 0.0, "true_arm")
+    assert (same.max_speed, same.backlash, same.sag) == (0.3, 0.002, Sag(slope=0.1))
+    other = TrueArm(max_speed="none", backlash=0.0, sag=Sag(slope=0.2)).over(model, 0.0, "true_arm")
+    assert (other.max_speed, other.backlash, other.sag) == (None, 0.0, Sag(slope=0.2))
 
 
 def test_slow_drift_is_a_sine_on_the_position() -> None:

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
@@ -157,6 +158,51 @@ def test_what_is_left_over_is_smooth_and_the_camera_drifts(tmp_path: Path) -> No
     for axis in ("tangential", "vertical"):
         found = consistency(est, "vision", axis)
         assert found is not None and found.nis < 0.65
+
+
+# RMSE in degrees and coverage, with the arm as it is; RMSE and coverage with an arm that is taken to be linear.
+BENT = {
+    "saturating-servo": ((0.31, 0.48), (0.90, 1.0), (4.9, 5.9), (0.67, 0.77)),
+    "tool-with-play": ((0.16, 0.21), (0.90, 0.99), (1.08, 1.23), (0.04, 0.07)),
+    "sagging-lever": ((0.13, 0.20), (0.90, 1.0), (1.30, 1.51), (0.11, 0.21)),
+}
+
+
+def check_bent(worked: Worked, name: str) -> None:
+    """An arm that is not linear: its error bars hold, those of a linear one do not."""
+    rmse, coverage, linear_rmse, linear_coverage = BENT[name]
+    config, run = pf.FusionConfig.load(worked.run / "fusion.toml"), pf.Run.read(worked.run)
+    (axis,) = config.arm.axes
+    linear = msgspec.structs.replace(config.arm.axes[axis], max_speed=None, play=0.0, sag=None)
+    arm = msgspec.structs.replace(config.arm, axes={axis: linear})
+    score = worked.scores[axis]
+    assert rmse[0] < score["rmse_deg"] < rmse[1]
+    assert coverage[0] < score["coverage"] < coverage[1]
+    score = pf.summarise(pf.fuse(run, msgspec.structs.replace(config, arm=arm))).axes[axis].score
+    assert score is not None
+    assert linear_rmse[0] < score.rmse_deg < linear_rmse[1]
+    assert linear_coverage[0] < score.coverage < linear_coverage[1]
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+def test_a_servo_that_saturates(tmp_path: Path) -> None:
+    """saturating-servo: a thirteenth of the error of a linear arm, and error bars that hold."""
+    check_bent(Worked("saturating-servo", tmp_path), "saturating-servo")
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+def test_a_tool_with_play(tmp_path: Path) -> None:
+    """tool-with-play: a sixth of the error of a linear arm, and error bars that hold."""
+    check_bent(Worked("tool-with-play", tmp_path), "tool-with-play")
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+def test_a_lever_that_sags(tmp_path: Path) -> None:
+    """sagging-lever: an eighth of the error of an arm without sag, and error bars that hold."""
+    check_bent(Worked("sagging-lever", tmp_path), "sagging-lever")
 
 
 @pytest.mark.long

@@ -23,6 +23,7 @@ from ..tuning.parameters import Fit
 from ..tuning.tune import tune
 from . import init
 from .fuse import draw, show
+from .register import taken
 from .tune import end, fitting, show_lags
 
 _FITTED: Sequence[Fit] = ("noise", "delay", "plant", "gain")
@@ -69,5 +70,7 @@ def run(
     summary = results.write(est, output, force, extras, texts["run.toml"])
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
+    for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
+        typer.echo(taken(name, 0.0))
     typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {shlex.quote(str(output))}/fusion.toml -o DIR")
     end(fitted.details)

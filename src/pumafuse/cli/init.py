@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from ..discovery.contents import Part, Signal, rate_of
-from ..discovery.drafts import BASES, FILES, drafts
+from ..discovery.drafts import BASES, FILES, MANIFEST, drafts
 from ..discovery.guesses import SensorGuess, guess
 from ..discovery.questions import decisions, questions
 from ..discovery.roles import Stream
@@ -36,7 +36,8 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
         force: Replace them.
 
     Raises:
-        PumafuseError: The log cannot be read, has no commands or no sensor, or the files are in the way.
+        PumafuseError: The log cannot be read, has no commands or no sensor, or the files are in the way; or its sensors
+            cannot be registered: then ``run.toml`` alone is written.
     """
     found = survey(log, rate)
     folder = Path(f"{found.name}-fusion") if output is None else output
@@ -47,7 +48,13 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     texts = drafts(found, arm, sensors, folder)
     show(found, sensors)
     if found.own_frames:
-        config = registered(found, described(drafts(found, arm, sensors, Path())["run.toml"], Path()))
+        recorded = described(drafts(found, arm, sensors, Path())["run.toml"], Path())
+        try:
+            config = registered(found, recorded)
+        except RunError as error:  # what it was read by is there to be mended
+            write_file(folder / MANIFEST, texts[MANIFEST], replace=force)
+            again = f"what was read is in {folder / MANIFEST}: mend it, then `pumafuse init {folder} --force`"
+            raise RunError(f"{error}; {again}") from None
         if config is not None:
             texts |= {"fusion.toml": config.to_toml(), "arm.toml": config.arm.to_toml()}
     for name, text in texts.items():
@@ -119,8 +126,7 @@ def _part_row(part: Part) -> list[str]:
 
 def _described_rows(found: Survey) -> list[list[str]]:
     """Of a log whose run.toml says what is where."""
-    run = found.run
-    sources = {"command": run.command, **run.sensors, **({} if run.reference is None else {"reference": run.reference})}
+    sources = {"command": found.run.command, **found.run.measured}
     return [
         [printable(source.label_for(name)), "", str(len(source.stamp)), *_rate(source.stamp), "run.toml", ""]
         for name, source in sources.items()

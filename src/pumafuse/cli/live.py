@@ -93,7 +93,7 @@ def run(
         sender = stack.enter_context(contextlib.closing(UdpSender(out))) if out else None
         estimator = partial(LiveEstimator, known, window=window, stale_after=stale_after, start=start, on_notice=notify)
         gc.freeze()  # what is here stays: looking through it again and again would take longer than an estimate may
-        for doubt in known.arm.doubts() + ([] if recorded else known.arm.joint_doubts()):
+        for doubt in known.arm.doubts() + ([] if known.robot else known.arm.joint_doubts()):
             notify(doubt)
         recorder = Recorder(record, known, start, notify) if record else None
         live = estimator(event_log=recorder)

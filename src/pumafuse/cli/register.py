@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 
 from .. import folders
-from ..fusion.config import FusionConfig
+from ..fusion.config import ARM_FILE, ROBOT_FILE, FusionConfig
 from ..logs.run import Run
 from ..registration.findings import AS_READ
 from ..registration.register import Registered
@@ -20,7 +20,7 @@ from ..units import DEG, MM, MS
 from .tables import print_tables, table
 
 SUMMARY = "registration.json"
-_OURS = frozenset({SUMMARY, "fusion.toml", "arm.toml"})
+_OURS = frozenset({SUMMARY, "fusion.toml", ARM_FILE, ROBOT_FILE})
 _MENDED = {one.value for one in AS_READ}  # findings after which run.toml is to be mended
 _NOT_ALL = 3  # exit code: some sensor was not registered
 
@@ -86,6 +86,16 @@ def _show(name: str, one: RegisteredSensor) -> None:
     if one.latency is not None:
         rows.append(["latency_ms", f"{one.latency * MS:.2f}", _limits(one.latency_ci95, MS, ".2f")])
     print_tables([table(["number", "found", "95 % interval"], rows)])
+    if one.latency is not None and one.latency_ci95 == (one.latency, one.latency):
+        typer.echo(taken(name, one.latency))
+
+
+def taken(name: str, latency: float) -> str:
+    """What to say of a latency [s] that nothing in a run tells."""
+    return (
+        f"the latency of {name} is taken to be {latency * MS:.4g} ms, not found: error bars do not count how far off"
+        " that is; by each ms the position is off by what the tool moves in it (fusion.toml, latency_ms)"
+    )
 
 
 def _places(what: str, found: Registered) -> list[list[str]]:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from .. import folders
 from ..errors import ConfigError
-from ..fusion.config import FusionConfig
+from ..fusion.config import ARM_FILE, ROBOT_FILE, FusionConfig
 from ..logs.run import Run
 from ..tuning.parameters import kinds_of
 from ..tuning.summary import TuningSummary
@@ -24,7 +24,7 @@ from .tables import interval, number, print_tables, table
 
 SUMMARY = "tuning.json"
 PAGE = "report.html"
-OURS = frozenset({SUMMARY, PAGE, "fusion.toml", "arm.toml"})
+OURS = frozenset({SUMMARY, PAGE, "fusion.toml", ARM_FILE, ROBOT_FILE})
 _HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
 _PAIRS = 3  # of correlated parameters that are shown
 _WORSE, _INTERRUPTED = 3, 130

@@ -26,12 +26,12 @@ from ..logs import formats, recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, without_sentinels
 from ..logs.frames import CARTESIAN
 from ..logs.manifest import Time
-from ..logs.messages import PATH, PATH_TIME
+from ..logs.recordings import PATH, PATH_TIME
 from ..logs.run import Source, standing_clock
 from ..logs.stamps import packets
-from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
+from ..units import TIMES, Kind, ending, kind_of, si_of, unwrapped, wraps
 from . import names
-from .orientations import Attitude, attitudes_in, may_be_part
+from .orientations import Attitude, are_units, attitudes_in, may_be_part
 
 _TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
 _ACCEPTED = "accepted: CSV, JSON, Parquet, .xlsx, .mat, .npy, .npz, MCAP, bags of ROS, .ulg, .rrd"
@@ -46,11 +46,14 @@ _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
 _MOST_READ = 2_000  # columns of one of them
 _FEWEST_ROWS = 10
-_UNIT = 1e-3  # from 1, of the length of a quaternion in a text
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
 _OF_TICK = 0.02  # of a tick, by which ticks of a clock differ: stamps of 15.6 ms that are written with 4 decimals
 _MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
+RANGES: dict[Kind, tuple[str, str, float]] = {  # small and large unit, and beyond which number it is the large one
+    "length": ("m", "mm", 10.0),
+    "angle": ("rad", "deg", 2.0 * math.pi),
+}
 _OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
@@ -79,6 +82,7 @@ _PX4 = "PX4"  # whose numbers are in SI units
 _CHILD = "child_frame_id"
 _BASES = names.words_in("base world map odom root origin")  # words of frames that stand still
 _TOOLS = names.words_in("tool tcp ee eef effector flange hand gripper")
+_NUMBERS = re.compile(r"\d+")  # as in tool0_controller
 _STREAM_NS = 250_000_000  # between trajectories of one point, up to which they are commands that are sent as they act
 
 
@@ -200,9 +204,13 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
     found: list[Part] = []
     for path in _files(log):
         if path.suffix in _TEXTS and path != log:
-            found += _perhaps(path, rate)
+            with suppress(RunError):  # it may be anything, if it is no table of positions with a clock of its own
+                found += [one for one in _tabled(path, rate) if one.clock and not one.clock.time.rate and one.signals]
+        elif tables.is_recording(path):
+            found += _recorded(path)
         else:
-            found += _recorded(path) if tables.is_recording(path) else _each_table(path, rate)
+            several = formats.names(path) if path.name.endswith(formats.ENDINGS) else ("",)
+            found += [part for name in several for part in _tabled(path, rate, name)]
         if len(found) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
     return found
@@ -254,9 +262,13 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
         elif found:
             left_out[name] = found
     signals = [_placed(one, told) for one in _without_quaternions(signals, left_out)]
+    notes = list[str]()
+    if len(table.names) > _MOST_READ:
+        read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
+        notes = [f"{table.path.name}: of {len(table.names)} columns {read}"]
     beside = [names.role_words(one.column) for one in signals if one.axis in CARTESIAN]
     left_out |= {path: "turning" for one in attitudes if one.role_words not in beside for path in one.columns.columns}
-    clock, notes = _clock(table, signals, sorted(counts))
+    clock, why_none = _clock(table, signals, sorted(counts))
     if clock is None and rate:
         clock = _counted(table, rate)
     used = () if clock is None else tuple(clock.time.columns)
@@ -268,7 +280,7 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
         clock=clock,
         signals=_with_units([one for one in signals if one.column not in used]),
         left_out={path: why for path, why in left_out.items() if path not in mine},
-        notes=(*notes, *(() if clock is None else clock.notes), *place.notes, *table.notes, *_of_many(table)),
+        notes=(*why_none, *(() if clock is None else clock.notes), *place.notes, *table.notes, *notes),
         attitudes=tuple(one for one in attitudes if one.role_words in beside),
     )
 
@@ -287,23 +299,14 @@ def _likeliest(columns: Sequence[str]) -> list[str]:
     return list(columns) if len(columns) <= _MOST_READ else names.likeliest_first(columns)[:_MOST_READ]
 
 
-def _of_many(table: Table) -> list[str]:
-    """What to say of a table of which only some columns are read."""
-    if len(table.names) <= _MOST_READ:
-        return []
-    read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
-    return [f"{table.path.name}: of {len(table.names)} columns {read}"]
-
-
 def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
     """Columns that are no quaternion, which are four of one list, of length 1 in each row."""
     lists = dict[str, list[Signal]]()
     for one in signals:
-        lists.setdefault(leaf(one.column) if one.column.endswith("]") else "", []).append(one)
-    for listed, four in lists.items():
-        with np.errstate(over="ignore"):
-            size = np.linalg.norm([one.plain for one in four], axis=0)
-        if listed and len(four) == 4 and bool((np.abs(size[np.isfinite(size)] - 1.0) < _UNIT).all()):
+        if one.column.endswith("]"):
+            lists.setdefault(leaf(one.column), []).append(one)
+    for four in lists.values():
+        if len(four) == 4 and are_units(np.column_stack([one.plain for one in four])):
             left_out |= {one.name: "of a quaternion" for one in four}
     return [one for one in signals if one.name not in left_out]
 
@@ -333,7 +336,10 @@ def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
     Such a column changes from row to row. Of numbers it has to be called so: ``id``. A ``status`` is none.
     """
     for name, column in table.columns.items():
-        whose, words = names.tells_apart(name), pa.types.is_string(column.type) and not table.is_dated(name)
+        whose, words = (
+            names.has_word(leaf(name), names.WHOSE),
+            pa.types.is_string(column.type) and not table.is_dated(name),
+        )
         if not (whose and pa.types.is_integer(column.type)) and not (words and (whose or not names.no_position(name))):
             continue
         counts = pc.value_counts(column.drop_null())
@@ -347,8 +353,7 @@ def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
 
 def _called(column: str, where: Mapping[str, Any]) -> str:
     """A column by its name, and by what says which rows are its own: ``elbow_position``, ``joint_11_position``."""
-    keys = (key if isinstance(key, str) else f"joint_{key}" for key in where.values())
-    return "_".join([*keys, column])
+    return "_".join([*(key if isinstance(key, str) else f"joint_{key}" for key in where.values()), column])
 
 
 def _signal(
@@ -363,10 +368,10 @@ def _signal(
     known = values[np.isfinite(values)]
     if len(known) < _FEWEST_ROWS:
         return "hardly any number" if len(known) else ""
-    if known.min() == known.max() and not names.is_part(path):
+    if known.min() == known.max() and not names.has_word(path, names.PARTS):
         return f"always {known[0]:g}"
     kind = _RADIANS[0] if joint else place.type.rpartition("/")[2]
-    sliding = kind in _RADIANS and names.is_sliding(joint or path)
+    sliding = kind in _RADIANS and names.has_word(joint or path, names.SLIDING)
     metres = kind in _METRES or sliding or _ECHOED.match(path) or (kind == _PX4 and not names.is_turning(path))
     of_type = "m" if metres else "rad" if kind in _RADIANS or path.startswith(f"{PATH}.") else ""
     unit = names.unit_of(path) or names.unit_of(place.topic or place.entity)
@@ -380,17 +385,11 @@ def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
     found = list[Signal]()
     for one in signals:
         if not one.unit:
-            alike = [
-                other
-                for other in signals
-                if not other.unit and names.is_turning(other.axis) == names.is_turning(one.axis)
-            ]
+            turns = names.is_turning(one.axis)
+            alike = [other for other in signals if not other.unit and names.is_turning(other.axis) == turns]
+            small, large, most = RANGES["angle" if turns else "length"]
             largest = max(float(np.nanmax(np.abs(other.plain))) for other in alike)
-            if names.is_turning(one.axis):
-                unit = "deg" if largest > 2.0 * np.pi else "rad"
-            else:
-                unit = "mm" if largest > 10.0 else "m"
-            one = replace(one, unit=unit)
+            one = replace(one, unit=large if largest > most else small)
         if kind_of(f"_{one.unit}") == "angle" and len(wraps(one.value)):
             one = replace(one, turns=True, basis="turn" if one.basis == "range" else one.basis)
         found.append(one)
@@ -428,9 +427,7 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
     def candidates() -> Iterator[Clock | None]:
         yield from (_clock_of(table, name, stroke) for name in called)
         yield from (_clock_of(table, name, stroke) for name in table.columns if ending(leaf(name)) in TIMES)
-        yield from (
-            _clock_of(table, name, stroke) for name, one in table.columns.items() if _is_dated(table, name, one)
-        )
+        yield from (_clock_of(table, name, stroke) for name in table.columns if table.is_dated(name))
         if nameless and not called:
             yield _nameless_clock(table, stroke)
         yield from (_clock_of(table, name, stroke, coarse) for name in counts if _counts(table, name) != 1.0)
@@ -531,7 +528,9 @@ def _clock_of(table: Table, name: str, stroke: float, span: float = 0.0) -> Cloc
     try:
         kind = table.column(name).type
         if pa.types.is_nested(kind) or pa.types.is_temporal(kind) or table.is_dated(name):
-            time, basis = Time(name), _basis(table, name, kind)
+            dated = table.zoned(name) is not None
+            apart = "seconds and nanoseconds" if pa.types.is_nested(kind) else "a time without a date"
+            time, basis = Time(name), "a date" if dated else apart
         elif pa.types.is_integer(kind) and (beside := table.nanoseconds_beside(name)):
             time, basis = Time(name, nanoseconds=beside), "seconds and nanoseconds"
         elif (unit := ending(leaf(name))) in TIMES:
@@ -584,31 +583,16 @@ def _counted(table: Table, rate: float) -> Clock:
     """Frames that come at a rate, by a column that counts them, or else each row."""
     basis = f"at {rate:g} Hz, as given"
     for name in table.columns:
-        if names.is_counter(name):
-            with suppress(RunError):
-                steps = np.diff(table.plain(name)[0])
-                if (steps >= 1.0).all() and (steps % 1.0 == 0.0).all() and (steps == 1.0).mean() > 0.5:
-                    return Clock.of(table, Time(name, rate=rate), basis)
+        with suppress(RunError):
+            steps = np.diff(table.plain(name)[0]) if names.has_word(leaf(name), names.COUNTERS) else np.zeros(1)
+            if (steps >= 1.0).all() and (steps % 1.0 == 0.0).all() and (steps == 1.0).mean() > 0.5:
+                return Clock.of(table, Time(name, rate=rate), basis)
     return Clock.of(table, Time(rate=rate), basis)
 
 
 def without_clock(part: Part) -> str:
     """Why a part that has positions has no clock."""
     return next((note for note in part.notes if " is no clock: " in note), "no clock")
-
-
-def _basis(table: Table, name: str, kind: pa.DataType) -> str:
-    """How it is known what stamps without a unit are."""
-    if pa.types.is_nested(kind):
-        return "seconds and nanoseconds"
-    return "a time without a date" if pa.types.is_duration(kind) or table.zoned(name) is None else "a date"
-
-
-def _is_dated(table: Table, name: str, column: pa.ChunkedArray) -> bool:
-    try:
-        return pa.types.is_string(column.type) and table.is_dated(name)
-    except RunError:  # dates mixed with numbers
-        return False
 
 
 def _no_clock(table: Table, name: str) -> str:
@@ -653,28 +637,23 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
 # Tables.
 
 
-def _each_table(path: Path, rate: float) -> Iterator[Part]:
-    """A table; of a file with several each of them."""
-    for name in formats.names(path) if path.name.endswith(formats.ENDINGS) else ("",):
-        yield from _tabled(path, rate, name)
-
-
 def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
     """A table; of several runs in it the first, of a sensor's rows those that it calls valid; of tf each frame."""
     read = partial(tables.read, path, growing=True, topic=topic)
     if path.suffix == ".parquet":
-        fields = _fields(path)
+        with tables.one_line(path):
+            fields = _likeliest([one.name for one in papq.read_schema(path) if "binary" not in str(one.type)])  # images
         some = [name for name in names.EPISODES if name in fields]
         where = _first_run(read(fields=some)) if some else {}
         table = read(fields=fields, where=where)
     else:
-        fields, table = _likeliest, read(fields=_likeliest)
+        table = read(fields=_likeliest)
         where = _first_run(table)
-        table = read(fields=fields, where=where) if where else table
+        table = tables.chosen(table, where)
     notes = [f"has several runs: only {key} = {value!r} is used" for key, value in where.items()]
     if valid := _validity(table) if names.role_of(path.name.split(".")[0]) in ("sensor", "reference") else {}:
         where, rows = {**where, **valid}, table.rows
-        table = read(fields=fields, where=where)
+        table = tables.chosen(table, valid)
         notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
     type_ = _PX4 if path.suffix == ".ulg" else ""
     for place, rows in _by_frame(table, Part(path, topic, where=where, type=type_, notes=tuple(notes))):
@@ -696,54 +675,28 @@ def _by_frame(table: Table, place: Part) -> Iterator[tuple[Part, Table]]:
     rows = {pair: np.array([one == pair for one in frames]) for pair in dict.fromkeys(frames)}
     links = {name for _, name in rows}
     moving = [pair for pair, mine in rows.items() if np.ptp(at[:, mine], axis=1).max() > 0.0]
-    chosen = [pair for pair in moving if pair[0] not in links or _called_as(pair[0], _BASES)]
-    chosen = [pair for pair in chosen if _called_as(pair[1], _TOOLS)] or chosen
+    chosen = [pair for pair in moving if pair[0] not in links or names.has_word(_NUMBERS.sub("", pair[0]), _BASES)]
+    chosen = [pair for pair in chosen if names.has_word(_NUMBERS.sub("", pair[1]), _TOOLS)] or chosen
     if not chosen:
         yield replace(place, notes=(*place.notes, "no frame in it moves as seen from a base: links only turn")), table
     others = [f"{one} → {name}" for one, name in rows if (one, name) not in chosen]
     notes = [f"transforms of {counted(len(others), 'other frame')} left out: {', '.join(others[:3])}"] if others else []
     for one, name in chosen:
-        where = {**place.where, child: name, **({parent: one} if sum(name == each for _, each in rows) > 1 else {})}
-        if not others and len(chosen) == 1:
-            where = place.where
-        fields = _OF_FRAME if place.type.endswith("/TFMessage") else None
-        mine = tables.read(place.file, topic=place.topic, fields=fields, where=where)
-        yield replace(place, where=where, notes=(*place.notes, *notes)), mine
-
-
-def _called_as(frame: str, known: frozenset[str]) -> bool:
-    """Whether a frame has one of these words in its name: ``tool0_controller``."""
-    return any(word.rstrip("0123456789") in known for word in names.words(frame))
-
-
-def _perhaps(path: Path, rate: float) -> Iterator[Part]:
-    """A text in a folder, which may be anything, if it is a table of positions with a clock of its own."""
-    with suppress(RunError):
-        for part in _tabled(path, rate):
-            if part.clock and not part.clock.time.rate and part.signals:
-                yield part
+        where = {child: name, **({parent: one} if sum(name == each for _, each in rows) > 1 else {})}
+        where = where if others or len(chosen) > 1 else {}
+        mine = replace(place, where={**place.where, **where}, notes=(*place.notes, *notes))
+        yield mine, tables.chosen(table, where)
 
 
 def _validity(table: Table) -> dict[str, Any]:
     """Which rows are valid, where a column of 0 and 1, or of false and true, says it."""
     for name, column in table.columns.items():
-        if names.VALID.isdisjoint(names.words(name)) or not (
-            pa.types.is_boolean(column.type) or pa.types.is_integer(column.type)
-        ):
-            continue
-        values = pc.unique(column.drop_null()).sort().to_pylist()
-        if values == [0, 1]:
-            return {name: values[1]}
+        is_flag = pa.types.is_boolean(column.type) or pa.types.is_integer(column.type)
+        if is_flag and names.has_word(name, names.VALID):
+            values = pc.unique(column.drop_null()).sort().to_pylist()
+            if values == [0, 1]:
+                return {name: values[1]}
     return {}
-
-
-def _fields(path: Path) -> list[str]:
-    """The columns of a Parquet file that are no images."""
-    try:
-        schema = papq.read_schema(path)
-    except (ValueError, OSError) as error:
-        raise RunError(f"{path}: not a table that can be read: {str(error).splitlines()[0]}") from None
-    return _likeliest([one.name for one in schema if "binary" not in str(one.type)])
 
 
 def _first_run(table: Table) -> dict[str, Any]:
@@ -752,31 +705,26 @@ def _first_run(table: Table) -> dict[str, Any]:
         if name not in table.columns:
             continue
         values = pc.unique(table.columns[name].drop_null())
-        if 1 < len(values) <= table.rows // _FEWEST_ROWS:
-            value: Any = values[0].as_py()
-            if isinstance(value, int | str | float):
-                return {name: int(value) if isinstance(value, float) and value.is_integer() else value}
+        value: Any = values[0].as_py() if 1 < len(values) <= table.rows // _FEWEST_ROWS else None
+        if isinstance(value, int | str | float):
+            return {name: int(value) if isinstance(value, float) and value.is_integer() else value}
     return {}
+
+
+class _Info(msgspec.Struct):
+    """Of a data set of LeRobot its columns, each with ``names``: a list, or a table with a list in it."""
+
+    features: dict[str, dict[str, Any]]
 
 
 def _labels(path: Path) -> dict[str, list[str]]:
     """What the elements of lists are called, by column, in a data set of LeRobot."""
-    for above in path.resolve().parents[:4]:
-        if (info := above / "meta" / "info.json").is_file():
-            try:
-                return _feature_names(msgspec.json.decode(info.read_bytes()))
-            except (msgspec.DecodeError, OSError):
-                return {}
-    return {}
-
-
-def _feature_names(info: Any) -> dict[str, list[str]]:
-    """``names`` of each feature: a list, or a table with a list in it."""
-    found = dict[str, list[str]]()
-    features: Any = info.get("features") if isinstance(info, dict) else None  # pyright: ignore
-    for key, feature in cast(dict[str, Any], features if isinstance(features, dict) else {}).items():
-        given: Any = cast(dict[str, Any], feature).get("names") if isinstance(feature, dict) else None
-        inside: Any = given
+    found, info = dict[str, list[str]](), _Info({})
+    with suppress(msgspec.MsgspecError, OSError, StopIteration):
+        about = next(one for above in path.resolve().parents[:4] if (one := above / "meta" / "info.json").is_file())
+        info = msgspec.json.decode(about.read_bytes(), type=_Info)
+    for key, feature in info.features.items():
+        inside: Any = feature.get("names")
         while isinstance(inside, dict | list) and inside:  # a list in a list, as Unitree's converter writes it
             listed = cast(list[Any], inside)
             inside = cast(Any, inside[0] if isinstance(inside, list) else next(iter(cast(Any, inside).values())))
@@ -832,8 +780,7 @@ def no_commands(parts: Iterable[Part]) -> str:
     """What may be the commands and is no positions, and what to do, in words; empty without any."""
     found = list[str]()
     for part in parts:
-        speeds = [name for name, why in part.left_out.items() if why in _SPEEDS]
-        speeds = [name for name in speeds if names.column_role(name) == "command"]
+        speeds = [one for one, why in part.left_out.items() if why in _SPEEDS and names.column_role(one) == "command"]
         if _ARE_VELOCITIES in part.notes or speeds:
             what = f"{part.label} are" if not speeds else f"{', '.join(speeds[:3])} of {part.label} are"
             found.append(
@@ -841,7 +788,7 @@ def no_commands(parts: Iterable[Part]) -> str:
                 " docs/own-log.md does under 'Commands that are velocities'"
             )
         found += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
-    return "; ".join(printable(one, 300) for one in found)
+    return "".join(f"{printable(one, 300)}; " for one in found) + ("or " if found else "")
 
 
 def period_of(command: Source) -> float:

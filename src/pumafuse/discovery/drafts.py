@@ -21,7 +21,7 @@ from .guesses import ArmGuess, SensorGuess
 from .roles import Stream
 from .survey import Survey
 
-FILES = ("run.toml", "arm.toml", "fusion.toml")
+FILES = MANIFEST, *_ = ("run.toml", "arm.toml", "fusion.toml")
 BASES = {"name": "by name", "type": "by type of message", "turn": "by its turn", "range": "guessed by range"}
 _COMMENT = 48  # column at which comments begin
 
@@ -35,11 +35,8 @@ def drafts(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess], fol
         sensors: Likewise.
         folder: Where they will be: files of the log are named from there.
     """
-    return {
-        "run.toml": _run_toml(found, arm, folder),
-        "arm.toml": _arm_toml(found, arm),
-        "fusion.toml": _fusion_toml(found, arm, sensors),
-    }
+    made = _run_toml(found, arm, folder), _arm_toml(found, arm), _fusion_toml(found, arm, sensors)
+    return dict(zip(FILES, made, strict=True))
 
 
 def _run_toml(found: Survey, arm: ArmGuess, folder: Path) -> str:
@@ -68,11 +65,8 @@ def _run_toml(found: Survey, arm: ArmGuess, folder: Path) -> str:
         lines += _source(["reference"], roles.reference, folder)
     for stream, why in roles.left_out:
         table = ["reference"] if stream.role == "reference" else ["sensors", stream.name]
-        lines += [
-            "",
-            f"# Not used: {printable(why, 200)}",
-            *(f"# {line}" for line in _source(table, stream, folder)[1:]),
-        ]
+        unused = [f"# {line}" for line in _source(table, stream, folder)[1:]]
+        lines += ["", f"# Not used: {printable(why, 200)}", *unused]
     return "\n".join([*lines, ""])
 
 
@@ -118,7 +112,7 @@ def _pose(stream: Stream) -> str:
 
 def _column(one: Signal) -> Any:
     """A column, with what its name does not say."""
-    more = {} if _says_unit(one.column, one.unit) else {"unit": one.unit}
+    more = {} if ending(leaf(one.column)) == f"_{one.unit}" else {"unit": one.unit}
     more |= {"turn_deg": 360} if one.turns else {}
     more |= {"where": dict(one.where)} if one.where else {}
     return {"column": one.column, **more} if more else one.column
@@ -159,17 +153,11 @@ def _arm_toml(found: Survey, arm: ArmGuess) -> str:
 
 
 def _fusion_toml(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
+    offsets = {axis: one.offset_sd for axis, one in arm.axes.items()}
     lines = [
         "# How far the arm and each sensor are trusted. `pumafuse tune` finds better numbers.",
-        _pair("arm", "arm.toml"),
-        "",
-        _header(["start"]),
-        *_by_kind(
-            "offset_sd",
-            {axis: one.offset_sd for axis, one in arm.axes.items()},
-            arm,
-            "how far the arm may be from its command at the start",
-        ),
+        *(_pair("arm", "arm.toml"), "", _header(["start"])),
+        *_by_kind("offset_sd", offsets, arm, "how far the arm may be from its command at the start"),
     ]
     for axis, one in arm.axes.items():
         unit, scale = SCREEN[one.kind].unit, SCREEN[one.kind].scale
@@ -213,10 +201,6 @@ def _by_kind(key: str, values: Mapping[str, float], arm: ArmGuess, comment: str)
 
 def _digits(value: float, digits: int = 2) -> float:
     return float(f"{value:.{digits}g}")
-
-
-def _says_unit(column: str, unit: str) -> bool:
-    return ending(leaf(column)) == f"_{unit}"
 
 
 def _from(folder: Path, file: Path) -> str:

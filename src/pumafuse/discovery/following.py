@@ -64,38 +64,18 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     s, z = s[inside], z[inside]
     if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
         return None
-    candidates = [one for span in _SPANS if (one := _at_span(t, u, s, z, span)) is not None]
-
-    def rest(one: tuple[float, float, float]) -> FloatArray:
-        return z - one[2] * np.interp(s - one[0], t, u)
-
-    best = min(candidates, key=lambda one: _robust_sd(rest(one)), default=None)
-    if best is None:
-        return None
-    lag, correlation, slope = best
-    return Following(
-        lag=lag,
-        correlation=correlation,
-        slope=slope,
-        offset=float(np.median(z - math.copysign(1.0, slope) * np.interp(s - lag, t, u))),
-        scatter=max(min(scatter(z), scatter(rest(best))), _resolution(z)),
-        resolution=_resolution(z),
-        misfit=_robust_sd(rest(best)),
-        outliers=float(isolated(z).mean()),
-    )
+    found, noise, steps, outliers = list[Following](), scatter(z), _resolution(z), float(isolated(z).mean())
+    for lag, correlation, slope in filter(None, (_at_span(t, u, s, z, span) for span in _SPANS)):
+        led = np.interp(s - lag, t, u)
+        offset, rest = float(np.median(z - math.copysign(1.0, slope) * led)), z - slope * led
+        left = max(min(noise, scatter(rest)), steps)
+        found.append(Following(lag, correlation, slope, offset, left, steps, robust_sd(rest), outliers))
+    return min(found, key=lambda one: one.misfit, default=None)
 
 
 def _stands(value: FloatArray) -> bool:
     """Whether a signal moves by no more than what rounding makes of its mean."""
     return float(np.ptp(value)) <= _ROUNDING * float(np.abs(value).max())
-
-
-def _without_few(rest: FloatArray, motion: FloatArray) -> BoolArray:
-    """Which changes are no outliers by what is left of them, (n,); all, where these are many, or are the motion."""
-    kept = np.abs(rest - np.median(rest)) <= _OUTLYING * _robust_sd(rest)
-    few = np.count_nonzero(~kept) <= _MOST_OUTLYING * len(rest)
-    is_motion = float(motion[kept] @ motion[kept]) < (1.0 - 2.0 * _MOST_OUTLYING) * float(motion @ motion)
-    return kept if few and not is_motion else np.ones(len(rest), dtype=np.bool_)
 
 
 def known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
@@ -143,8 +123,11 @@ def _at_span(
     lag = float(fine[np.argmax(sign * correlations(fine))])
     other = moves(np.array([lag]))[0]
     slope = float(other @ change) / float(other @ other)
-    kept = _without_few(change - slope * other, other)
-    other, change = other[kept], change[kept]
+    rest = change - slope * other
+    kept = np.abs(rest - np.median(rest)) <= _OUTLYING * robust_sd(rest)
+    is_motion = float(other[kept] @ other[kept]) < (1.0 - 2.0 * _MOST_OUTLYING) * float(other @ other)
+    if np.count_nonzero(~kept) <= _MOST_OUTLYING * len(rest) and not is_motion:
+        other, change = other[kept], change[kept]
     power = math.sqrt(float(other @ other) * float(change @ change))
     return (lag, float(other @ change) / power, slope) if power > 0.0 else None
 
@@ -190,5 +173,6 @@ def isolated(value: FloatArray) -> BoolArray:
     return found
 
 
-def _robust_sd(rest: FloatArray) -> float:
+def robust_sd(rest: FloatArray) -> float:
+    """Standard deviation by the median distance from the median."""
     return 1.4826 * float(np.median(np.abs(rest - np.median(rest))))

@@ -11,11 +11,11 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import RunError
-from ..logs.run import Run
+from ..logs.run import REFERENCE, Run
 from ..units import Kind
 from .contents import period_of
 from .following import Following, isolated
-from .sensors import REFERENCE, Alignment, aligned, noise
+from .sensors import Alignment, aligned, noise
 from .survey import AHEAD, FOLLOWS, Survey
 
 _DELAY_SHARE = 0.6  # of the lag; the PUMA's is 0.6, a servo's on a bus rather 0.75
@@ -139,19 +139,17 @@ def _against_each_other(
     if not lags:
         return "", {}, {}
     base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
-    every = {name: aligned([run], base, name) for name in lags if name != base}
-    pairs = {name: Pair(base, one) for name, one in every.items() if one is not None}
-    later = {base: 0.0, **{name: one.alignment.latency for name, one in pairs.items() if not _hardly_earlier(one)}}
+    others = [name for name in lags if name != base]
+    pairs = {name: Pair(base, one) for name in others if (one := aligned([run], base, name)) is not None}
+    every = {name: one.alignment for name, one in pairs.items()}
+    # One that seems earlier than the densest one, but not surely, would make the time of all wrong by that.
+    known = {name: one.latency for name, one in every.items() if not -_SURELY * one.half < one.latency < 0.0}
+    later = {base: 0.0, **known}
     first = base if base == REFERENCE else min(later, key=later.__getitem__)
     ahead = float(np.median(lags[first]))
     ahead = ahead if ahead < -AHEAD else 0.0
     latencies = {name: ahead + max(later.get(name, 0.0) - later[first], 0.0) for name in (base, *pairs)}
     return first, latencies, pairs
-
-
-def _hardly_earlier(pair: Pair) -> bool:
-    """Whether a sensor seems earlier than the densest one, but not surely: the time of all would be wrong by that."""
-    return -_SURELY * pair.alignment.half < pair.alignment.latency < 0.0
 
 
 def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
@@ -190,7 +188,9 @@ def _sensor(
     scale = -1.0 if sum(mirrored) > len(mirrored) / 2 else 1.0
     bias = {axis: size for axis, one in known.items() if (size := _bias(found, axis, one, scale, leads[axis]))}
     sd = dict.fromkeys(relations, _UNKNOWN_SD)
-    sd |= {axis: _noise(found, name, axis, one, noises.get(axis, math.inf)) for axis, one in known.items()}
+    for axis, one in known.items():  # the least of three: how far a slow sensor moves from row to row is none of it
+        alone = noise(found.run.command, found.run.sensors[name], axis, one.lag)
+        sd[axis] = max(min(one.scatter, alone, noises.get(axis, math.inf)), one.resolution, _SMALLEST_SD)
     words = "DECIDE: how old a measurement is when it is stamped"
     if first == REFERENCE and name in latencies:
         words = "so much later than the reference, whose stamps are taken to be right"
@@ -207,21 +207,9 @@ def _sensor(
     return replace(known, latency_sd=beside.unsteadiness, doubts=doubts, pair=pair)
 
 
-def _noise(found: Survey, name: str, axis: str, one: Following, beside: float) -> float:
-    """The least of three estimates [m or rad]: how far a slow sensor moves from row to row is none of its noise.
-
-    By its differences, beside the path that it tells itself, and beside that of another sensor.
-    """
-    alone = noise(found.run.command, found.run.sensors[name], axis, one.lag)
-    return max(min(one.scatter, alone, beside), one.resolution, _SMALLEST_SD)
-
-
 def _start(found: Survey, axis: str, name: str, one: Following, misfit: float, travel: float) -> float | None:
     """Where an axis starts by its best sensor [m or rad]; None: at its first command, or nothing tells."""
-    command, sensors = found.run.command, {REFERENCE: found.run.reference, **found.run.sensors}
-    source = sensors[name]
-    assert source is not None
-    (given, told), (stamp, seen) = command.series(axis), source.series(axis)
+    (given, told), (stamp, seen) = found.run.command.series(axis), found.run.measured[name].series(axis)
     near = int(np.argmin(np.abs(stamp - given[0])))
     if stamp[near] - given[0] > _SOON * max(one.lag, 0.0) * 1e9:
         return None

@@ -1,9 +1,14 @@
-"""Which commands a sensor follows, how late and how far: correlation at every shift of its clock, without a filter."""
+"""Which commands a sensor follows, how late and how far, and where from: beside a model's response, without a filter.
+
+By correlation at every shift of its clock, and, at none, by its motion, its zero, and motion of its own.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -20,8 +25,15 @@ _AS_GOOD = math.log(1.5)  # of such valleys the nearest counts: a motion may rep
 _LEAST = 1e-6  # share of a variance that is left at least: bins are no finer
 _ROUNDING = 1e-9  # share of a power below which a variance is the rounding of transforms
 _SPIKE, _MOST_SPIKES = 10.0, 0.25  # times the usual distance from the values around, and the most that are outliers
-_PIECES, _MOVING = 20, 4.0  # short pieces of a run, and how many of them must move
+_PIECES, _MOVING = 20, 4.0  # short pieces of a run, and how many must move; a zero that scatters over them wanders
 _SLIGHT = 0.1  # share of the greatest motion below which commands tell nothing at a shift
+FOLLOWS = 0.95  # correlation from which there is nothing to ask
+GAIN = 3.0  # factor on a motion up to which it may be a gain
+_NOISY = 3.0  # times the noise, up to which a distance is noise
+_FAR = 5.0  # sds beyond which chance is no explanation
+_UNLIKELY = 3.5  # sds of priors beyond which they are none
+_MODEL = 0.01  # share of a motion that a wrong model makes look like another zero
+_SMOOTH = 0.0  # correlation of one step and the next from which they are a motion; that of noise is −0.5
 
 
 Rows: TypeAlias = tuple[TimeArray, FloatArray]  # stamps [ns] and values
@@ -58,11 +70,6 @@ class Grid(NamedTuple):
         """What the transforms are limited to [ns]."""
         return round(_MOST * max(period, _FINEST) * 1e9)
 
-    @property
-    def inner(self) -> slice:
-        """The bins without the margins."""
-        return slice(self.margin, len(self.time) - self.margin)
-
     def mean(self, stamp: TimeArray, value: FloatArray) -> FloatArray:
         """The mean of the values in each bin without the margins, NaN without any, (n,)."""
         size = len(self.time) - 2 * self.margin
@@ -92,17 +99,11 @@ class Match(NamedTuple):
 
 
 class _Fits(NamedTuple):
-    """Regressions of one measured motion on A commanded ones at S shifts, beside a constant and a trend.
-
-    Attributes:
-        correlation: (A, S).
-        slope: Measured over commanded motion, (A, S).
-        unexplained: Log of the share of the measured variance that is left, (A, S).
-    """
+    """Regressions of one measured motion on A commanded ones at S shifts, beside a constant and a trend: (A, S)."""
 
     correlation: FloatArray
-    slope: FloatArray
-    unexplained: FloatArray
+    slope: FloatArray  # measured over commanded motion
+    unexplained: FloatArray  # log of the share of the measured variance that is left
 
 
 def matches(measured: Mapping[str, FloatArray], led: Mapping[str, FloatArray], grid: Grid) -> dict[str, Match]:
@@ -122,8 +123,10 @@ def matches(measured: Mapping[str, FloatArray], led: Mapping[str, FloatArray], g
     fits = {axis: _fits(value, commanded, grid.margin) for axis, value in measured.items()}
     place, cost, together = dict[str, tuple[int, int]](), 0.0, np.zeros(len(every))
     for axis, fit in fits.items():
-        own = names.index(axis)
-        places = [_nearest_best(fit, other, near) for other in range(len(names))]
+        own, same = names.index(axis), np.where(fit.slope > 0.0, fit.unexplained, np.inf)
+        # Of shifts about as good one counts at which both move the same way.
+        alike = same[:, near].min(axis=1) <= fit.unexplained[:, near].min(axis=1) + _AS_GOOD
+        places = [_nearest(one, near) for one in np.where(alike[:, None], same, fit.unexplained)]
         costs = fit.unexplained[range(len(names)), places] + _MUCH_BETTER * (np.arange(len(names)) != own)
         best = int(np.argmin(costs))
         place[axis], cost = (best, places[best]), cost + float(costs[best])
@@ -132,11 +135,14 @@ def matches(measured: Mapping[str, FloatArray], led: Mapping[str, FloatArray], g
     shift = 0.0
     if together[late] + _MUCH_BETTER < cost:
         place = {axis: (names.index(axis), late) for axis in fits}
-        shift = (float(every[late]) + _between(np.exp(together[max(late - 1, 0) : late + 2]))) * grid.step
-    return {
-        axis: _match(names[other], shift, measured[axis], commanded[other], fits[axis], other, at)
-        for axis, (other, at) in place.items()
-    }
+        shift = (float(every[late]) + _between(together, late)) * grid.step
+    found = dict[str, Match]()
+    for axis, (other, at) in place.items():
+        slope, first = float(fits[axis].slope[other, at]), 2 * grid.margin - at
+        steady, _ = slope_of_pieces(measured[axis], commanded[other][first : first + len(measured[axis])])
+        is_steady = abs(steady - slope) < 0.5 * abs(slope)
+        found[axis] = Match(names[other], shift, float(fits[axis].correlation[other, at]), slope, is_steady)
+    return found
 
 
 def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple[float, float]) -> float | None:
@@ -167,14 +173,7 @@ def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple
     at_once = left[here].min(initial=np.inf) <= left[late] + _MUCH_BETTER
     if correlation[late] < _CLEARLY or (overlap and at_once):
         return None
-    return float(lag[late]) + _between(np.exp(left[max(late - 1, 0) : late + 2])) * step
-
-
-def _match(name: str, shift: float, measured: FloatArray, led: FloatArray, fits: _Fits, axis: int, place: int) -> Match:
-    """The match of a measured motion (n,) with a commanded one (n + 2m,), at one of the shifts."""
-    slope, first = float(fits.slope[axis, place]), len(led) - len(measured) - place
-    steady = slope_of_pieces(measured, led[first : first + len(measured)])[0]
-    return Match(name, shift, float(fits.correlation[axis, place]), slope, abs(steady - slope) < 0.5 * abs(slope))
+    return float(lag[late]) + _between(left, late) * step
 
 
 def slope_of_pieces(measured: FloatArray, led: FloatArray) -> tuple[float, float]:
@@ -216,12 +215,9 @@ def without_spikes(value: FloatArray) -> BoolArray:
 
 
 def _fits(measured: FloatArray, led: FloatArray, margin: int) -> _Fits:
-    """The regressions at shifts from −margin to margin bins, by sums over the bins that have measurements.
+    """The regressions of values, NaN where there is none, (n,), on motions about zero, (A, n + 2m), at −m to m bins.
 
-    Args:
-        measured: NaN where there is nothing, (n,).
-        led: About zero, (A, n + 2m).
-        margin: m.
+    They are by sums over the bins that have measurements.
     """
     seen = np.isfinite(measured)
     count, numbers = np.count_nonzero(seen), np.arange(len(measured))
@@ -246,13 +242,6 @@ def _fits(measured: FloatArray, led: FloatArray, margin: int) -> _Fits:
     return _Fits(correlation, slope, np.log(np.maximum(1.0 - correlation**2, _LEAST)))
 
 
-def _nearest_best(fits: _Fits, axis: int, places: IntArray) -> int:
-    """The best of ``places``, of those about as good one where both move the same way, and of these the nearest."""
-    same = np.where(fits.slope[axis] > 0.0, fits.unexplained[axis], np.inf)
-    best = fits.unexplained[axis, places].min()
-    return _nearest(same if same[places].min() <= best + _AS_GOOD else fits.unexplained[axis], places)
-
-
 def _nearest(unexplained: FloatArray, places: IntArray) -> int:
     """Where, of ``places``, the least is unexplained; of valleys that are about as low the one nearest to no shift."""
     beside = np.pad(unexplained, 1, constant_values=np.inf)[np.add.outer(places, [0, 2])]
@@ -261,9 +250,127 @@ def _nearest(unexplained: FloatArray, places: IntArray) -> int:
     return int(min(places[valley], key=lambda place: abs(place - len(unexplained) // 2)))
 
 
-def _between(valley: FloatArray) -> float:
-    """How far from the middle one of three values, (3,), a parabola through them is lowest; 0 at an edge."""
-    if len(valley) < 3:
-        return 0.0
-    bend = float(valley[0] - 2.0 * valley[1] + valley[2])
-    return 0.5 * float(valley[0] - valley[2]) / bend if bend > 0.0 else 0.0
+def _between(unexplained: FloatArray, place: int) -> float:
+    """How far from a place a parabola through what is left there and beside it is lowest; 0 at an edge."""
+    before, there, after = np.exp(np.pad(unexplained, 1, mode="edge")[place : place + 3]).tolist()
+    bend = before - 2.0 * there + after
+    return 0.5 * (before - after) / bend if bend > 0.0 and 0 < place < len(unexplained) - 1 else 0.0
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Up to 500 positions that a sensor measures on an axis, and where the commands lead, relative to the start.
+
+    Attributes:
+        time: Since the first [s], (n,).
+        measured: [m or rad], (n,).
+        led: [m or rad], (n,).
+        before: Where the commands had led shortly before each [m or rad], (n,).
+        noise: Standard deviation of what varies [m or rad].
+        zero_sd: That of the difference of both zeros, by the priors [m or rad].
+        drift: Density of the random walk [m/√s or rad/√s].
+    """
+
+    time: FloatArray
+    measured: FloatArray
+    led: FloatArray
+    before: FloatArray
+    noise: float
+    zero_sd: float
+    drift: float
+
+    @cached_property
+    def _near(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Time, measured and commanded motion without outliers, and that shortly before, (k,) each.
+
+        At rest all is near: what is off by no more than the motion, as a wrong delay makes it, is no outlier.
+        """
+        distance = self.measured - self.led
+        distance = np.abs(distance - median(distance))
+        near = distance <= max(10.0 * median(distance), float(np.ptp(self.led))) + 1e-12
+        kept = slice(None) if near.all() else near
+        return self.time[kept], self.measured[kept], self.led[kept], self.before[kept]
+
+    @cached_property
+    def _moved(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The same about zero, without time."""
+        _, measured, led, before = (part - part.mean() for part in self._near)
+        return measured, led, before
+
+    @property
+    def rests(self) -> bool:
+        """Whether all values are one."""
+        return float(np.ptp(self.measured)) == 0.0
+
+    @cached_property
+    def correlation(self) -> float:
+        """Of measured and commanded motion; 0 where one of them rests."""
+        measured, led, _ = self._moved
+        power = math.sqrt(float(measured @ measured) * float(led @ led))
+        return float(measured @ led) / power if power > 0.0 else 0.0
+
+    @property
+    def follows(self) -> bool:
+        """Whether there is nothing to ask: it moves about as far as commanded, about then, or is off by its noise."""
+        measured, led, before = self._moved
+        if _spread(measured - led) <= _NOISY * self.noise or not led.any():
+            return True
+        if self.correlation < FOLLOWS:
+            return False
+        slope = float(measured @ led) / float(led @ led)
+        left, step = measured - slope * led, led - before
+        along, power = float(left @ step), max(float(step @ step), 1e-30)
+        is_late = abs(along) > 0.5 * slope * power and along**2 > 0.5 * power * float(left @ left)
+        return 1.0 / GAIN < slope < GAIN and not is_late
+
+    @property
+    def lacks_motion(self) -> bool:
+        """Whether less than half of the commanded motion is there, by three standard errors."""
+        measured, led, _ = self._moved
+        slope, error = slope_of_pieces(measured, led)
+        return slope + 3.0 * error < 0.5 and _spread(led) > self.noise
+
+    @cached_property
+    def own_motion(self) -> float:
+        """How far it moves while the commands rest [m or rad]; 0 if they do not, or if it is noise or drift."""
+        time, measured, led, _ = self._near
+        if np.ptp(led) > 0.0 or len(measured) < 3:
+            return 0.0
+        steps = np.diff(measured)
+        expected = math.hypot(math.sqrt(2.0) * self.noise, self.drift * math.sqrt(float(np.median(np.diff(time)))))
+        power = float(steps @ steps)
+        is_smooth = float(steps[1:] @ steps[:-1]) > _SMOOTH * power
+        far = math.sqrt(power / len(steps)) > _FAR * expected
+        return float(np.ptp(measured)) if is_smooth and far else 0.0
+
+    @cached_property
+    def zero(self) -> float:
+        """How far its zero is from the commands' [m or rad]; 0 if chance and priors explain it.
+
+        The constant of a regression on where the commands lead and on how that changes, so that a wrong gain or lag
+        does not count. Where the zero wanders, its scatter is its error.
+        """
+        _, measured, led, before = self._near
+        _, moved, moved_before = self._moved
+        motions = (led, moved), (led - before, moved - moved_before)
+        columns = [one for one, about_zero in motions if _spread(about_zero) > self.noise]
+        known, off = np.array([np.ones(len(led)), *columns]), measured - led
+        gram = known @ known.T
+        found = np.linalg.lstsq(gram, known @ off)[0]
+        if not self.excludes(float(found[0])):
+            return 0.0
+        left = off - found @ known
+        wanders = float(np.std([piece.mean() for piece in np.array_split(left, _PIECES)]))
+        # at a distance from the start that hardly changes, the constant is as uncertain as the slope
+        chance = wanders * math.sqrt(len(left) * float(np.linalg.pinv(gram, hermitian=True)[0, 0]))
+        error = max(chance, _MODEL * float(np.ptp(led)))
+        return float(found[0]) if abs(found[0]) > _FAR * error else 0.0
+
+    def excludes(self, zero: float) -> bool:
+        """Whether the priors do not expect such a difference of the zeros [m or rad]."""
+        return abs(zero) > _UNLIKELY * self.zero_sd
+
+
+def _spread(about_zero: FloatArray) -> float:
+    """Standard deviation of values whose mean is 0."""
+    return math.sqrt(float(about_zero @ about_zero) / len(about_zero))

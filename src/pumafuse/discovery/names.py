@@ -35,11 +35,13 @@ _ROLES: dict[Role, frozenset[str]] = {
 # In the name of a topic or file these are something else.
 _OF_COLUMNS = words_in("set sp pv fb current present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
-_OF_PLACES = words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in that of a column
-_PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
+_SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
+_MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
+_OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in a column's
+PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
 _SILENT = (
     _OF_ROLES
-    | _PARTS
+    | PARTS
     | words_in(
         "pose poses position positions pos point points data translation transform value values scalar scalars joint"
         " jnt dof qpos controller robot arm tool tcp ee flange coordinates axis"
@@ -68,17 +70,17 @@ _TIME_UNITS = {
 _TIMES = frozenset(one for one in _TIME_UNITS if len(one) > 2) | words_in(
     "t time times stamp stamps timestamp timestamps date datetime clock ts arrival arrived zeit"
 )
-_COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
-_WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")
+COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
+WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")  # a row may be of one of many
 EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
 VALID = words_in("valid tracked visible detected")  # of columns that say whether a row of a sensor means anything
-_TELLING = _TIMES | _COUNTERS | _WHOSE | VALID | words_in("episode run trial")
+_TELLING = _TIMES | COUNTERS | WHOSE | VALID | words_in("episode run trial")
 _DIGITS = "0123456789"
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _BRACKETED = re.compile(rf"[\[(] *(mm|m|um|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
-_SLIDING = words_in("slide slider prismatic linear rail gantry")
+SLIDING = words_in("slide slider prismatic linear rail gantry")  # joints in metres, where others turn
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
     **dict.fromkeys(words_in("m meter meters metre metres"), "m"),
@@ -114,6 +116,12 @@ def role_of(name: str) -> Role | None:
     return _role([word for word in words(name) if word not in _OF_COLUMNS], _OF_PLACES)
 
 
+def may_be_seen(name: str) -> bool:
+    """Whether a name calls its numbers commands by nothing but a word for what a camera looks at, too."""
+    found = {word.rstrip(_DIGITS) for word in words(name)} & _ROLES["command"]
+    return bool(found) and found <= _SEEN
+
+
 def role_words(column: str) -> list[str]:
     """The words of a column's name that say whose it is."""
     return [word for word in words(leaf(column)) if word.rstrip(_DIGITS) in _OF_ROLES]
@@ -124,9 +132,9 @@ def column_role(column: str) -> Role | None:
     return _role(words(leaf(column)), frozenset())
 
 
-def is_part(column: str) -> bool:
-    """Whether a column is one of several that are added up."""
-    return not _PARTS.isdisjoint(words(column))
+def has_word(name: str, known: frozenset[str]) -> bool:
+    """Whether one of these words is in a name."""
+    return not known.isdisjoint(words(name))
 
 
 def is_time(column: str) -> bool:
@@ -138,16 +146,6 @@ def time_unit_of(column: str) -> str:
     """The unit of stamps that a name says otherwise than by its ending, ``micros`` or ``t [ms]``; empty without one."""
     *before, last = words(leaf(column)) or [""]
     return _TIME_UNITS.get(last, "") if before or len(last) > 2 else ""
-
-
-def is_counter(column: str) -> bool:
-    """Whether a column is called as numbers of frames are."""
-    return not _COUNTERS.isdisjoint(words(leaf(column)))
-
-
-def tells_apart(column: str) -> bool:
-    """Whether a column of numbers is called as those are that say whose a row is."""
-    return not _WHOSE.isdisjoint(words(leaf(column)))
 
 
 def likeliest_first(columns: Iterable[str]) -> list[str]:
@@ -221,11 +219,6 @@ def is_turning(axis: str) -> bool:
     return _TURNING.search(axis) is not None
 
 
-def is_sliding(joint: str) -> bool:
-    """Whether a joint is called as those are that slide, in metres, where others turn."""
-    return not _SLIDING.isdisjoint(words(joint))
-
-
 def axis_of(column: str, labels: list[str]) -> str:
     """What a column's axis is called: the words of its name that say nothing else.
 
@@ -268,7 +261,10 @@ def plain(name: str) -> str:
 
 
 def _role(found: list[str], more: frozenset[str]) -> Role | None:
+    plainly = {word.rstrip(_DIGITS) for word in found}
+    if not plainly.isdisjoint(_MARKERS | _DEVICES):  # camera_target is what a camera looks at
+        plainly -= _SEEN
     for role, known in _ROLES.items():
-        if not known.isdisjoint(word.rstrip(_DIGITS) for word in found):
+        if not known.isdisjoint(plainly):
             return role
     return None if more.isdisjoint(found) else "sensor"

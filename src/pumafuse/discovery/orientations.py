@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from msgspec import structs
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import FloatArray, TimeArray, known_rows
 from ..errors import RunError
 from ..logs.columns import Table
 from ..logs.frames import CARTESIAN
@@ -39,6 +39,7 @@ _QUATERNION = re.compile(
 _NAMED, _NUMBERED = "wxyz", ("0123", "1234")  # parts of a quaternion, in the order of letters
 _ANGLE = re.compile(rf"{_FRONT}(?P<part>(?i:r[xyz]|roll|pitch|yaw|[abcwprxyz])|[0-5]){_BACK}")
 _EULER = {("a", "b", "c"): "kuka", ("w", "p", "r"): "fanuc", ("roll", "pitch", "yaw"): "rpy"}
+_NAMED_EULER = {"kuka": "KUKA's angles about z, y, x", "fanuc": "FANUC's angles about x, y, z that stay"}
 _NAMELESS = re.compile(r"column \d+")
 _UR = re.compile(r"(?i)tcp_?pose[_\[]$")  # x, y, z in m and a rotation vector in rad
 
@@ -130,7 +131,7 @@ def _quaternions(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
             continue
         columns = tuple(group[part] for part in ("xyzw" if parts == _NAMED else parts))
         value = _plain(table, columns)
-        if value is None or not _are_units(value):
+        if value is None or not are_units(value):
             continue
         x, y, z, w = columns
         made = Orientation(quaternion=(x, y, z, w), order="xyzw" if parts == _NAMED else "wxyz")
@@ -145,7 +146,7 @@ def _without_header(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
     for first in range(len(order) - 6):
         place, (x, y, z, w) = order[first : first + 3], order[first + 3 : first + 7]
         position, value = _plain(table, place), _plain(table, [x, y, z, w])
-        if position is None or value is None or not _moves(position) or not _are_units(value):
+        if position is None or value is None or not _moves(position) or not are_units(value):
             continue
         made = Orientation(quaternion=(x, y, z, w), order="xyzw")
         doubt = f"is w the last of {x}, {y}, {z}, {w}? Their norm is 1, and no name says it (run.toml, order)"
@@ -153,7 +154,7 @@ def _without_header(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
         yield Attitude(made, rotations.of_quaternions(value, made.order), "a norm of 1: w last", axes, doubt=doubt)
 
 
-def _are_units(value: FloatArray) -> bool:
+def are_units(value: FloatArray) -> bool:
     """Whether the norm is 1 in all rows, (rows, 4); without those of a sensor that is lost."""
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(value, axis=1)
@@ -173,26 +174,20 @@ def _angles(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
         position = _plain(table, list(place)) if len(place) == len(CARTESIAN) else None
         if len(forms) != 1 or position is None or not _moves(position):
             continue
-        columns = _three(group, forms[0])
-        made = _of_list(columns) if listed else _of_angles(table, columns, _EULER.get(forms[0], ""))
+        first, second, third = columns = (*(group[part] for part in forms[0]),)
+        made, unit = _of_angles(table, (first, second, third), _EULER.get(forms[0], "")), names.unit_of(first)
+        if listed:
+            made = Orientation(rotation_vector=(first, second, third), unit="rad")
         if made is not None:
-            quaternion, unsure = made.read(table)[0], _unsure(made, names.unit_of(columns[0]))
-            doubt = "" if listed else f"are {', '.join(columns)} {unsure}? No name says it (run.toml)"
-            yield Attitude(made, quaternion, "by name", place, "m" if listed else "", doubt)
+            euler = _NAMED_EULER.get(made.convention, "angles about x, y and z that stay")
+            what = f"{euler if made.euler else 'a rotation vector'}{'' if unit else f', in {made.unit}'}"
+            doubt = "" if listed else f"are {', '.join(columns)} {what}? No name says it (run.toml)"
+            yield Attitude(made, made.read(table)[0], "by name", place, "m" if listed else "", doubt)
 
 
 def _moves(position: FloatArray) -> bool:
     known = position[np.isfinite(position).all(axis=1)]
     return len(known) > 0 and bool(np.ptp(known, axis=0).any())
-
-
-def _three(group: Mapping[str, str], parts: Sequence[str]) -> tuple[str, str, str]:
-    first, second, third = (group[part] for part in parts)
-    return first, second, third
-
-
-def _of_list(columns: tuple[str, str, str]) -> Orientation:
-    return Orientation(rotation_vector=columns, unit="rad")
 
 
 def _of_angles(table: Table, columns: tuple[str, str, str], convention: str) -> Orientation | None:
@@ -208,15 +203,6 @@ def _of_angles(table: Table, columns: tuple[str, str, str], convention: str) -> 
     return Orientation(rotation_vector=columns, unit="rad") if is_vector else None
 
 
-def _unsure(made: Orientation, unit: str) -> str:
-    """What three angles are taken for, in words; ``unit`` is what their names say."""
-    guessed = "" if unit else f", in {made.unit}"
-    if made.rotation_vector:
-        return f"a rotation vector{guessed}"
-    kinds = {"kuka": "KUKA's angles about z, y, x", "fanuc": "FANUC's angles about x, y, z that stay"}
-    return f"{kinds.get(made.convention, 'angles about x, y and z that stay')}{guessed}"
-
-
 def in_order(attitude: Attitude, stamp: TimeArray, other: Attitude, other_stamp: TimeArray, *, leads: bool) -> Attitude:
     """An orientation whose order is open in the order in which it turns with another one, where that tells.
 
@@ -227,13 +213,9 @@ def in_order(attitude: Attitude, stamp: TimeArray, other: Attitude, other_stamp:
         other_stamp: Of its rows.
         leads: Whether the first is commanded, and the other follows.
     """
-    both = [attitude, attitude.exchanged()]
-    shares = [
-        _turning_alike((stamp, one.quaternion), (other_stamp, other.quaternion))
-        if leads
-        else _turning_alike((other_stamp, other.quaternion), (stamp, one.quaternion))
-        for one in both
-    ]
+    both, known = [attitude, attitude.exchanged()], (other_stamp, other.quaternion)
+    pairs = [((stamp, one.quaternion), known) for one in both]
+    shares = [_turning_alike(*(pair if leads else pair[::-1])) for pair in pairs]
     if abs(shares[0] - shares[1]) < _BETTER:
         return attitude
     best = both[int(np.argmax(shares))]
@@ -245,7 +227,7 @@ def _turning_alike(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArr
 
     A frame turns all changes of orientation alike, by a proper rotation; a wrong order mirrors them.
     """
-    (t, led), (s, seen) = (_rows(*one) for one in (leader, follower))
+    (t, led), (s, seen) = (known_rows(*one) for one in (leader, follower))
     begin, end = (max(t[0], s[0]), min(t[-1], s[-1]) - _CHANGE_NS) if len(t) and len(s) else (0, 0)
     if end <= begin:
         return 0.0
@@ -255,12 +237,6 @@ def _turning_alike(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArr
         rotations.aligning(_changes(t, led, time - round(lag * 1e9)), measured)[1]
         for lag in np.arange(0.0, _LATEST, _STEP)
     )
-
-
-def _rows(stamp: TimeArray, quaternion: FloatArray) -> tuple[TimeArray, FloatArray]:
-    known = np.flatnonzero(np.isfinite(quaternion[:, 0]) & (stamp != NO_STAMP))
-    known = known[np.argsort(stamp[known], kind="stable")]
-    return stamp[known], quaternion[known]
 
 
 def _changes(stamp: TimeArray, quaternion: FloatArray, time: TimeArray) -> FloatArray:

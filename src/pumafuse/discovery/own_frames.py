@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import FloatArray, TimeArray, known_rows
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run, Source
 from ..space import rotations
@@ -53,8 +53,7 @@ class OwnFrame:
 
 def own_frames(run: Run) -> dict[str, OwnFrame]:
     """The sensors of a run that seem to stand in frames of their own, by name."""
-    found = {name: _own_frame(run.command, source) for name, source in run.sensors.items()}
-    return {name: one for name, one in found.items() if one is not None}
+    return {name: one for name, source in run.sensors.items() if (one := _own_frame(run.command, source)) is not None}
 
 
 def speeds_follow(command: Source, source: Source) -> Following | None:
@@ -63,15 +62,17 @@ def speeds_follow(command: Source, source: Source) -> Following | None:
     None where one of them is in other axes, or stands still.
     """
     axes = _axes(command, source)
-    (t, told), (s, seen) = _rows(command, axes), _rows(source, axes)
-    if len(axes) < 2 or min(len(t), len(s)) < _FEWEST:
+    if len(axes) < 2:
         return None
-    linear = following((t, _speed(t, told)), (s, _speed(s, seen)))
-    if command.orientation is None or source.orientation is None:
-        return linear
-    (t, told), (s, seen) = _turning(command), _turning(source)
-    turning = following((t, _speed(t, told)), (s, _speed(s, seen))) if min(len(t), len(s)) >= _FEWEST else None
-    return max((one for one in (linear, turning) if one), key=lambda one: one.correlation, default=None)
+    pairs = [(_rows(command, axes), _rows(source, axes))]
+    if command.orientation is not None and source.orientation is not None:
+        pairs.append((_turning(command), _turning(source)))
+    fast = [
+        following((t, _speed(t, told)), (s, _speed(s, seen)))
+        for (t, told), (s, seen) in pairs
+        if min(len(t), len(s)) >= _FEWEST
+    ]
+    return max(filter(None, fast), key=lambda one: one.correlation, default=None)
 
 
 def _axes(command: Source, source: Source) -> list[str]:
@@ -95,7 +96,8 @@ def _own_frame(command: Source, source: Source) -> OwnFrame | None:
     if np.count_nonzero(near) < _FEWEST or not led[near].any():
         return None
     led, seen = led[near] - led[near].mean(axis=0), seen[near] - seen[near].mean(axis=0)
-    crossed = _correlations(seen, led)
+    power = np.sqrt(np.sum(seen**2, axis=0)[:, None] * np.sum(led**2, axis=0))
+    crossed = (seen.T @ led) / np.where(power > 0.0, power, np.inf)  # correlations, (k, k)
     moves = [place for place in range(len(axes)) if np.ptp(led[:, place]) > 0.0]
     least = min((float(crossed[place, place]) for place in moves), default=1.0)
     if least >= FOLLOWS:
@@ -104,17 +106,12 @@ def _own_frame(command: Source, source: Source) -> OwnFrame | None:
     rotation, turned = rotations.aligning(seen, led)
     _, mirrored = rotations.aligning(seen * np.where(np.arange(len(axes)) == 0, -1.0, 1.0), led)
     is_mirrored = 1.0 - mirrored**2 < _EXPLAINS * (1.0 - turned**2)
-    exchanged = _exchanged(crossed, moves, signs=is_mirrored)
+    size = np.abs(crossed) if is_mirrored else crossed
+    others = {int(np.argmax(size[:, place])) for place in moves}
+    exchanged = len(others) == len(moves) and all(size[:, place].max() >= _EXCHANGED for place in moves)
     if exchanged or 1.0 - max(turned, mirrored) ** 2 > _EXPLAINS * (1.0 - as_it_is * abs(as_it_is)):
         return None
     return OwnFrame(speeds, least, math.nan if is_mirrored else angle_of(rotation))
-
-
-def _exchanged(crossed: FloatArray, moves: Sequence[int], *, signs: bool) -> bool:
-    """Whether each axis that moves is another one, as columns that are exchanged; ``signs``: or against one."""
-    size = np.abs(crossed) if signs else crossed
-    others = {int(np.argmax(size[:, place])) for place in moves}
-    return len(others) == len(moves) and all(size[:, place].max() >= _EXCHANGED for place in moves)
 
 
 def angle_of(rotation: FloatArray) -> float:
@@ -123,18 +120,9 @@ def angle_of(rotation: FloatArray) -> float:
     return math.acos(min(max(cosine, -1.0), 1.0))
 
 
-def _correlations(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Of each column of the first with each of the second, (k, k); both are about zero."""
-    power = np.sqrt(np.sum(first**2, axis=0)[:, None] * np.sum(second**2, axis=0))
-    return (first.T @ second) / np.where(power > 0.0, power, np.inf)
-
-
 def _rows(source: Source, axes: Sequence[str]) -> tuple[TimeArray, FloatArray]:
     """Stamps and positions, (n, k), of the rows that have all of the axes, in the order of time."""
-    value = np.column_stack([source.values[axis] for axis in axes]) if axes else np.empty((0, 0))
-    known = np.flatnonzero(np.isfinite(value).all(axis=1) & (source.stamp != NO_STAMP)) if axes else np.empty(0, int)
-    stamp, order = np.unique(source.stamp[known], return_index=True)
-    return stamp, value[known][order]
+    return known_rows(source.stamp, np.column_stack([source.values[axis] for axis in axes]))
 
 
 def _turning(source: Source) -> tuple[TimeArray, FloatArray]:
@@ -143,9 +131,7 @@ def _turning(source: Source) -> tuple[TimeArray, FloatArray]:
     Another frame and a marker that is turned on the tool only turn these vectors, all alike.
     """
     assert source.orientation is not None
-    known = np.flatnonzero(np.isfinite(source.orientation[:, 0]) & (source.stamp != NO_STAMP))
-    stamp, order = np.unique(source.stamp[known], return_index=True)
-    told = source.orientation[known][order]
+    stamp, told = known_rows(source.stamp, source.orientation)
     return stamp, rotations.vectors(told, rotations.mean(told)) if len(told) else np.empty((0, 3))
 
 

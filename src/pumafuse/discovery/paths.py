@@ -24,11 +24,6 @@ _FEWEST_KNOTS = 6
 _CLIP = 10.0
 
 
-def _first_knots(lag: float) -> FloatArray:
-    """Knots about a lag [s]."""
-    return _KNOTS + lag - _BEFORE - min(max(lag, _SHORT), _LONG)
-
-
 def _placed(knots: FloatArray, coefficients: FloatArray) -> FloatArray:
     """As many knots, most of them where an impulse response is [s]."""
     impulse = np.abs(np.concatenate([[0.0], np.cumsum(coefficients[::-1])[::-1], [0.0]]))
@@ -41,13 +36,7 @@ def _placed(knots: FloatArray, coefficients: FloatArray) -> FloatArray:
 def _responses(t: FloatArray, u: FloatArray, knots: FloatArray) -> Basis:
     """Responses to held commands that make up that of any linear arm: those to integrated hats.
 
-    Args:
-        t: Instants of the commands [s], ascending, (n,).
-        u: The commands [m or rad], (n,).
-        knots: Of the impulse response [s], (k + 2,).
-
-    Returns:
-        A function of instants [s], (m,), which gives the responses, (m, k).
+    They are a function of instants [s], (m,), which gives (m, k) of knots of the impulse response [s], (k + 2,).
     """
     from scipy.interpolate import PPoly
 
@@ -174,7 +163,7 @@ def path(command: tuple[FloatArray, FloatArray], lag: float, s: FloatArray, z: F
         s: Its instants [s], ascending, (m,).
         z: Its positions [m or rad], (m,).
     """
-    knots = _first_knots(lag)
+    knots = _KNOTS + lag - _BEFORE - min(max(lag, _SHORT), _LONG)
     basis, found, rest = _explained(command, knots, s, z)
     for _ in range(_PLACED):
         basis, found, rest = _explained(command, knots := _placed(knots, found.coefficients), s, z)

@@ -26,7 +26,7 @@ def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
     """What was checked, what it is, and how surely that is known."""
     if found.roles is not None:
         roles = found.roles
-        streams = [roles.command, *roles.sensors, *filter(None, [roles.reference])]
+        streams = roles.streams
         clocks = {f"{one.part.clock.time.column or 'rows'}": one.part.clock.basis for one in streams if one.part.clock}
         guessed = [column for column, basis in clocks.items() if basis.endswith(("interval", "default"))]
         yield "clock", ", ".join(f"{column}: {basis}" for column, basis in clocks.items()), _sure(guessed)
@@ -55,7 +55,7 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
     """Sentences, in the order in which one checks."""
     run = found.run
     roles = found.roles
-    streams = [] if roles is None else [roles.command, *roles.sensors, *filter(None, [roles.reference])]
+    streams = [] if roles is None else roles.streams
     yield from dict.fromkeys(one.part.clock.doubt for one in streams if one.part.clock and one.part.clock.doubt)
     yield from dict.fromkeys(one.attitude.doubt for one in streams if one.attitude and one.attitude.doubt)
     for name, one in found.own_frames.items():

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 from msgspec import structs
@@ -15,11 +15,11 @@ from ..arrays import NO_STAMP
 from ..errors import RunError, printable
 from ..logs.axes import FARTHEST_TURN
 from ..logs.frames import CARTESIAN
-from ..logs.messages import PATH_TIME
-from ..logs.run import Run, Source
+from ..logs.recordings import PATH_TIME
+from ..logs.run import REFERENCE, Run, Source
 from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
-from .contents import Part, Signal, no_commands, without_clock
+from .contents import RANGES, Part, Signal, no_commands, without_clock
 from .following import LATEST, Following, following
 from .matching import far_shift
 from .names import Role
@@ -37,10 +37,6 @@ _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of
 _MOST_APART = 40  # axes of a table that is taken apart by their names
 _MOST_LISTED = 8  # columns in an error
 _NUMBERED = re.compile(r"joint\d+|position")
-_RANGES: dict[Kind, tuple[str, str, float]] = {  # small and large unit, and beyond which number it is the large one
-    "length": ("m", "mm", 10.0),
-    "angle": ("rad", "deg", 2.0 * math.pi),
-}
 _AXIS_WORD = re.compile(r"[xyz]|\d+|")
 
 
@@ -108,32 +104,39 @@ class Roles:
     left_out: Sequence[tuple[Stream, str]]
 
     @property
+    def measured(self) -> dict[str, Stream]:
+        """Its sensors, and ``reference``, by name."""
+        found = {one.name: one for one in self.sensors}
+        return found if self.reference is None else {**found, REFERENCE: self.reference}
+
+    @property
+    def streams(self) -> list[Stream]:
+        """The commands, and what measures."""
+        return [self.command, *self.measured.values()]
+
+    @property
     def run(self) -> Run:
         """The run as it would be read."""
         command = self.command.source
-        sensors = {one.name: one.source.beside(command, one.turns) for one in self.sensors}
+        sensors = {name: one.source.beside(command, one.turns) for name, one in self.measured.items()}
         kinds: dict[str, Kind] = {axis: self.command.kind(axis) for axis in self.command.axes}
-        scored = self.reference
-        reference = None if scored is None else scored.source.beside(command, scored.turns)
+        reference = None if self.reference is None else sensors.pop(REFERENCE)
         return Run("log", command, sensors, reference, kinds=kinds)
 
     def without(self, why_not: Mapping[tuple[str, str], str]) -> Roles:
         """The roles without axes of sensors or ``reference``, and without axes that nothing measures then."""
-        left_out, found = [*self.left_out], list[Stream]()
-        for one in (*self.sensors, *filter(None, [self.reference])):
-            name = "reference" if one is self.reference else one.name
+        left_out, found = [*self.left_out], dict[str, Stream]()
+        for name, one in self.measured.items():
             bad = {axis: why_not[name, axis] for axis in one.axes if (name, axis) in why_not}
-            kept = {axis: signals for axis, signals in one.axes.items() if axis not in bad}
             left_out += [(replace(one, axes={axis: one.axes[axis]}), why) for axis, why in bad.items()]
-            found += [replace(one, axes=kept)] if kept else []
-        sensors = [one for one in found if one.role == "sensor"]
-        reference = next((one for one in found if one.role == "reference"), None)
-        measured = {axis for one in found for axis in one.axes}
+            if kept := {axis: signals for axis, signals in one.axes.items() if axis not in bad}:
+                found[name] = replace(one, axes=kept)
+        measured = {axis for one in found.values() for axis in one.axes}
         told = {axis: signals for axis, signals in self.command.axes.items() if axis in measured}
         if unmeasured := {axis: signals for axis, signals in self.command.axes.items() if axis not in measured}:
             left_out.append((replace(self.command, axes=unmeasured), "nothing measures where these commands lead"))
-        command = replace(self.command, axes=told)
-        return replace(self, command=command, sensors=sensors, reference=reference, left_out=left_out)
+        reference = found.pop(REFERENCE, None) if self.reference else None
+        return Roles(replace(self.command, axes=told), list(found.values()), reference, left_out)
 
 
 def roles_of(parts: Iterable[Part], log: str) -> Roles:
@@ -152,10 +155,14 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         raise RunError(
             f"{log}: no columns of positions with a clock beside them"
             + (f", but {there}" if there else "")
-            + f";{at_a_rate} {_and_then(no_commands(parts))}say in run.toml where they are"
+            + f";{at_a_rate} {no_commands(parts)}say in run.toml where they are"
         )
-    streams = _uniquely_named(_apart(streams[0]) if len(streams) == 1 else streams)
-    command, why = _command(streams, log, _and_then(no_commands(parts)))
+    named = dict[str, Stream]()
+    for one in _apart(streams[0]) if len(streams) == 1 else streams:
+        name = _free(one.name, named.keys())
+        named[name] = replace(one, name=name)
+    streams = _looked_at(list(named.values()))
+    command, why = _command(streams, log, no_commands(parts))
     left_out: list[tuple[Stream, str]] = []
     kept: list[Stream] = []
     for stream in streams:
@@ -171,7 +178,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             continue
         matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
         if stream.role is None and axes:
-            late = _follows(command, matched) or _as_fast(command, matched)
+            late = _follows(command, matched)
             matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
             why_not = (
                 "neither its name nor its motion says what it is: it does not follow the commands, or moves before"
@@ -201,10 +208,9 @@ def _in_order(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> 
     Without a commanded orientation that no rotation vector can follow: the reason is added to ``left_out``.
     """
     command, *others = streams
-    if command.attitude and command.attitude.is_open:
-        known = next((one for one in others if one.attitude and not one.attitude.is_open), None)
-        if known is not None:
-            command = replace(command, attitude=_ordered(command, known, leads=True))
+    known = next((one for one in others if one.attitude and not one.attitude.is_open), None)
+    if command.attitude and command.attitude.is_open and known is not None:
+        command = replace(command, attitude=_ordered(command, known, leads=True))
     for place, one in enumerate(others):
         if command.attitude and not command.attitude.is_open and one.attitude and one.attitude.is_open:
             others[place] = replace(one, attitude=_ordered(one, command, leads=False))
@@ -223,10 +229,9 @@ def _ordered(stream: Stream, known: Stream, *, leads: bool) -> Attitude:
 
 def relations(run: Run) -> dict[tuple[str, str], Following]:
     """How each sensor, and ``reference``, follows the commands, by its name and the axis."""
-    every = {**run.sensors, **({} if run.reference is None else {"reference": run.reference})}
     return {
         (name, axis): found
-        for name, source in every.items()
+        for name, source in run.measured.items()
         for axis, value in source.values.items()
         if axis in run.command.values
         and (found := following((run.command.stamp, run.command.values[axis]), (source.stamp, value))) is not None
@@ -302,6 +307,8 @@ def _streams(part: Part) -> list[Stream]:
     of_file, of_columns = names.role_of(part.stem), {names.column_role(one[0].name) for one in groups.values()}
     of_file = None if len(groups) > 1 and of_file in of_columns else of_file  # then it is what these columns are
     found = list[Stream]()
+    by_type = "command" if part.type.endswith("JointTrajectory") or part.clock.time.column == PATH_TIME else None
+    by_type = "sensor" if part.type.endswith("JointState") else by_type
     for (key, listed, copy, desired), signals in groups.items():
         wanted = ("command" if desired else None, f"'{signals[0].column}' is of desired values, by its name")
         own = (names.column_role(signals[0].name), f"its columns are called '{key.replace('_', ' ')}'")
@@ -310,11 +317,8 @@ def _streams(part: Part) -> list[Stream]:
             names.column_role(part.clock.time.column),
             f"its clock is called '{printable(part.clock.time.column)}'",
         )
-        tells = part.type.endswith("JointTrajectory") or part.clock.time.column == PATH_TIME
-        by_type = ("command" if tells else None, f"its messages are {part.type}")
-        by_state = ("sensor" if part.type.endswith("JointState") else None, f"its messages are {part.type}")
-        order = (own, file, clock) if len(groups) > 1 else (file, own, clock)
-        role, why = next((one for one in (wanted, *order, by_type, by_state) if one[0]), (None, ""))
+        typed, order = (by_type, f"its messages are {part.type}"), (own, file) if len(groups) > 1 else (file, own)
+        role, why = next((one for one in (wanted, *order, clock, typed) if one[0]), (None, ""))
         name = key if roles[key] == 1 else names.plain(f"{listed or key or part.stem}{copy}")
         name = name if len(groups) > 1 and name else names.plain(part.stem)
         axes, attitude = _axes(signals), None
@@ -333,11 +337,9 @@ def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
     """Columns by axis: parts of a sum together; others that would be called the same get a number."""
     found: dict[str, list[Signal]] = {}
     for signal in signals:
-        axis, number = signal.axis, 1
-        while axis in found and not (names.is_part(signal.name) and names.is_part(found[axis][0].name)):
-            number += 1
-            axis = f"{signal.axis}_{number}"
-        found.setdefault(axis, []).append(signal)
+        parts = {axis for axis, some in found.items() if names.has_word(some[0].name, names.PARTS)}
+        summed = parts if names.has_word(signal.name, names.PARTS) else set[str]()
+        found.setdefault(_free(signal.axis, found.keys() - summed), []).append(signal)
     return {
         axis: some for axis, some in found.items() if any(np.nanmin(one.plain) < np.nanmax(one.plain) for one in some)
     }
@@ -359,8 +361,12 @@ def _apart(stream: Stream) -> list[Stream]:
 
     def of(word: str, rests: Iterable[tuple[str, ...]]) -> Stream:
         axes = {names.axis_of("_".join(rest), []): stream.axes[by_word[word][rest]] for rest in rests}
-        mine = [one for one in stream.part.attitudes if _is_of(one, word, by_word)]
-        return Stream(names.plain(word) or stream.name, None, "", stream.part, axes, next(iter(mine), None))
+        others = frozenset(other for other in by_word if not _AXIS_WORD.fullmatch(other))
+        for one in stream.part.attitudes:  # with the word in its names; without one, with none of the others
+            inside = names.words(one.columns.columns[0])
+            if word in inside if word else others.isdisjoint(inside):
+                return Stream(names.plain(word) or stream.name, None, "", stream.part, axes, one)
+        return Stream(names.plain(word) or stream.name, None, "", stream.part, axes)
 
     ways = list[list[Stream]]()
     for word, mine in by_word.items():
@@ -376,12 +382,6 @@ def _apart(stream: Stream) -> list[Stream]:
     return best if len(best) > 1 and _followers(best[0], best)[0] else [stream]
 
 
-def _is_of(attitude: Attitude, word: str, every: Iterable[str]) -> bool:
-    """Whether a word that tells sources apart is in the names of an orientation; without one, whether no other is."""
-    inside = names.words(attitude.columns.columns[0])
-    return word in inside if word else not any(one in inside for one in every if not _AXIS_WORD.fullmatch(one))
-
-
 def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream: Stream) -> bool:
     """Whether two words in names of axes, of which the rests are the same, can be of commands and a sensor."""
     if word == other or (_AXIS_WORD.fullmatch(word) and _AXIS_WORD.fullmatch(other)):
@@ -389,19 +389,24 @@ def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream
     return rests != [()] or (len(stream.axes) == 2 and not any(map(names.is_turning, (word, other))))
 
 
-def _uniquely_named(streams: Iterable[Stream]) -> list[Stream]:
-    found: dict[str, Stream] = {}
+def _looked_at(streams: Sequence[Stream]) -> list[Stream]:
+    """Streams of which one that is called target, but moves after another that nothing names, is a sensor's."""
+    found = list[Stream]()
     for stream in streams:
-        name, number = stream.name, 1
-        while name in found:
-            number += 1
-            name = f"{stream.name}_{number}"
-        found[name] = replace(stream, name=name)
-    return list(found.values())
+        columns = [one.column for signals in stream.axes.values() for one in signals]
+        seen = stream.role == "command" and any(map(names.may_be_seen, [stream.part.stem, *columns]))
+        led = [one for one in streams if one.role is None and _followers(one, [replace(stream, role=None)])[0]]
+        if seen and led:
+            why = f"it is called target, but follows '{printable(led[0].name)}': it is what a sensor looks at"
+            stream = replace(stream, role="sensor", why=why)
+        found.append(stream)
+    return found
 
 
-def _and_then(advice: str) -> str:
-    return f"{advice}; or " if advice else ""
+def _free(name: str, taken: Set[str]) -> str:
+    """A name, with a number where it is taken: ``x``, ``x_2``."""
+    numbered = (name if number == 1 else f"{name}_{number}" for number in count(1))
+    return next(one for one in numbered if one not in taken)
 
 
 def _command(streams: Sequence[Stream], log: str, advice: str) -> tuple[Stream, str]:
@@ -429,13 +434,16 @@ def _command(streams: Sequence[Stream], log: str, advice: str) -> tuple[Stream, 
 def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]:
     """How many axes of others run behind a stream, each as far as its motion is the same; and by how much, in all [s].
 
-    The number is rounded: of commands and the same ones later on, those that are sent first are followed as well.
+    Of one in a frame of its own the speed does.
     """
     count = late = 0.0
     for other in streams:
         if other is not leader and other.role != "command":
             axes, _ = _matched(leader, other)
-            for found in _relations(leader, replace(other, axes=axes)):
+            relations = _relations(leader, replace(other, axes=axes))
+            if not any(abs(found.correlation) >= _SAME for found in relations):
+                relations = list(filter(None, [speeds_follow(leader.source, other.source)]))
+            for found in relations:
                 if abs(found.correlation) >= _SAME and found.lag > _AT_ONCE:
                     count, late = count + abs(found.correlation), late + found.lag
     return round(count, 1), late
@@ -444,21 +452,17 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]
 def _follows(command: Stream, stream: Stream) -> str:
     """By how much a stream that nothing names follows the commands, in words; empty if it does not.
 
-    Positions do on most axes, later, and all with one gain; torques and currents do not.
+    Positions do on most axes, later, and all with one gain; torques and currents do not. In a frame of its own its
+    speed does.
     """
     found = _relations(command, stream)
     behind = [one for one in found if one.correlation >= _SAME and -_AT_ONCE < one.lag < LATEST]
     gains = [one.slope for one in behind]
-    alike = len(behind) > len(found) / 2 and max(gains) < _GAINS * min(gains)
-    return f"{float(np.median([one.lag for one in behind])) * 1e3:.0f} ms late" if alike else ""
-
-
-def _as_fast(command: Stream, stream: Stream) -> str:
-    """The same of a stream whose speed follows the commanded one, as in a frame of its own."""
+    if len(behind) > len(found) / 2 and max(gains) < _GAINS * min(gains):
+        return f"{float(np.median([one.lag for one in behind])) * 1e3:.0f} ms late"
     speeds = speeds_follow(command.source, stream.source)
-    if speeds is None or speeds.correlation < _SAME or not -_AT_ONCE < speeds.lag < LATEST:
-        return ""
-    return f"{speeds.lag * 1e3:.0f} ms late, by its speed"
+    is_late = speeds is not None and speeds.correlation >= _SAME and -_AT_ONCE < speeds.lag < LATEST
+    return f"{speeds.lag * 1e3:.0f} ms late, by its speed" if speeds and is_late else ""
 
 
 def _copies(command: Stream, stream: Stream) -> bool:
@@ -549,7 +553,7 @@ def _ranged(stream: Stream, measured: Set[str]) -> Stream:
     """A stream whose guessed units are the likeliest for the range of those of its axes that are measured."""
     found = dict(stream.axes)
     for kind in KINDS:
-        small, large, most = _RANGES[kind]
+        small, large, most = RANGES[kind]
         mine = {axis: signals for axis, signals in stream.axes.items() if stream.kind(axis) == kind}
         plain = [one.plain for axis in mine.keys() & measured for one in mine[axis] if one.basis == "range"]
         unit = large if max((float(np.nanmax(np.abs(one))) for one in plain), default=0.0) > most else small

@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from ..units import MS
 from .following import following, isolated, known
 from .paths import Path, Residue, Shrunk, clipped_rms, interpolated, path, residue, robust_sd, shrunk
 
-REFERENCE = "reference"  # the name of a run's reference among its sensors
 _FOLLOWS = 0.5  # correlation of changes below which two sensors do not see one motion
 _FEWEST = 40  # rows of a sensor from which its latency is looked for
 _MOST = 10_000  # rows of a sensor that are used: more only take longer
@@ -51,12 +51,11 @@ _RANDOM = 0.5  # mean intervals; those of stamps at random scatter by 0.86
 
 @dataclass(frozen=True)
 class Step:
-    """A latency that steps: when [s after the first command], from what and to what [s], with half intervals [s]."""
+    """A latency that steps: when [s after the first command], from what and to what [s]."""
 
     time: float
     before: float
     after: float
-    halves: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -184,7 +183,7 @@ class _Axis:
 
 def _source(run: Run, name: str) -> Source | None:
     """The rows of a sensor, or of the reference, in the part of the run that is used."""
-    source = run.reference if name == REFERENCE and run.reference is not None else run.sensors.get(name)
+    source = run.measured.get(name)
     there = run.command.stamp[run.command.stamp != NO_STAMP]
     return None if source is None or not len(there) else source.rows(run.within(source.stamp, int(there.min())))
 
@@ -194,18 +193,13 @@ def _of_run(run: Run, first: str, second: str) -> Alignment | None:
     if one is None or two is None:
         return None
     swapped = _count(two) > _count(one)
-    if swapped:
-        one, two = two, one
-    axes = [axis for name in one.values if (axis := _axis(run, name, one, two)) is not None]
+    dense, other = (two, one) if swapped else (one, two)
+    axes = [axis for name in dense.values if (axis := _axis(run, name, dense, other)) is not None]
     if not axes:
         return None
     latency = float(np.median([axis.lag for axis in axes]))
-    axes = [replace(axis, lag=latency) for axis in axes]
-    found = _parts(axes, latency)
-    if found is None:
-        return None
-    fits, steps = found
-    return _alignment(fits, steps, swapped, one if swapped else two)
+    found = _parts([replace(axis, lag=latency) for axis in axes], latency)
+    return None if found is None else _alignment(*found, swapped, two)
 
 
 def _count(source: Source) -> int:
@@ -263,12 +257,8 @@ def _thinned(time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArra
 class _Noise:
     """What is believed of an axis while the latency is sought.
 
-    Attributes:
-        scale: How far the second sensor moves where the first moves by 1.
-        sd1: Noise of the first [m or rad].
-        sd2: That of the second.
-        left: What the commands leave of the path.
-        penalty: The ridge of the responses; None: not known yet.
+    How far the second sensor moves where the first moves by 1, the noise of both [m or rad], what the commands leave of
+    the path, and the ridge of the responses, if it is known yet.
     """
 
     scale: float
@@ -280,25 +270,15 @@ class _Noise:
 
 @dataclass(frozen=True)
 class _Linear:
-    """An axis about a latency.
-
-    Attributes:
-        axis: Its rows.
-        time: When each row was valid, those of the first sensor before those of the second [s], (n,).
-        columns: Responses, levels of both, position, less the speed, and what is left, weighted, (n, k + 5).
-        rest: What is left of each row [sd], (n,).
-        speed: Of what it tells [sd/s], (n,).
-        shrunk: The coefficients of the responses.
-        noise: What to believe next.
-    """
+    """An axis about a latency, its n rows those of the first sensor before those of the second."""
 
     axis: _Axis
-    time: FloatArray
-    columns: FloatArray
-    rest: FloatArray
-    speed: FloatArray
-    shrunk: Shrunk
-    noise: _Noise
+    time: FloatArray  # when each row was valid [s], (n,)
+    columns: FloatArray  # responses, levels of both, position, less the speed, and what is left, weighted, (n, k + 5)
+    rest: FloatArray  # what is left of each row [sd], (n,)
+    speed: FloatArray  # of what it tells [sd/s], (n,)
+    shrunk: Shrunk  # the coefficients of the responses
+    noise: _Noise  # what to believe next
 
     def late(self, swapped: bool) -> tuple[FloatArray, FloatArray]:
         """What is left of the rows of the second sensor [sd], of the first if they are swapped, and speeds [sd/s]."""
@@ -345,8 +325,7 @@ def _linear(axis: _Axis, noise: _Noise, latency: float, fitted: bool) -> _Linear
     return _Linear(axis, time, columns, rest, speed, found, noise)
 
 
-@dataclass(frozen=True)
-class _Fit:
+class _Fit(NamedTuple):
     """The latency of rows between two stamps and half its interval [s], scales by axis with theirs, and the axes."""
 
     latency: float
@@ -355,16 +334,15 @@ class _Fit:
     scale_half: FloatArray
     axes: Sequence[_Linear]
 
-    @property
-    def span(self) -> float:
-        """How long its rows last [s]."""
-        return max(float(np.ptp(one.axis.x)) for one in self.axes)
-
 
 def _fit(axes: Sequence[_Axis], latency: float) -> _Fit | None:
     """The latency by Gauss-Newton; None where it does not settle."""
     axes = [one for one in axes if min(len(one.s), len(one.x)) >= _FEWEST]
-    noises = [_Noise(one.slope, *_first_sds(one, latency), Residue()) for one in axes]
+    noises = list[_Noise]()
+    for one in axes:
+        rest, floor = one.z2 - one.slope * one.path(one.x - latency), 1e-9 * float(np.ptp(one.z2))
+        sds = max(one.path.sd, floor), max(clipped_rms(rest - np.median(rest)), floor)
+        noises.append(_Noise(one.slope, *sds, Residue()))
     last = 0.0
     for count in range(_ROUNDS if axes else 0):
         lines = [_linear(one, noise, latency, count < _FITTED) for one, noise in zip(axes, noises, strict=True)]
@@ -380,13 +358,6 @@ def _fit(axes: Sequence[_Axis], latency: float) -> _Fit | None:
     else:
         return None
     return _jackknife(grams, lines, latency)
-
-
-def _first_sds(axis: _Axis, latency: float) -> tuple[float, float]:
-    """Noise of both sensors [m or rad]: of the second, what the path by the first leaves."""
-    rest = axis.z2 - axis.slope * axis.path(axis.x - latency)
-    floor = 1e-9 * float(np.ptp(axis.z2))
-    return max(axis.path.sd, floor), max(clipped_rms(rest - np.median(rest)), floor)
 
 
 def _grams(lines: Sequence[_Linear]) -> list[FloatArray]:
@@ -448,20 +419,17 @@ def _parts(axes: Sequence[_Axis], latency: float) -> tuple[list[_Fit], list[Step
         edges = [-math.inf, *times, math.inf]
         fits = [_fit([one.between(*span) for one in axes], latency) for span in pairwise(edges)]
         steps = [
-            Step(time, one.latency, two.latency, (one.half, two.half))
+            Step(time, one.latency, two.latency)
             for time, one, two in zip(times, fits, fits[1:], strict=False)
-            if one is not None and two is not None and _differ(one, two)
+            if one is not None
+            and two is not None
+            and abs(one.latency - two.latency) > max(_FURTHER * math.hypot(one.half, two.half), _SMALLEST_STEP)
         ]
         if len(steps) == len(times):
             return [one for one in fits if one is not None], steps
         times = [step.time for step in steps]
     whole = _fit(axes, latency)
     return None if whole is None else ([whole], [])
-
-
-def _differ(one: _Fit, two: _Fit) -> bool:
-    apart = abs(one.latency - two.latency)
-    return apart > max(_FURTHER * math.hypot(one.half, two.half), _SMALLEST_STEP)
 
 
 def _candidates(axes: Sequence[_Axis], latency: float) -> list[float]:
@@ -502,15 +470,18 @@ def _costs(axis: _Axis, latencies: FloatArray) -> FloatArray:
 
 def _alignment(fits: Sequence[_Fit], steps: Sequence[Step], swapped: bool, late: Source) -> Alignment:
     """What is told of the second sensor; ``swapped``: it was the first one that was the slower."""
-    sign = -1.0 if swapped else 1.0
-    best = max(fits, key=lambda one: one.span)
+    sign, best = -1.0 if swapped else 1.0, max(fits, key=lambda fit: max(np.ptp(one.axis.x) for one in fit.axes))
     low, high = min(one.latency - one.half for one in fits), max(one.latency + one.half for one in fits)
     if swapped:
         low, high = -high, -low
         steps = [replace(one, before=-one.before, after=-one.after) for one in steps]
     scale, scale_ci95 = _scale(best, swapped)
     jitter, sd = _jitter(best, swapped)
-    irregular, bunched = _arrivals(late)
+    apart, interval = _intervals(late)
+    narrow, wide = np.quantile(interval, [0.1, 0.9])
+    bunched, irregular = apart < (1.0 - _BUNCHED) * len(interval), float(wide - narrow) / 2.563
+    # A jitter of stamps may be as large as their intervals scatter, anything where these come near random ones.
+    irregular = math.inf if bunched or irregular > _RANDOM * interval.mean() else irregular
     if jitter > irregular or jitter < _OF_BOTH * _jitter(best, not swapped)[0]:
         jitter = 0.0
     return Alignment(sign * best.latency, (low, high), scale, scale_ci95, sd, jitter, bunched, steps)
@@ -547,29 +518,14 @@ def _jitter(fit: _Fit, swapped: bool) -> tuple[float, dict[str, float]]:
         weighted = X / np.maximum(X @ b, 0.1)[:, None] ** 2
         cov = np.linalg.pinv(X.T @ weighted)
         b = np.maximum(cov @ (weighted.T @ rest), 0.0)
-    error = weighted * (rest - X @ b)[:, None]
+    error, jitter = weighted * (rest - X @ b)[:, None], math.sqrt(float(b[-1]))
     variance = cov @ (error.T @ error) @ cov
-    jitter = math.sqrt(float(b[-1]))
     if b[-1] < _SURELY * math.sqrt(float(variance[-1, -1])) or jitter < _SMALLEST_JITTER:
         return 0.0, sds
-    return jitter, {
-        axis: sd * math.sqrt(max(float(one), 1e-2)) for (axis, sd), one in zip(sds.items(), b, strict=False)
-    }
+    return jitter, {name: sds[name] * math.sqrt(max(float(one), 1e-2)) for name, one in zip(sds, b, strict=False)}
 
 
 def _intervals(source: Source) -> tuple[int, FloatArray]:
     """How many intervals of its stamps are not within a bunch, and all of them [s]."""
     interval = np.diff(np.sort(source.stamp[source.stamp != NO_STAMP])) / 1e9
     return int(np.count_nonzero(interval > _SAME_BUNCH * interval.mean())) if len(interval) else 0, interval
-
-
-def _arrivals(source: Source) -> tuple[float, bool]:
-    """How large a jitter of its stamps may be [s], and whether rows arrive in bunches.
-
-    As their intervals scatter, outliers apart; anything, where these come near those of stamps at random.
-    """
-    apart, interval = _intervals(source)
-    low, high = np.quantile(interval, [0.1, 0.9])
-    bunched = apart < (1.0 - _BUNCHED) * len(interval)
-    irregular = float(high - low) / 2.563
-    return math.inf if bunched or irregular > _RANDOM * interval.mean() else irregular, bunched

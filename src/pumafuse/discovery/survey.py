@@ -16,15 +16,14 @@ import numpy as np
 from ..errors import RunError
 from ..logs.axes import in_axes
 from ..logs.clock import without_strays
-from ..logs.run import Run, Source
+from ..logs.run import REFERENCE, Run, Source
 from ..space.rotations import TURNING
 from ..units import MS
 from .contents import Part, parts_of, period_of, without_clock
-from .following import Following
+from .following import LATEST, Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
 from .roles import GUESSED_LAG, Roles, relations, roles_of
-from .sensors import REFERENCE
 
 FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
@@ -96,10 +95,17 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     related = relations(run)
     lags, least = [one.lag for one in related.values() if abs(one.correlation) >= _SURELY], least_lag(run)
     surely = _SURELY if max(lags, default=0.0) < least else math.inf
-    bad = {key: why for key, one in related.items() if lags and (why := _does_not_follow(one, least, surely))}
+    bad = dict[tuple[str, str], str]()
+    for key, one in related.items() if lags else ():
+        if abs(one.correlation) < FOLLOWS:
+            bad[key] = f"it does not follow the commands (correlation {one.correlation:+.2f}): are columns exchanged?"
+        elif one.lag < least and abs(one.correlation) < surely:
+            bad[key] = f"it moves {-one.lag * MS:.0f} ms before its commands (correlation {one.correlation:+.2f})"
+    bad |= {(name, axis): why for name, why in _without_lag(related).items() for axis in (*run.axes, *TURNING)}
     roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
-    kept = {(one.name, axis) for one in roles.sensors for axis in (*one.axes, *TURNING)}
-    kept |= {(REFERENCE, axis) for axis in (*roles.reference.axes, *TURNING)} if roles.reference else set()
+    if not roles.sensors:
+        raise RunError(f"{log}: commands, but nothing that surely follows them: {_reasons(roles, parts)}")
+    kept = {(name, axis) for name, one in roles.measured.items() for axis in (*one.axes, *TURNING)}
     related = {key: one for key, one in related.items() if key in kept}
     run, related = _followed(_along_axes(without_strays(roles.run), aside), related)
     found = Survey(log, run, related, parts, roles, own_frames=aside)
@@ -120,40 +126,37 @@ def _followed(run: Run, related: _Relations) -> tuple[Run, _Relations]:
 
     A marker may be turned on the tool. Where no sensor follows the commanded orientation, nobody measures it.
     """
-    every = {**run.sensors, **({} if run.reference is None else {REFERENCE: run.reference})}
-    turned = {name for name in every if _turns_along(run.command, name, related)}
-    every = {name: source if name in turned else _without_turning(source) for name, source in every.items()}
+    turned = set[str]()
+    for name in run.measured:  # on its axes together, each as far as the tool is told to turn
+        turning = [axis for axis in TURNING if (name, axis) in related]
+        power = np.array([np.nanvar(run.command.values[axis]) for axis in turning])
+        correlation = np.array([related[name, axis].correlation for axis in turning])
+        if turning and float(power @ correlation) >= TURNS * float(power.sum()):
+            turned.add(name)
+    every = {name: one if name in turned else _without_turning(one) for name, one in run.measured.items()}
     run = replace(run, sensors={name: every[name] for name in run.sensors}, reference=every.get(REFERENCE))
     if run.sensors and turned.isdisjoint(run.sensors):
         run = replace(run.each(lambda _, source: _without_turning(source)), tool=None)
     return run, {(name, axis): one for (name, axis), one in related.items() if axis in every[name].values}
 
 
-def _turns_along(command: Source, name: str, related: _Relations) -> bool:
-    """Whether a source follows the commanded orientation on its axes together, each as far as it is told to turn."""
-    turning = [axis for axis in TURNING if (name, axis) in related]
-    power = np.array([np.nanvar(command.values[axis]) for axis in turning])
-    correlation = np.array([related[name, axis].correlation for axis in turning])
-    return bool(turning) and float(power @ correlation) >= TURNS * float(power.sum())
-
-
 def _without_turning(source: Source) -> Source:
     return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
-def _does_not_follow(one: Following, least: float, surely: float) -> str:
-    """Why an axis of a sensor is left out where others follow; empty for one that follows.
-
-    Args:
-        one: How it follows.
-        least: The least lag that it may have [s].
-        surely: The correlation from which it may be earlier.
-    """
-    if abs(one.correlation) < FOLLOWS:
-        return f"it does not follow the commands (correlation {one.correlation:+.2f}): are columns exchanged?"
-    if one.lag < least and abs(one.correlation) < surely:
-        return f"it moves {-one.lag * MS:.0f} ms before its commands (correlation {one.correlation:+.2f})"
-    return ""
+def _without_lag(related: _Relations) -> dict[str, str]:
+    """Sources of which an axis surely moves alike, but as late as lags are looked for: that is no following."""
+    late: dict[str, list[str]] = {}
+    for (name, axis), one in related.items():
+        if one.lag >= LATEST and abs(one.correlation) >= _SURELY:
+            late.setdefault(name, []).append(axis)
+    return {
+        name: (
+            f"no lag up to {LATEST:g} s explains its motion on {', '.join(axes)}: is it another robot's, or its clock"
+            f" another one? If it follows, say so in run.toml: [sensors.{name}], with shift_s = SECONDS in its time"
+        )
+        for name, axes in late.items()
+    }
 
 
 def least_lag(run: Run) -> float:
@@ -201,4 +204,4 @@ def soonest(found: Survey) -> float:
 def _reasons(roles: Roles, parts: Sequence[Part]) -> str:
     reasons = [f"{stream.name}: {why}" for stream, why in roles.left_out]
     reasons += [f"{part.label}: {without_clock(part)}" for part in parts if part.signals and part.clock is None]
-    return "; ".join(reasons) or "nothing else is in the log"
+    return "; ".join(dict.fromkeys(reasons)) or "nothing else is in the log"

@@ -20,7 +20,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
 from ..errors import PumafuseError
 from .events import Events, Results
 
-VERSION = 6  # of the interface
+VERSION = 7  # of the interface
 FINEST = 1e-9  # PF_FINEST
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
@@ -32,13 +32,14 @@ def _numbers(*names: str) -> np.dtype[np.void]:
 
 AXIS = _numbers(
     *("period", "delay", "time_constant", "natural_frequency", "damping", "slope", "intercept", "recovery"),
+    *("max_speed", "play", "sag_offset", "sag_slope", "sag_knee", "sag_slope_beyond"),
     *("input_noise", "drift", "maneuver_noise", "maneuver_drift"),
     *("disturbance_sd", "disturbance_time", "smoothness", "offset_sd", "lag_sd", "gain_sd", "start"),
 )
 SENSOR = _numbers("scale", "latency", "latency_sd", "gate", "gate_rows")
 VIEW = _numbers("sd", "bias_sd", "bias_drift_sd", "bias_time", "turn")
 
-MOTION = np.dtype([("time", np.int64), *_numbers("command", "step", "error", "position", "rate").descr])
+MOTION = np.dtype([("time", np.int64), *_numbers("command", "step", "error", "position", "rate", "slack").descr])
 
 
 class Output(IntEnum):

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from filterpy.common import van_loan_discretization
 from filterpy.kalman import KalmanFilter
+from scipy.integrate import solve_ivp
 
 from ..arrays import FloatArray, TimeArray
 from ..model.plants import Plant
@@ -54,6 +55,50 @@ def discretized(A: FloatArray, L: FloatArray, dt: float) -> tuple[FloatArray, Fl
     for _ in range(doublings):
         F, Q = F @ F, F @ Q @ F.T + Q
     return F, 0.5 * (Q + Q.T)
+
+
+class Bent:
+    """What the commands alone make of an axis with a fastest speed, play or sag, which no matrix does."""
+
+    def __init__(self, plant: Plant, axis: Record) -> None:
+        self.axis, self.state, self.tool = axis, np.zeros(len(plant.state_space()[0])), 0.0
+        self.lag, self.fastest, self.half = plant.lag, float(axis["max_speed"]) or math.inf, 0.5 * float(axis["play"])
+        self.follows = 2.0 * float(axis["damping"] * axis["natural_frequency"])  # how fast the speed does [1/s]
+
+    def speed(self, state: FloatArray, goal: float) -> float:
+        """Of the drive: a plant of first order has the speed that it is asked for."""
+        asked = min(max((goal - state[0]) / self.lag, -self.fastest), self.fastest)
+        return float(asked if len(state) == 1 else state[1])
+
+    def rates(self, state: FloatArray, goal: float) -> list[float]:
+        """How the drive's state changes."""
+        asked, speed = self.speed(state[:1], goal), self.speed(state, goal)
+        return [speed] if len(state) == 1 else [speed, self.follows * (asked - speed)]
+
+    def move(self, u: float, e: float, dt: float) -> None:
+        """Over an interval, at whose beginning the gain error is e; the tool stays where the drive turns."""
+
+        def goal(t: float) -> float:
+            return u + e * math.exp(-t / self.axis["recovery"]) if self.axis["recovery"] else u + e
+
+        solved = solve_ivp(
+            lambda t, state: self.rates(state, goal(t)), (0.0, dt), self.state, "LSODA",
+            events=lambda t, state: self.speed(state, goal(t)), rtol=1e-12, atol=1e-14,
+        )  # fmt: skip
+        self.state = solved.y[:, -1]
+        for x in (*(turned[0] for turned in solved.y_events[0]), self.state[0]):
+            self.tool = min(max(self.tool, float(x) - self.half), float(x) + self.half)
+
+    def motion(self, goal: float) -> FloatArray:
+        """Position and speed of the tool, which rests while the drive does not push it, (2,)."""
+        axis, speed, level = self.axis, self.speed(self.state, goal), float(self.axis["start"]) + self.tool
+        beyond = level > axis["sag_knee"]
+        slope = axis["sag_slope_beyond"] if beyond else axis["sag_slope"]
+        sag = axis["sag_offset"] + axis["sag_slope"] * level
+        sag += (axis["sag_slope_beyond"] - axis["sag_slope"]) * (level - axis["sag_knee"]) * beyond
+        x = float(self.state[0])
+        rests = self.tool not in (x - self.half, x + self.half) or (self.tool - x) * speed > 0.0
+        return np.array((self.tool + sag, 0.0 if rests else speed * (1.0 + slope)))
 
 
 class Axis:
@@ -93,7 +138,9 @@ class Axis:
         self.H = sensors["scale"][:, np.newaxis] * self.h + self.unit[drifting] + self.unit[constant]
         self.kf = KalmanFilter(dim_x=size, dim_z=1)
         self.kf.x, self.kf.P, self.kf.Q = np.zeros(size), np.diag(sd**2), np.zeros((size, size))
-        self.path = np.zeros(size)  # the state by commands alone
+        self.path = np.zeros(size)  # the state by commands alone, as it would be without what bends it
+        bends = any(axis[name] for name in axis.dtype.names or () if name.startswith(("max_speed", "play", "sag")))
+        self.bent = Bent(plant, axis) if bends else None
         self.doubts = np.array((axis["lag_sd"], axis["gain_sd"]))  # of its lag [s], and of its size
         self.by = np.zeros((2, size))  # how these have changed the state, by way of measurements
 
@@ -116,6 +163,8 @@ class Axis:
         if time > self.time:
             F, Q = self.over(time - self.time)
             self.kf.predict(F=F, Q=Q)
+            if self.bent is not None:
+                self.bent.move(float(self.path[self.u]), float(self.path[self.e]), (time - self.time) / 1e9)
             self.path, self.by, self.time = F @ self.path, self.by @ F.T, time
 
     def give(self, time: int, command: float, acts: int) -> None:
@@ -142,8 +191,10 @@ class Axis:
     def innovation(self, s: int, z: float, spread: float) -> Innovation:
         """Of a measurement [m] of sensor ``s``, whose noise is scaled by ``spread``."""
         sensor, view, H, x, P = self.sensors[s], self.views[s], self.H[s], self.kf.x, self.kf.P
-        R = (spread * view["sd"]) ** 2 + (sensor["scale"] * (self.speed @ x) * sensor["latency_sd"]) ** 2
-        nu = math.remainder(z - sensor["scale"] * self.axis["start"] - H @ x, view["turn"] or math.inf)
+        position, speed = self.bend()
+        R = (spread * view["sd"]) ** 2 + (sensor["scale"] * (self.speed @ x + speed) * sensor["latency_sd"]) ** 2
+        level = sensor["scale"] * (self.axis["start"] + position)
+        nu = math.remainder(z - level - H @ x, view["turn"] or math.inf)
         return Innovation(self.time, nu, H @ P @ H + R, R)
 
     def fuse(self, s: int, found: Innovation, reacquires: bool) -> float:
@@ -159,7 +210,15 @@ class Axis:
 
     def moved_by(self) -> FloatArray:
         """How the position by commands alone changes with its lag [m/s] and with its size [m], (2,)."""
-        return np.array((-self.speed @ self.path, self.h @ self.path))
+        position, speed = self.bend()
+        return np.array((-(self.speed @ self.path + speed), self.h @ self.path + position))
+
+    def bend(self) -> FloatArray:
+        """By how much position and speed are not what the path says, (2,)."""
+        if self.bent is None:
+            return np.zeros(2)
+        goal = float(self.path[self.u] + self.path[self.e])
+        return self.bent.motion(goal) - (self.h @ self.path, self.speed @ self.path)
 
     def agrees(self, s: int, now: Innovation) -> bool | None:
         """Whether a rejected measurement agrees with the one before; None where that is less than T ago."""
@@ -183,13 +242,14 @@ class Axis:
         h, T, x, P, until = self.h, self.period, self.kf.x, self.kf.P, time + round(self.period * 1e9)
         left = self.moved_by() - self.by @ h  # how what is not known of the position changes
         later = copy(self)
-        later.kf = copy(self.kf)
+        later.kf, later.bent = copy(self.kf), copy(self.bent)
         later.kf.P = np.zeros_like(P)  # which becomes what noise adds until then
         while later.in_flight and later.in_flight[0] <= until:
             later.act(later.in_flight[0])
         later.predict(until)
         moves = self.variance_of_motion(self.over(until - time)[0], later.kf.P)
-        mean = np.array((h @ x, h @ (later.kf.x - x) / T, x[OFFSET], x[DISTURBANCE]))
+        bend, bends = self.bend()[0], (later.bend() - self.bend())[0]
+        mean = np.array((h @ x + bend, (h @ (later.kf.x - x) + bends) / T, x[OFFSET], x[DISTURBANCE]))
         variance = np.array((h @ P @ h, moves / T**2, P[OFFSET, OFFSET], P[DISTURBANCE, DISTURBANCE]))
         moves_by = (later.moved_by() - later.by @ h - left) / T
         doubts = np.stack((left, moves_by, self.by[:, OFFSET], self.by[:, DISTURBANCE]))

@@ -14,7 +14,7 @@ def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Rec
     """An axis without noise as the core takes it, (1,).
 
     Args:
-        axis: Plant and gain.
+        axis: Plant, gain, fastest speed, play and sag.
         period: The update period T [s].
         delay: Td [s].
         start: The level u₀ [m] at which it rests; NaN where that is not known.
@@ -26,6 +26,10 @@ def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Rec
     else:
         found["natural_frequency"], found["damping"] = plant.natural_frequency, plant.damping
     found["slope"], found["intercept"], found["recovery"] = gain.slope, gain.intercept, axis.gain_recovery or 0.0
+    found["max_speed"], found["play"] = axis.max_speed or 0.0, axis.play
+    if (sag := axis.sag) is not None:
+        found["sag_offset"], found["sag_slope"], found["sag_knee"] = sag.offset, sag.slope, sag.knee or 0.0
+        found["sag_slope_beyond"] = sag.slope if sag.slope_beyond is None else sag.slope_beyond
     return found
 
 
@@ -35,7 +39,7 @@ def response(
     """The position of an axis that rests until its first command.
 
     Args:
-        axis: Plant and gain.
+        axis: Plant, gain, fastest speed, play and sag.
         period: The update period T [s].
         delay: Td [s].
         given: When each command is given, int64 ns, ascending, (k,).

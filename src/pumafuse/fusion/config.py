@@ -18,6 +18,7 @@ import numpy as np
 from .. import toml
 from ..errors import ConfigError, UnknownNameError, shortened, suggestion
 from ..logs.frames import CARTESIAN, Frame
+from ..logs.manifest import Robot, chain_of
 from ..model.arm import ArmModel, arm_of
 from ..model.presets import PRESETS
 from ..space import rotations
@@ -36,7 +37,7 @@ _LONGEST_LATENCY = 3600.0  # s
 _LARGEST_SCALE = 1e9  # as high as all numbers of a configuration
 _OFFSET_SD: dict[Kind, float] = {"length": 5e-3, "angle": math.radians(5.0)}
 _PER_AXIS = ("sd_mm", "bias_sd_mm", "bias_drift_sd_mm")  # keys of a sensor that may differ from axis to axis
-ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
+ARM_FILE, ROBOT_FILE = "arm.toml", "robot.urdf"  # beside a saved configuration: its arm, and what its joints move
 
 
 def of_axis(value: float | Mapping[str, float], axis: str, absent: float = 0.0) -> float:
@@ -197,6 +198,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         process: Process noise by axis; every axis of the arm is there.
         frame: For streams and runs in x, y, z that have no frame of their own.
         tool: The reference orientation of a tool that turns; None: a run's mean.
+        robot: The chain by which joints of a stream are poses of the tool.
         sensors: By name, in the order of processing of measurements valid at the same instant.
     """
 
@@ -205,6 +207,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     process: dict[str, Process] = {}
     frame: Frame | None = None
     tool: Tool | None = None
+    robot: Robot | None = None
     sensors: dict[str, Sensor] = {}
 
     def __post_init__(self) -> None:
@@ -251,7 +254,12 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         """
         path = Path(path)
         tree, where = toml.read(path), str(path)
-        return _config(tree, load_arm(tree, path), where)
+        found = _config(tree, load_arm(tree, path), where)
+        if found.robot is None:
+            return found
+        robot = found.robot.beside(path.parent)
+        chain_of(robot)  # what is wrong with it is said before anything begins
+        return msgspec.structs.replace(found, robot=robot)
 
     @staticmethod
     def parse(source: str | Mapping[str, Any], arm: ArmModel | None = None) -> FusionConfig:
@@ -279,14 +287,22 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return _config(tree, arm, where)
 
     def save(self, folder: Path) -> None:
-        """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""
+        """Write ``fusion.toml``, and beside it the arm as ``arm.toml`` and the robot as ``robot.urdf``.
+
+        Raises:
+            ConfigError: There is no such URDF any more.
+        """
         (folder / "fusion.toml").write_text(self.to_toml(), encoding="utf-8")
         self.arm.save(folder / ARM_FILE)
+        if self.robot is not None:
+            (folder / ROBOT_FILE).write_text(toml.text_of(Path(self.robot.urdf)), encoding="utf-8")
 
     def to_toml(self) -> str:
-        """The text of ``fusion.toml``, with the arm in a file ``arm.toml`` beside it."""
+        """The text of ``fusion.toml``, with ``arm.toml`` and, of a robot, ``robot.urdf`` beside it."""
         tree = toml.builtins(self)
         tree["arm"] = ARM_FILE
+        if self.robot is not None:
+            tree["robot"]["urdf"] = ROBOT_FILE
         tree["process"] = {axis: toml.builtins(one, self.arm.axes[axis].kind) for axis, one in self.process.items()}
         tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
         tree["sensors"] = {name: with_kinds(table, self.arm, _PER_AXIS) for name, table in tree["sensors"].items()}

@@ -14,9 +14,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from ..arrays import FloatArray, TimeArray, median
-from ..discovery.matching import SMALL_SHIFT, Grid, Match, matches, without_spikes
+from ..discovery.matching import FOLLOWS, GAIN, SMALL_SHIFT, Grid, Match, Tracking, matches, without_spikes
 from ..discovery.own_frames import angle_of
-from ..discovery.tracking import FOLLOWS, GAIN, Tracking
 from ..errors import RunError
 from ..filter.outcome import ABSENT, Outcome
 from ..filter.response import response

@@ -63,9 +63,9 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
 
 
 def with_tool(config: FusionConfig, run: Run) -> FusionConfig:
-    """The configuration with the reference orientation of a run's commands, where it has none."""
-    tool = reference_orientation(run) if config.tool is None else None
-    return config if tool is None else msgspec.structs.replace(config, tool=Tool(reference=tool))
+    """The configuration with the robot of a run, and the reference orientation of its commands where it has none."""
+    tool, robot = reference_orientation(run) if config.tool is None else None, run.robot or config.robot
+    return msgspec.structs.replace(config, tool=config.tool if tool is None else Tool(reference=tool), robot=robot)
 
 
 def _still(_: str, source: Source) -> Source:

@@ -25,7 +25,7 @@ from ..logs.run import Run
 from ..logs.tables import Table
 from ..model.arm import ArmModel
 from ..units import AN, KINDS, SCREEN, SI, Kind, Screen, kind_of, of_kind, seconds
-from .config import FusionConfig
+from .config import ARM_FILE, ROBOT_FILE, FusionConfig
 from .estimates import AxisEstimate, Estimates, Mode
 from .placing import in_base
 from .pose import orientation, relative_to
@@ -34,7 +34,7 @@ from .summary import ScoreSummary, Summary, decode, encode, score_axis, summaris
 
 ESTIMATES, MEASUREMENTS, REFERENCE = "estimates.parquet", "measurements.parquet", "reference.parquet"
 SUMMARY = "summary.json"
-_FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"} | {
+_FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", ARM_FILE, ROBOT_FILE} | {
     "fused.rrd",
     "fused.png",
     "error.png",

@@ -131,8 +131,9 @@ class CommandWatch:
         stamps = np.array([stamp for stamp, _ in recent])
         table = {axis: np.array([number(values.get(axis)) for _, values in recent]) for axis in recent[0][1]}
         steady: dict[str, FloatArray] = {axis: column for axis, column in table.items() if np.isfinite(column).all()}
-        if steady and (missing := missing_commands(Source(stamps, steady, "commands"))) is not None:
-            self._log.write("missing commands", f"until {recent[-1][0] / 1e9:.3f} s {missing}; send every command")
+        if steady and (missing := missing_commands(Source(stamps, steady, "commands"), 0)) is not None:
+            told = f"until {recent[-1][0] / 1e9:.3f} s {missing}: the model holds the one before; send every command"
+            self._log.write("missing commands", told)
 
 
 def number(value: object) -> float:

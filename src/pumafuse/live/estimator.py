@@ -20,10 +20,12 @@ from ..fusion.segments import LONGEST_TAIL_NS, latest_follow
 from ..fusion.setup import live_model
 from ..logs.frames import CARTESIAN
 from ..space.rotations import TURNING
+from ..units import Kind
 from .clock import Clock, Time, Verdict, nanoseconds
 from .commands import Commands, CommandWatch, number
 from .frame_start import FrameStart
 from .health import Counts, Health, by_word
+from .joints import Joints
 from .rate_limit import RateLimitedLog
 from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
 from .screening import CommandScreen, HoldWatch, Screened
@@ -110,6 +112,7 @@ class LiveEstimator:
             if not abs(number(value)) < FARTHEST:
                 raise ConfigError(f"start: the level of {name} must be a finite position in m, not {value!r:.40}")
         check_tool(config, start or {})
+        self._joints = None if config.robot is None else Joints(config)
         self.config = config
         self.segment = 0
         self.axes = tuple(config.arm.axes)
@@ -137,7 +140,7 @@ class LiveEstimator:
         Args:
             t: When, float seconds or int nanoseconds.
             **axes: u [m] of each commanded axis; x, y and z with a frame; and ``orientation``, a quaternion x, y, z, w,
-                for a tool that turns.
+                for a tool that turns. Or all joints [rad or m] of the configuration's robot.
         """
         return self._take(t, None, axes)
 
@@ -147,8 +150,8 @@ class LiveEstimator:
         Args:
             t: Its stamp, float seconds or int nanoseconds; its latency is in the configuration.
             sensor: Its name there.
-            **axes: z [m] of each axis it saw; x, y and z with a frame; and ``orientation``, likewise. Of a sensor with
-                a frame or a marker all are as it measures them.
+            **axes: z [m] of each axis it saw; x, y and z with a frame; and ``orientation``, likewise; or all joints. Of
+                a sensor with a frame or a marker all are as it measures them.
         """
         return self._take(t, str(sensor), axes)
 
@@ -197,6 +200,11 @@ class LiveEstimator:
         return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason, orientation)
 
     @property
+    def joints(self) -> Mapping[str, Kind]:
+        """What the joints that events may be in move by; empty without a robot."""
+        return {} if self._joints is None else self._joints.kinds
+
+    @property
     def newest(self) -> int | None:
         """The newest stamp that is believed, int ns; None before any event."""
         return self._clock.newest
@@ -237,10 +245,10 @@ class LiveEstimator:
             sensor: Its name; empty for a command.
             values: As it came.
         """
-        if self._tool is None:
-            return values
-        parsed = self._tool.parsed(sensor or None, values)
-        return self._tool.of_tool(sensor, nanoseconds(t), parsed).values if sensor else parsed
+        parsed = self._parsed(sensor or None, values)
+        if self._tool is None or not sensor:
+            return parsed
+        return self._tool.of_tool(sensor, nanoseconds(t), parsed).values
 
     def health(self, at: Time | None = None) -> Health:
         """How each sensor does, and what became of everything so far.
@@ -282,13 +290,9 @@ class LiveEstimator:
 
     def _take(self, t: Time, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Put an event where its stamp says, if that can be."""
-        parsed = values
         try:
             stamp = nanoseconds(t)
-            if self._tool is not None:
-                parsed = self._tool.parsed(sensor, values)
-            elif ORIENTATION in values:
-                raise ValueError(NO_TOOL)
+            parsed = self._parsed(sensor, values)
         except ValueError as error:
             return self._refuse(sensor, values, _INVALID, str(error), self._refused)
         if sensor is not None and sensor not in self._sensors:
@@ -306,11 +310,25 @@ class LiveEstimator:
             self._aside = []
         if self._event_log is not None:
             self._event_log.append(stamp, sensor, values)
-        if sensor is None:
-            return self._take_screened(stamp, parsed)
+        if sensor is None:  # of joints these are screened: a pose is of all of them
+            return self._take_screened(stamp, values if not self.joints.keys().isdisjoint(values) else parsed)
         if stamp > self._screen.until:
             self._settle(self._screen.believed())
         return self._enter(stamp, sensor, parsed)
+
+    def _parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """An event's values with a pose in the place of joints, and a commanded orientation as axes.
+
+        Raises:
+            ValueError: It cannot be used; says why.
+        """
+        if self._joints is not None and (told := self._joints.told(values)) is not None:
+            values = self._joints.posed(values, told)
+        if self._tool is not None:
+            return self._tool.parsed(sensor, values)
+        if ORIENTATION in values:
+            raise ValueError(NO_TOOL)
+        return values
 
     def _take_screened(self, stamp: int, values: Mapping[str, Any]) -> UpdateResult:
         """Take a command that is in time, or let it wait for the next."""
@@ -329,16 +347,36 @@ class LiveEstimator:
                     f"a command of {name} at {stamp / 1e9:.3f} s leaps away from those before and after it: stray, not"
                     " used",
                 )
+            if not self.joints.keys().isdisjoint(stray):  # a pose is of all joints
+                values = {name: value for name, value in values.items() if name not in self.joints}
             if values or not stray:
                 self._counts.outcomes[COMMAND, _STRAY] -= 1
-                found[stamp] = self._enter(stamp, None, values)
+                found[stamp] = self._enter_command(stamp, values)
         return found
 
-    def _enter(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
-        """Take an event that is to be used."""
-        if self._early is not None:
-            return self._take_early(_Event(stamp, sensor, dict(values)))
-        return self._feed(stamp, sensor, values)
+    def _enter_command(self, stamp: int, values: Mapping[str, Any]) -> UpdateResult:
+        """Take a command that is to be used; one in joints changes the poses of others, where joints are later."""
+        oldest = self._oldest()
+        if self._joints is None or (told := self._joints.told(values)) is None:
+            return self._enter(stamp, None, values)
+        by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
+        try:
+            first = self._parsed(None, self._joints.posed(values, by_stamp.pop(stamp)))
+            others = {other: self._parsed(None, self._joints.posed({}, one)) for other, one in by_stamp.items()}
+        except ValueError as error:
+            return self._refuse(None, values, _INVALID, str(error), self._refused)
+        result = self._enter(stamp, None, first)
+        for other, pose in others.items():
+            self._enter(other, None, pose, again=True)
+        return result
+
+    def _enter(self, stamp: int, sensor: str | None, values: Mapping[str, Any], again: bool = False) -> UpdateResult:
+        """Take an event that is to be used; ``again``: in the place of a command of the same stamp."""
+        if self._early is None:
+            return self._feed(stamp, sensor, values, judged=again)
+        if again:
+            self._early = [one for one in self._early if one.sensor is not None or one.stamp != stamp]
+        return self._take_early(_Event(stamp, sensor, dict(values)), again)
 
     def _judged(self, event: _Event) -> UpdateResult | None:
         """What becomes of an event whose stamp is not plainly right; None if it is to be taken."""
@@ -387,6 +425,8 @@ class LiveEstimator:
         self._commands.forget(after)
         if self._tool is not None:
             self._place_again(self._tool.forget(after))
+        if self._joints is not None:
+            self._joints.forget(after)
         self._screen.restart()
         if self._event_log is not None:
             self._event_log.discard(after)
@@ -407,6 +447,8 @@ class LiveEstimator:
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
         self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
         self._start = {}
+        if self._joints is not None:
+            self._joints.restart()
         self._begin(self._counts.counted(self._window))
         if self._event_log is not None:
             self._event_log.begin_segment()
@@ -415,13 +457,13 @@ class LiveEstimator:
             self._take(*other)
         return self._take(*event)
 
-    def _take_early(self, event: _Event) -> UpdateResult:
+    def _take_early(self, event: _Event, again: bool) -> UpdateResult:
         """Take an event while the frame's place may still change; a command before all others moves it."""
         assert self._early is not None
         oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
         if origin is not None and self._clock.sure - origin > self._clock.window:
             self._early = None
-            return self._feed(*event)
+            return self._feed(*event, judged=again)
         x, y = (number(event.values.get(name)) for name in ("x", "y"))
         if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
             frame_start = FrameStart(self.config.frame, self.axes)
@@ -437,10 +479,10 @@ class LiveEstimator:
         if len(self._early) >= _MOST_ASIDE:
             del self._early[: _MOST_ASIDE // 2]
         self._early.append(event)
-        return self._feed(*event)
+        return self._feed(*event, judged=again)
 
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any], judged: bool = False) -> UpdateResult:
-        """Give an event that is in time to the window; ``judged``: nothing of it is held."""
+        """Give an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
         window, counts, given, stranger = self._window, self._counts, 0, ""
         new, told = window.value, None
         if self._tool is not None and sensor is not None and not judged:
@@ -485,7 +527,9 @@ class LiveEstimator:
         result = result or self._answer(codes, stranger)
         counts.read(window)
         if sensor is None:
-            self._take_command(stamp, values, codes, result.outcome, oldest)
+            if not judged:
+                self._count_command(stamp, values, result.outcome)
+            self._keep_command(stamp, values, codes, oldest)
             return result
         if not judged:
             counts.came(source, stamp, self._clock.sure)
@@ -530,14 +574,17 @@ class LiveEstimator:
                 )
         return held, released
 
-    def _take_command(self, stamp: int, values: Mapping[str, Any], codes: bytes, outcome: Outcome, oldest: int) -> None:
-        """Keep and watch a command that is in the window."""
+    def _count_command(self, stamp: int, values: Mapping[str, Any], outcome: Outcome) -> None:
+        """Count a command that is in the window, and when it came."""
         self._counts.outcomes[COMMAND, outcome] += 1
-        self._commands.add(stamp, codes, self._window.value[:], oldest)
-        self._watch.limits(self._commands)
         if outcome is _FUSED:
             self._doubtful += self._clock.doubtful
             self._watch.intervals(stamp, values)
+
+    def _keep_command(self, stamp: int, values: Mapping[str, Any], codes: bytes, oldest: int) -> None:
+        """Keep and watch where a command that is in the window has the arm go."""
+        self._commands.add(stamp, codes, self._window.value[:], oldest)
+        self._watch.limits(self._commands)
         if self._tool is not None:
             self._place_again(self._tool.command(stamp, values, oldest))
 

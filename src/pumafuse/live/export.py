@@ -76,6 +76,7 @@ def left_out(config: FusionConfig) -> str | None:
     placed = [name for name, sensor in config.sensors.items() if sensor.is_placed]
     parts = ["its [frame]"] if config.frame is not None else []
     parts += ["the reference of its [tool]"] if config.tool is not None else []
+    parts += ["the kinematics of its [robot]"] if config.robot is not None else []
     parts += [f"frame and marker of {', '.join(placed)}"] if placed else []
     return f"{'; '.join(parts)} {'is' if len(parts) == 1 and not placed else 'are'}" if parts else None
 

@@ -19,11 +19,13 @@ from typing import Any, NamedTuple
 
 from .. import toml
 from ..folders import FolderError, check_writable, write_file
-from ..fusion.config import FusionConfig
+from ..fusion.config import ROBOT_FILE, FusionConfig
 from ..logs.clock import TOLERATED_STEP_BACK_NS
 from ..logs.frames import CARTESIAN
+from ..logs.manifest import chain_of
 from ..logs.save import check_axis, check_name
 from ..space.rotations import TURNING
+from ..toml import text_of
 from ..units import SCREEN
 from .commands import number
 from .rate_limit import RateLimitedLog
@@ -80,8 +82,11 @@ class Recorder:
             check_name(sensor)
         for axis in axes:
             check_axis(axis)
+        self._robot = config.robot
+        self._joints = {} if config.robot is None else chain_of(config.robot).kinds
         framed = CARTESIAN if config.frame is not None else ()
         screens = {**{axis: config.arm.screen_of(axis) for axis in axes}, **dict.fromkeys(framed, SCREEN["length"])}
+        screens |= {joint: SCREEN[kind] for joint, kind in self._joints.items()}
         self._columns = {axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}
         self._scales = {axis: screen.scale for axis, screen in screens.items()}
         self._frame, self._start, self._notify = config.frame, dict(start), notify
@@ -92,7 +97,9 @@ class Recorder:
         check_writable(folder, force=False, markers=(), ours=lambda _: False)
         folder.mkdir(parents=True, exist_ok=True)
         self._turning = _QUATERNION if turns else []
-        self._writer = Writer(",".join((_TIME, *self._columns.values(), *self._turning)).encode() + b"\n")
+        header = ",".join((_TIME, *self._columns.values(), *self._turning)).encode() + b"\n"
+        beside = {} if self._robot is None else {ROBOT_FILE: text_of(Path(self._robot.urdf))}
+        self._writer = Writer(header, beside)
         self._due, self._reported, self._troubled = 0.0, -math.inf, False
         self._clear()
 
@@ -232,7 +239,12 @@ class Recorder:
             sensor: {
                 "file": _file(sensor),
                 "time": _TIME,
-                **{axis: column for axis, column in self._columns.items() if axis in seen},
+                **{axis: column for axis, column in self._columns.items() if axis in seen - self._joints.keys()},
+                **(
+                    {"joints": {joint: self._columns[joint] for joint in self._joints}}
+                    if seen & self._joints.keys()
+                    else {}
+                ),
                 **({ORIENTATION: {"quaternion": self._turning}} if ORIENTATION in seen else {}),
             }
             for sensor, seen in self._seen.items()
@@ -245,6 +257,8 @@ class Recorder:
             tree["sensors"] = entries
         if self._frame is not None:
             tree["frame"] = toml.builtins(self._frame)
+        if self._robot is not None:
+            tree["robot"] = {**toml.builtins(self._robot), "urdf": ROBOT_FILE}
         return toml.text(tree)
 
 
@@ -272,10 +286,15 @@ class Writer:
         rows: How many are written.
     """
 
-    def __init__(self, header: bytes) -> None:
-        """Start to wait for jobs; ``header`` is the first line of every file."""
+    def __init__(self, header: bytes, beside: Mapping[str, str]) -> None:
+        """Start to wait for jobs.
+
+        Args:
+            header: The first line of every file.
+            beside: Texts of files beside ``run.toml``, by their names.
+        """
         self.trouble, self.rows = "", 0
-        self._header = header
+        self._header, self._beside = header, beside
         self._begin(Path())
         self._jobs = queue.SimpleQueue[Job | None]()
         self._given = self._done = 0  # bytes; each is counted by one thread alone
@@ -320,6 +339,8 @@ class Writer:
             job.folder.mkdir(exist_ok=True)
             gone = [self._append(job, name) for name in list(job.rows)]
             if job.manifest != self._manifest or not (job.folder / _MANIFEST).exists():
+                for name, text in self._beside.items():
+                    write_file(job.folder / name, text)
                 write_file(job.folder / _MANIFEST, job.manifest)
                 self._manifest = job.manifest
         except (OSError, FolderError) as error:

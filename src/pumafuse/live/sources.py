@@ -50,14 +50,14 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
     """A run's events in the order of their arrival, at ``speed`` times its own pace; an empty list while it is quiet.
 
     A row arrives when its stamp says, one that steps back with the row before it; measurements come before commands
-    of the same instant.
+    of the same instant. What the run has in joints comes so: the configuration has its robot.
 
     Raises:
         RunError: The clocks of the run cannot be followed.
     """
     if run.clock != "stamps" and run.has_orientation:
         raise RunError(f"run '{run.name}': with orientations its clock = '{run.clock}' cannot be replayed; fuse it")
-    for part in segments(run.delayed(config.arm))[0]:
+    for part in segments(run)[0]:
         yield from _paced(*_arrivals(part, config), speed)
 
 
@@ -65,7 +65,7 @@ def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     """When each event arrives [ns], ascending, (n,), and the events."""
     sources = [*run.sensors.items(), ("", as_commanded(run, config))]
     arrival = np.concatenate([np.maximum.accumulate(source.stamp) for _, source in sources])
-    events = [event for name, source in sources for event in _events(name, source)]
+    events = [event for name, source in sources for event in _events(name, source.in_joints())]
     order = np.argsort(arrival, kind="stable")
     return arrival[order], [events[place] for place in order.tolist()]
 

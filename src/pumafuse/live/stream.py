@@ -63,7 +63,7 @@ class Stream:
         self.live, self.lines, self.bad, self.estimates = live, 0, 0, 0
         self._write, self._watchers = write, tuple(watchers)
         self._kinds = live.config.arm.kind_of
-        self._decoder = LineDecoder(self._kinds, live.config.frame is not None)
+        self._decoder = LineDecoder(self._kinds, live.config.frame is not None, live.joints)
         self._step = None if rate is None else 1e9 / rate
         self._grid: tuple[int, int] | None = None  # the segment, and where its grid begins [ns]
         self._due = 0

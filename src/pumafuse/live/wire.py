@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, cast
 
 import msgspec
@@ -66,8 +67,8 @@ class Event(NamedTuple):
     Attributes:
         t: Float seconds or int nanoseconds.
         sensor: Its name, empty for a command.
-        values: By axis [m or rad], and an orientation as a quaternion x, y, z, w; values under unknown names are passed
-            on as they are.
+        values: By axis or joint [m or rad], and an orientation as a quaternion x, y, z, w; values under unknown names
+            are passed on as they are.
     """
 
     t: float | int
@@ -78,20 +79,23 @@ class Event(NamedTuple):
 class LineDecoder:
     """Decoder of lines into events, for one arm's axes."""
 
-    def __init__(self, kinds: Mapping[str, Kind], framed: bool) -> None:
-        """Prepare for the axes, of which each is a length or an angle, and for x, y, z where there is a frame.
+    def __init__(
+        self, kinds: Mapping[str, Kind], framed: bool, joints: Mapping[str, Kind] = MappingProxyType({})
+    ) -> None:
+        """Prepare for axes and joints, of which each is a length or an angle, and for x, y, z where there is a frame.
 
         Raises:
-            ConfigError: An axis has the name of another part of a line.
+            ConfigError: An axis or joint has the name of another part of a line.
         """
-        every: dict[str, Kind] = {**dict.fromkeys(CARTESIAN if framed else (), "length"), **kinds}
+        every: dict[str, Kind] = {**dict.fromkeys(CARTESIAN if framed else (), "length"), **kinds, **joints}
         self._axes = tuple(dict.fromkeys((*kinds, *every)))
         self._scales = [SCREEN[every[axis]].scale for axis in self._axes]
         self._turns = _QUATERNION not in kinds or set(TURNING) <= kinds.keys()
         self._names = (*_NAMES, _QUATERNION) if self._turns else _NAMES
         for axis in self._axes:
             if axis in self._names:
-                raise ConfigError(f"axis '{axis}': lines of a stream call something else so ({', '.join(self._names)})")
+                what, every_name = "joint" if axis in joints else "axis", ", ".join(self._names)
+                raise ConfigError(f"{what} '{axis}': lines of a stream call something else so ({every_name})")
         fields: list[tuple[str, Any, Any]] = [
             (f"axis_{number}", float | UnsetType | None, UNSET) for number in range(len(self._axes))
         ]

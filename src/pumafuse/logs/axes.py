@@ -62,11 +62,7 @@ def reference_orientation(run: Run) -> tuple[float, float, float] | None:
 
 
 def _turning(run: Run, tool: tuple[float, float, float] | None) -> Run:
-    """The run with axes rx, ry, rz instead of orientations, if the commands have one; else without these.
-
-    Raises:
-        RunError: The tool is told to turn farther from its reference orientation than 170°.
-    """
+    """The run with axes rx, ry, rz instead of orientations, if the commands have one; else without these."""
     tool = tool or reference_orientation(run)
     if tool is None or run.command.orientation is None:
         return run.each(lambda _, source: replace(source, orientation=None)) if run.has_orientation else run
@@ -140,7 +136,12 @@ def _converted(source: Source, placed: Placed, command: Source | None) -> Source
     spread = dict(source.spread)
     found: dict[str, FloatArray] = {}
     if "x" in given:
-        near = None if command is None or isinstance(placed.frame, Rotated) else _commanded(command, source)
+        near = None  # where the commands are then, tangential [m], (rows,)
+        if command is not None and not isinstance(placed.frame, Rotated):
+            if "tangential" not in command.values:
+                both = f"{source.label} is in x and y, the commands are not; give them in x and y too"
+                raise RunError(f"{command.label}: {both}")
+            near = np.interp(source.stamp, *command.series("tangential"))
         x, y = source.values["x"], source.values["y"]
         found["tangential"], found["radial"], spread["tangential"] = placed.to_axes(x, y, near)
     if "z" in given:
@@ -148,10 +149,3 @@ def _converted(source: Source, placed: Placed, command: Source | None) -> Source
     if twice := next((axis for axis in found if axis in named), None):
         raise RunError(f"{source.label}: gives {twice} both by its name and by {', '.join(given)}; give one")
     return replace(source, values={**named, **found}, spread=spread)
-
-
-def _commanded(command: Source, source: Source) -> FloatArray:
-    """Commanded tangential position [m] at each row of a source, (rows,)."""
-    if "tangential" not in command.values:
-        raise RunError(f"{command.label}: {source.label} is in x and y, the commands are not; give them in x and y too")
-    return np.interp(source.stamp, *command.series("tangential"))

@@ -18,7 +18,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeAlias, cast
@@ -98,19 +97,16 @@ def decoder_of(channel: Channel) -> Decoder:
     Raises:
         ValueError: Nothing here does.
     """
-    if channel.encoding in ("cdr", "ros1"):
-        return _ros_decoder(channel)
-    if channel.encoding == "json":
-        return _json
-    if channel.encoding == "protobuf":
-        return _protobuf_decoder(channel)
-    raise ValueError(
-        f"topic '{channel.topic}': messages are encoded as '{channel.encoding}'; accepted: cdr, ros1, json, protobuf"
-    )
-
-
-def _json(payload: bytes) -> Message:
-    return msgspec.json.decode(payload, type=dict[str, Any])
+    match channel.encoding:
+        case "cdr" | "ros1":
+            return _ros_decoder(channel)
+        case "protobuf":
+            return _protobuf_decoder(channel)
+        case "json":
+            return msgspec.json.Decoder(dict[str, Any]).decode
+        case other:
+            accepted = "accepted: cdr, ros1, json, protobuf"
+            raise ValueError(f"topic '{channel.topic}': messages are encoded as '{other}'; {accepted}")
 
 
 def _protobuf_decoder(channel: Channel) -> Decoder:
@@ -222,7 +218,13 @@ def records_of(path: Path, topic: str | None, faults: Faults, seen: set[Channel]
         RunError: It is no such file or folder.
     """
     if path.is_dir():
-        for part in _parts(path):
+        listed = sorted(path.iterdir())  # metadata.yaml says no more, and is missing where recording was cut off
+        parts = [part for part in listed if part.suffix in (".mcap", ".db3")]
+        if not parts:
+            packed = any(part.suffix == ".zstd" for part in listed)
+            advice = "; unpack its files first: zstd -d *.zstd" if packed else ""
+            raise RunError(f"{path}: cannot be read: no bag of ROS 2, the folder has no .mcap and no .db3{advice}")
+        for part in parts:
             yield from records_of(part, topic, faults, seen)
     elif path.suffix == ".db3":
         yield from _sqlite_records(path, topic, faults, seen)
@@ -234,23 +236,10 @@ def records_of(path: Path, topic: str | None, faults: Faults, seen: set[Channel]
                     yield record
 
 
-def _parts(folder: Path) -> list[Path]:
-    """The files of a bag of ROS 2. Its ``metadata.yaml`` says no more, and is missing where recording was cut off."""
-    listed = sorted(folder.iterdir())
-    parts = [path for path in listed if path.suffix in (".mcap", ".db3")]
-    if not parts:
-        packed = any(path.suffix == ".zstd" for path in listed)
-        advice = "; unpack its files first: zstd -d *.zstd" if packed else ""
-        raise RunError(f"{folder}: cannot be read: no bag of ROS 2, the folder has no .mcap and no .db3{advice}")
-    return parts
-
-
 class _Whole:
-    """A file whose reads give all that was asked for or nothing, so that nothing torn is taken for whole.
+    """A file of ``size`` bytes, of which ``left`` are not read yet.
 
-    Attributes:
-        size: Bytes in the file.
-        left: Bytes that were not read yet.
+    Its reads give all that was asked for or nothing, so that nothing torn is taken for whole.
     """
 
     def __init__(self, file: BinaryIO, size: int) -> None:
@@ -267,11 +256,7 @@ class _Whole:
 
 
 def _inflated(data: bytes, compression: str, most: int = _LARGEST) -> bytes:
-    """The first ``most`` + 1 bytes of what was compressed.
-
-    Raises:
-        ValueError: The compression is not known, or ``most`` is beyond reason.
-    """
+    """The first ``most`` + 1 bytes of what was compressed."""
     if most > _LARGEST:
         raise ValueError(f"a chunk of {most >> 20} MB; up to {_LARGEST >> 20} MB are accepted")
     match compression:
@@ -289,20 +274,6 @@ def _inflated(data: bytes, compression: str, most: int = _LARGEST) -> bytes:
             return bz2.BZ2Decompressor().decompress(data, max_length=most + 1)
         case _:
             raise ValueError(f"unknown compression '{compression}'")
-
-
-def _chunk(data: bytes, compression: str, size: int, crc: int = 0) -> _Whole:
-    """The inside of a chunk.
-
-    Raises:
-        ValueError: It is not what its head says.
-    """
-    inside = _inflated(data, compression, size)
-    if len(inside) != size:
-        raise ValueError("it is not as long as it claims to be")
-    if crc and crc32(inside) != crc:
-        raise ValueError("its checksum is wrong")
-    return _Whole(BytesIO(inside), size)
 
 
 def _mcap_records(source: _Whole, faults: Faults, seen: set[Channel]) -> Iterator[Record]:
@@ -340,27 +311,32 @@ def _mcap_pieces(source: _Whole, faults: Faults, *, inside: bool = False) -> Ite
             if not isinstance(record, Chunk):
                 yield record
             elif not inside:
-                chunk = partial(
-                    _chunk, record.data, record.compression, record.uncompressed_size, record.uncompressed_crc
-                )
-                yield from _inside(faults, chunk, partial(_mcap_pieces, faults=faults, inside=True))
+                size, crc = record.uncompressed_size, record.uncompressed_crc
+                yield from _inside(_mcap_pieces, faults, record.data, record.compression, size, crc)
     except EndOfFile:
         if inside and source.left:
             raise ValueError("it ends within a record") from None
         faults.cut = faults.cut or not inside
 
 
-def _inside(faults: Faults, chunk: Callable[[], _Whole], pieces: Callable[[_Whole], Iterator[Any]]) -> list[Any]:
-    """The pieces of a chunk: all of them, or none if it is damaged."""
+def _inside(
+    pieces: Callable[..., Iterator[Any]], faults: Faults, data: bytes, compression: str, size: int, crc: int = 0
+) -> list[Any]:
+    """The pieces of a chunk: all of them, or none if it is damaged, or not what its head says."""
     try:
-        return list(pieces(chunk()))
+        inside = _inflated(data, compression, size)
+        if len(inside) != size:
+            raise ValueError("it is not as long as it claims to be")
+        if crc and crc32(inside) != crc:
+            raise ValueError("its checksum is wrong")
+        return list(pieces(_Whole(BytesIO(inside), size), faults, inside=True))
     except Exception as error:  # bytes that are not what they should be: every library has its own errors for that
         faults.leave_out("chunk", error)
         return []
 
 
 def _ros1_records(source: _Whole, faults: Faults, seen: set[Channel]) -> Iterator[Record]:
-    from rosbags.rosbag1.reader import RecordType, normalize
+    from rosbags.rosbag1.reader import Header, RecordType, normalize
 
     if source.read(13) != b"#ROSBAG V2.0\n":
         raise ValueError("not a bag of ROS 1, version 2.0")
@@ -368,7 +344,7 @@ def _ros1_records(source: _Whole, faults: Faults, seen: set[Channel]) -> Iterato
     for head, data in _ros1_pieces(source, faults):
         match head.get_uint8("op"):
             case RecordType.CONNECTION:
-                more = _ros1_head(data)
+                more = Header.read(BytesIO(struct.pack("<L", len(data)) + data))
                 name, kind = normalize(head.get_string("topic")), more.get_string("type")
                 channel = Channel(name, kind, "ros1", "ros1msg", more["message_definition"])
                 channels[head.get_uint32("conn")] = channel
@@ -398,25 +374,13 @@ def _ros1_pieces(source: _Whole, faults: Faults, *, inside: bool = False) -> Ite
         if kind == RecordType.BAGHEADER:  # says where the index is; 0 until the recorder ends
             faults.cut = faults.cut or not 0 < head.get_uint64("index_pos") < source.size
         if kind == RecordType.CHUNK and not inside:
-            size, compression = head.get_uint32("size"), head.get_string("compression")
-            chunk = partial(_chunk, data, compression, size)
-            yield from _inside(faults, chunk, partial(_ros1_pieces, faults=faults, inside=True))
+            yield from _inside(_ros1_pieces, faults, data, head.get_string("compression"), head.get_uint32("size"))
         elif kind != RecordType.CHUNK:
             yield head, data
 
 
-def _ros1_head(data: bytes) -> Any:
-    from rosbags.rosbag1.reader import Header
-
-    return Header.read(BytesIO(struct.pack("<L", len(data)) + data))
-
-
 def _has_lost_pages(path: Path) -> bool:
-    """Whether a database is shorter than its head says, which SQLite itself does not always notice.
-
-    Raises:
-        RunError: It ends within a page: SQLite would take zeros for the rest of it.
-    """
+    """Whether a database is shorter than its head says, which SQLite itself does not always notice."""
     with path.open("rb") as file:
         head = file.read(32)
     if len(head) < 32:

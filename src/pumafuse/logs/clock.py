@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import ALWAYS, NO_STAMP, IntArray, TimeArray, median
+from ..arrays import NO_STAMP, IntArray, TimeArray, median
 from ..errors import RunError
 from ..units import TIMES, mistaken
-from .run import Run, Source, note_rows
+from .run import REFERENCE, Run, Source, note_rows
 from .screening import without_stray_values
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
@@ -27,6 +27,7 @@ _FEW, _MANY = 30, 10_000  # stamps, below which nothing is said about their unit
 _SCATTERED, _JUMP = 5, 3.0  # periods of a short gap, and steps as large as a usual one that a long one hides
 _MANY_LOST, _OFF_TICK = 0.03, 0.25  # shares: of commands in motion, above which it is said; of a period
 _CORRECT = "Correct the unit of its time in run.toml"
+_LONG_GAP = 1.0  # s, of commands in motion, from which one gap is said
 _EVEN = 0.1  # spread of intervals over the usual one, up to which commands are a steady stream
 _HOUR_NS = 3_600_000_000_000
 _LONG_NS = 87_660 * _HOUR_NS  # ten years: no log is as long
@@ -169,19 +170,13 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
             )
         return [source.rows(slice(*edges)) for edges in pairwise([0, *jumps, len(source.stamp)])]
 
-    sensors = {name: pieces(source) for name, source in run.sensors.items()}
-    references = [None] * (len(cuts) + 1) if run.reference is None else pieces(run.reference)
-    parts = [
-        replace(
-            run,
-            command=command,
-            sensors={name: parts[index] for name, parts in sensors.items()},
-            reference=references[index],
-            start=run.start if index == 0 else {},
-            notes=run.notes if index == 0 else (),
-        )
-        for index, command in enumerate(pieces(run.command))
-    ]
+    measured = {name: pieces(source) for name, source in run.measured.items()}
+    parts = list[Run]()
+    for index, command in enumerate(pieces(run.command)):
+        mine = {name: parts[index] for name, parts in measured.items()}
+        reference = None if run.reference is None else mine.pop(REFERENCE)
+        begin: dict[str, Any] = {} if index == 0 else {"start": {}, "notes": ()}
+        parts.append(replace(run, command=command, sensors=mine, reference=reference, **begin))
     lag, label = behind(run.command.stamp) / 1e9, run.command.label
     notes = [
         f"{label}: the clock is set back by {lag[row]:.3f} s in row {row + 1}: new segment, filter restarted"
@@ -218,8 +213,8 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
         RunError: The stamps of a source are in another unit than they are taken to be in.
     """
     found, label, stamp = list[str](), run.command.label, run.command.stamp
-    command = _ascending(stamp)
-    first = _ascending(stamp[np.isfinite(run.command.values[run.axes[0]])]) if run.command.apart else command
+    command = np.sort(stamp[stamp != NO_STAMP], kind="stable")
+    first = run.command.series(run.axes[0])[0] if run.command.apart else command
     if (other := other_interval(first, period)) is not None:
         sentence, kind = other
         if kind == "unit":
@@ -228,19 +223,20 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
             raise RunError(f"{label}: {sentence} Log every command, or correct update_period_ms in arm.toml")
         found.append(f"{label}: {sentence}")
     if (missing := missing_commands(run.command)) is not None:
-        found.append(f"{label}: {missing}; log every command")
+        found.append(f"{label}: {missing}: the model holds the one before; log every command")
     for name in sensors:
-        stamp = _ascending(run.sensors[name].stamp)
-        if len(stamp):
-            _check_span(run.sensors[name].label_for(name), stamp, command)
-            found += [f"{name}: {one}" for one in _apart(stamp, int(command[0]), int(command[-1]))]
+        stamp = run.sensors[name].stamp
+        stamp = np.sort(stamp[stamp != NO_STAMP], kind="stable")  # fast where they are in order
+        if not len(stamp):
+            continue
+        span, commanded = (float(part[-1] - part[0]) / 1e9 for part in (stamp, command))
+        if min(len(stamp), len(command)) >= _FEW and (units := mistaken(span / max(commanded, 1e-9), TIMES)):
+            raise RunError(
+                f"{run.sensors[name].label_for(name)}: measurements go on for {span:.4g} s, the commands for"
+                f" {commanded:.4g} s: {_taken(units)} {_CORRECT}"
+            )
+        found += [f"{name}: {one}" for one in _apart(stamp, int(command[0]), int(command[-1]))]
     return found
-
-
-def _ascending(stamp: TimeArray) -> TimeArray:
-    """The stamps that there are, in order."""
-    known = stamp[stamp != NO_STAMP]
-    return known[in_order(known)]
 
 
 def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit", "lost", "other"]] | None:
@@ -274,14 +270,18 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit"
     return f"commands come every {times}: {lost}", "lost" if is_lost else "other"
 
 
-def missing_commands(command: Source) -> str | None:
-    """A sentence if commands of a steady stream are missing where they move.
+def missing_commands(command: Source, origin: int | None = None) -> str | None:
+    """A sentence if commands of a steady stream are missing where they move: many, or for longer than a second.
 
     Short gaps count in mid-motion, long ones if the command jumps: who sends a command only when it changes leaves the
     others out on purpose.
+
+    Args:
+        command: The commands.
+        origin: Since when times are told [ns]; None: the first command.
     """
     rows = np.flatnonzero(command.stamp != NO_STAMP)
-    rows = rows[np.diff(command.stamp[rows], prepend=ALWAYS) > 0]
+    rows = rows[np.append(True, np.diff(command.stamp[rows]) > 0)[: len(rows)]]
     intervals = np.diff(command.stamp[rows]) / 1e9
     if len(intervals) < _FEW or (intervals <= 0.0).any():
         return None
@@ -296,22 +296,14 @@ def missing_commands(command: Source) -> str | None:
     moving, on = moving[1:-1], moving[:-2] & moving[1:-1] & moving[2:]
     gaps = (ticks > 1) & np.where(ticks > _SCATTERED, jumps, on)
     missing, sent = int(np.sum(ticks[gaps] - 1)), int(np.count_nonzero(moving))
-    if missing < _FEW or missing <= _MANY_LOST * (missing + sent):
+    longest = int(np.argmax(np.where(gaps, intervals, 0.0)))
+    if missing < _FEW or (missing <= _MANY_LOST * (missing + sent) and intervals[longest] < _LONG_GAP):
         return None
+    begin = (command.stamp[rows[longest]] - (command.stamp[rows[0]] if origin is None else origin)) / 1e9
     return (
         f"{missing} of {missing + sent} commands are missing while the arm moves (one is due every"
-        f" {usual * 1e3:.4g} ms), the longest gap is {intervals[gaps].max():.3g} s: the model holds the one before"
+        f" {usual * 1e3:.4g} ms), the longest gap is {intervals[longest]:.3g} s, from {begin:.2f} s on"
     )
-
-
-def _check_span(label: str, stamp: TimeArray, command: TimeArray) -> None:
-    """Refuse measurements that last as long as the commands in another unit."""
-    span, commanded = (float(part[-1] - part[0]) / 1e9 for part in (stamp, command))
-    if min(len(stamp), len(command)) >= _FEW and (units := mistaken(span / max(commanded, 1e-9), TIMES)):
-        raise RunError(
-            f"{label}: measurements go on for {span:.4g} s, the commands for {commanded:.4g} s: {_taken(units)}"
-            f" {_CORRECT}"
-        )
 
 
 def _taken(units: Sequence[tuple[str, str]]) -> str:
@@ -328,18 +320,15 @@ def _apart(stamp: TimeArray, first: int, last: int) -> list[str]:
         return [f"measurements go on for {_duration(tail)} after the last command: are both stamped by one clock?"]
     every = stamp[-1] < first or stamp[0] > last
     side, apart = "before the first" if middle < first else "after the last", int(stamp[0]) - first
+    hours, why = round(abs(apart) / _HOUR_NS), ""
+    if abs(apart) > _LONG_NS:
+        why = " One may count from 1970, the other from when a computer was switched on"
+    elif hours and abs(abs(apart) - hours * _HOUR_NS) < 60 * _TAIL_NS:
+        why = " Is one of another time zone?"
     return [
         f"{'all' if every else 'most'} measurements lie {side} command, their stamps begin {_duration(abs(apart))}"
-        f" {'before' if apart < 0 else 'after'} those of the commands: are both stamped by one clock?{_why(abs(apart))}"
+        f" {'before' if apart < 0 else 'after'} those of the commands: are both stamped by one clock?{why}"
     ]
-
-
-def _why(apart: int) -> str:
-    """What two clocks that differ by that [ns] may be; empty without an idea."""
-    if apart > _LONG_NS:
-        return " One may count from 1970, the other from when a computer was switched on"
-    hours = round(apart / _HOUR_NS)
-    return " Is one of another time zone?" if hours and abs(apart - hours * _HOUR_NS) < 60 * _TAIL_NS else ""
 
 
 def _duration(time: int) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import count
@@ -102,10 +103,9 @@ class Table:
         values, none = without_sentinels(given)
         if none is not None:
             gone = np.isnan(values) & ~np.isnan(given)
-            cells = counted(int(gone.sum()), "cell")
             what = (
-                f"{self.path.name}: {cells} of column '{shortened(name)}' with {none:.15g}, ten times as far as all"
-                f" others, first in row {gone.argmax() + 1}: taken as missing"
+                f"{self.path.name}: {counted(int(gone.sum()), 'cell')} of column '{shortened(name)}' with {none:.15g},"
+                f" ten times as far as all others, first in row {gone.argmax() + 1}: taken as missing"
             )
             note = what if note is None else f"{note}; {what}"
         return units.si_of(values, unit), note
@@ -157,8 +157,7 @@ class Table:
             return self._of_two(name, nanoseconds)
         if _is_any(column.type, (pa.types.is_timestamp, pa.types.is_duration)):
             return self._within_reach(name, self._of_clock(name, column)), None
-        dates = self._dates(name, column)
-        if dates is not None:
+        if (dates := self._dates(name, column)) is not None:
             return self._within_reach(name, self._of_clock(name, dates[0])), dates[1]
         self._refuse_words(name, self._plain_column(name))
         if unit == DAYS:
@@ -185,9 +184,10 @@ class Table:
         return units.nanoseconds(time), note
 
     def is_dated(self, name: str) -> bool:
-        """Whether a column of text has dates, or times of day."""
-        column = self.column(name)
-        return _is_any(column.type, _TEXTS) and self._dates(name, column) is not None
+        """Whether a column of text has dates, or times of day, and nothing else."""
+        with suppress(RunError):  # dates mixed with numbers
+            return self._dates(name, self.column(name)) is not None
+        return False
 
     def zoned(self, name: str) -> bool | None:
         """Whether a column of dates says its time zone; None for a column of anything else."""
@@ -201,18 +201,13 @@ class Table:
 
     def nanoseconds_beside(self, name: str) -> str | None:
         """A column beside one of seconds that by its name has their nanoseconds; None without one."""
-        beside = self._of_nanoseconds.get(name.rpartition(".")[0], [])
-        return next((path for path in beside if path != name), None)
+        within = name.rpartition(".")[0]
+        return next((path for path in self._of_nanoseconds if path.rpartition(".")[0] == within and path != name), None)
 
     @cached_property
-    def _of_nanoseconds(self) -> dict[str, list[str]]:
-        """Columns that are nanoseconds by their names, by what is before the last point of these."""
-        found: dict[str, list[str]] = {}
-        for path in self.names:
-            table, _, leaf = path.rpartition(".")
-            if _NANOSECONDS.search(leaf):
-                found.setdefault(table, []).append(path)
-        return found
+    def _of_nanoseconds(self) -> list[str]:
+        """Columns that are nanoseconds by what is behind the last point of their names."""
+        return [path for path in self.names if _NANOSECONDS.search(path.rpartition(".")[2])]
 
     def column(self, path: str) -> pa.ChunkedArray:
         """The column of a name or a field path, nothing converted. A column that has the whole path as its name wins.
@@ -272,11 +267,7 @@ class Table:
         return _filled(self._cast(name, column, kind).cast(pa.int64()), NO_STAMP)
 
     def _dates(self, name: str, column: pa.ChunkedArray) -> tuple[pa.ChunkedArray, str | None] | None:
-        """A column of dates or times as text, as Arrow's, and a note on other text; None for a column without any.
-
-        Raises:
-            RunError: It has numbers, too, or dates with and without a time zone, or both dates and times.
-        """
+        """A column of dates or times as text, as Arrow's, and a note on other text; None for a column without any."""
         if not _is_any(column.type, _TEXTS):
             return None
         text = _rewritten(column)
@@ -431,16 +422,12 @@ def _rewritten(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 def _durations(text: pa.ChunkedArray) -> pa.ChunkedArray:
     """Times without a date as durations [ns]; null where a cell has none."""
-    found = pc.extract_regex(text, _ELAPSED)
-
-    def number(part: str) -> pa.ChunkedArray:
+    found, total = pc.extract_regex(text, _ELAPSED), pa.scalar(0)
+    for factor, part in ((1, "days"), (24, "hours"), (60, "minutes"), (60, "seconds"), (_GIGA, "fraction")):
         digits = pc.struct_field(found, part)
         digits = pc.utf8_rpad(digits, 9, "0") if part == "fraction" else digits
-        return pc.if_else(pc.equal(digits, ""), "0", digits).cast(pa.int64())
-
-    total = number("days")
-    for factor, part in ((24, "hours"), (60, "minutes"), (60, "seconds"), (_GIGA, "fraction")):
-        total = pc.add(pc.multiply(total, factor), number(part))
+        number = pc.if_else(pc.equal(digits, ""), "0", digits).cast(pa.int64())
+        total = pc.add(pc.multiply(total, factor), number)
     return total.cast(pa.duration("ns"))
 
 
@@ -568,7 +555,10 @@ def _element(
         place = _places(names, key)
     there = (place >= 0) & (place < lengths)
     if len(there) and not there.any() and not part:
-        what = f"at most {lengths.max()} elements" if names is None or isinstance(place, int) else _some_of(names)
+        what = f"at most {lengths.max()} elements"
+        if names is not None and not isinstance(place, int):
+            known = pc.unique(pc.list_flatten(names).drop_null()).to_pylist()[:20]
+            what = ", ".join(map(shortened, known)) or "no names"
         raise RunError(f"{label}: no row has an element '{shortened(key)}'; they have {what}")
     return pa.chunked_array([elements.take(pa.array(starts + place, mask=~there))])
 
@@ -587,12 +577,6 @@ def _places(names: pa.ChunkedArray, key: str) -> IntArray:
     places = np.full(len(lengths), -1)
     places[rows[::-1]] = (found - starts[rows])[::-1]  # the first of several
     return places
-
-
-def _some_of(names: pa.ChunkedArray) -> str:
-    """Names in a sentence."""
-    known = [shortened(name) for name in pc.unique(pc.list_flatten(names).drop_null()).to_pylist()[:20]]
-    return ", ".join(known) or "no names"
 
 
 def _is_any(kind: pa.DataType, kinds: Sequence[Callable[[pa.DataType], bool]]) -> bool:

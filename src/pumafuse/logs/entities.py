@@ -70,14 +70,11 @@ def read(path: Path, entity: str, fields: Sequence[str] | None) -> Table:
     table = table.take(pc.sort_indices(table[_ROW])).drop_columns(_ROW)
     timelines = [name for name in table.column_names if name not in known[place]]
     names = _names(known[place], timelines)
-    there = [
-        pc.greater(pc.fill_null(pc.list_value_length(table[name]), 0), 0)
-        for name in names
-        if name in table.column_names
-    ]
+    told = {name: short for name, short in names.items() if name in table.column_names}
+    there = [pc.greater(pc.fill_null(pc.list_value_length(table[name]), 0), 0) for name in told]
     table = table.filter(reduce(pc.or_, there)) if there else table
-    columns = {name: table[name] for name in table.column_names if name not in names}
-    columns |= {short: _single(table[name]) for name, short in names.items() if name in table.column_names}
+    columns = {name: table[name] for name in timelines}
+    columns |= {short: _single(table[name]) for name, short in told.items()}
     return Table(path, columns, table.num_rows, opened.notes, (*timelines, *names.values()))
 
 
@@ -93,18 +90,13 @@ def topics(path: Path) -> tuple[Topic, ...]:
         for name, chunk in opened.chunks:
             components.setdefault(name, set()).update(_components(chunk))
             rows[name] += chunk.num_rows
-            if LOG_TIME in chunk.column_names and pa.types.is_timestamp(chunk[LOG_TIME].type):
-                ends.setdefault(name, []).extend(pc.min_max(chunk[LOG_TIME].cast(pa.int64())).as_py().values())
             fields.setdefault(name, {}).update(dict.fromkeys(_numbers_of(chunk)))
+            recorded = ends.setdefault(name, [])
+            if LOG_TIME in chunk.column_names and pa.types.is_timestamp(chunk[LOG_TIME].type):
+                recorded += pc.min_max(chunk[LOG_TIME].cast(pa.int64())).as_py().values()
+    span = {name: (min(some, default=None), max(some, default=None)) for name, some in ends.items()}
     return tuple(
-        Topic(
-            name,
-            ", ".join(sorted(found)),
-            rows[name],
-            min(ends.get(name, ()), default=None),
-            max(ends.get(name, ()), default=None),
-            tuple(fields[name]),
-        )
+        Topic(name, ", ".join(sorted(found)), rows[name], *span[name], tuple(fields[name]))
         for name, found in sorted(components.items())
     )
 
@@ -201,15 +193,7 @@ class _Opened(NamedTuple):
 
 @contextmanager
 def _opened(path: Path, entity: str = "") -> Generator[_Opened]:
-    """A recording, from memory where it is small.
-
-    Args:
-        path: The file.
-        entity: Of others the columns may come without rows; empty: all rows come.
-
-    Raises:
-        RunError: It is no such recording, or damaged.
-    """
+    """A recording, from memory where it is small; of others than an ``entity`` columns may come without rows."""
     with one_line(path, "rerun-sdk"):
         found = path.stat()
     if found.st_size > _SMALL:
@@ -228,21 +212,19 @@ def _kept(path: Path, *_: int) -> _Opened:
 
 @contextmanager
 def _read(path: Path, entity: str) -> Generator[_Opened]:
-    """A recording, read by a process that ends with the context.
-
-    Args:
-        path: The file.
-        entity: Of other entities come the columns without rows; empty: all rows come.
-
-    Raises:
-        RunError: It is no such recording, or damaged; or there is no such process.
-    """
-    with _start(path, entity) as reader:
+    """A recording, read by a process that ends with the context; see :func:`_recorded`."""
+    command = [sys.executable, "-P", "-m", _READER, str(path), entity]
+    nothing, pipe = subprocess.DEVNULL, subprocess.PIPE
+    try:  # in a session of its own: Ctrl-C is for this process, which then ends the other
+        started = subprocess.Popen(command, stdin=nothing, stdout=pipe, stderr=nothing, start_new_session=True)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {sys.executable} does not start: {error.strerror}") from None
+    with started as reader:
         assert reader.stdout is not None
         try:
             if not reader.stdout.read(1):
-                command = f"{sys.executable} -P -m {_READER}"
-                raise RunError(f"{path}: cannot be read: its reader does not start; to see why, run: {command}")
+                why = f"to see why, run: {' '.join(command[:4])}"
+                raise RunError(f"{path}: cannot be read: its reader does not start; {why}")
             messages = _messages(path, reader.stdout)
             about, _ = next(messages)
             notes = (about["note"],) if about["note"] else ()
@@ -251,38 +233,20 @@ def _read(path: Path, entity: str) -> Generator[_Opened]:
             reader.kill()
 
 
-def _start(path: Path, entity: str) -> subprocess.Popen[bytes]:
-    """The process, in a session of its own: Ctrl-C is for this one, which then ends the other."""
-    command = [sys.executable, "-P", "-m", _READER, str(path), entity]
-    nothing, pipe = subprocess.DEVNULL, subprocess.PIPE
-    try:
-        return subprocess.Popen(command, stdin=nothing, stdout=pipe, stderr=nothing, start_new_session=True)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {sys.executable} does not start: {error.strerror}") from None
-
-
 def _messages(path: Path, pipe: IO[bytes]) -> Iterator[tuple[dict[str, str], pa.Table]]:
-    """What the process sends: metadata and rows.
-
-    Raises:
-        RunError: It says that something is wrong, or ends without a word.
-    """
+    """What the process sends: metadata and rows."""
     while True:
         try:
             with pa.ipc.open_stream(pipe) as stream:
-                about, rows = _decoded(stream.schema.metadata), stream.read_all()
+                about, rows = stream.schema.metadata, stream.read_all()
         except (pa.ArrowInvalid, OSError):
             raise RunError(f"{path}: damaged: Rerun's reader fails on it; take another copy, or record anew") from None
-        if "end" not in about:
-            yield about, rows
-        elif about["end"]:
-            raise RunError(about["end"])
-        else:
+        said = {key.decode(): value.decode(errors="surrogateescape") for key, value in about.items()}
+        if said.get("end"):
+            raise RunError(said["end"])
+        if "end" in said:
             return
-
-
-def _decoded(metadata: Mapping[bytes, bytes]) -> dict[str, str]:
-    return {key.decode(): value.decode(errors="surrogateescape") for key, value in metadata.items()}
+        yield said, rows
 
 
 # The process that reads, from inside.
@@ -303,7 +267,10 @@ def _main(path: Path, entity: str) -> None:
 
 
 def _recorded(path: Path, entity: str) -> Iterator[tuple[dict[str, str], pa.RecordBatch]]:
-    """The ids of a recording, then what was logged in time, chunk by chunk: metadata and rows."""
+    """The ids of a recording, then what was logged in time, chunk by chunk: metadata and rows.
+
+    Of others than an ``entity`` come the columns without rows; of an empty one all rows come.
+    """
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings(record=True) as caught:

@@ -85,7 +85,11 @@ def _topics(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
 def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     """The tables that arrays, structs and records of a file make."""
     if path.suffix == ".json":
-        value = _json(file.read())
+        text = file.read()
+        try:
+            value = msgspec.json.decode(text)
+        except msgspec.DecodeError:  # a list of what its lines hold, if each of them is JSON
+            value = cast(Any, msgspec.json.Decoder()).decode_lines(text)
     elif path.suffix == ".mat":
         value = _matlab(path, file)
     else:
@@ -95,14 +99,6 @@ def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     for name, one in _apart(value, ""):
         found.update(_by_length(one, name))
     return found
-
-
-def _json(text: bytes) -> Any:
-    """What a JSON file holds; a list of what its lines do, if each of them is JSON."""
-    try:
-        return msgspec.json.decode(text)
-    except msgspec.DecodeError:
-        return cast(Any, msgspec.json.Decoder()).decode_lines(text)
 
 
 def _matlab(path: Path, file: BinaryIO) -> Any:
@@ -120,7 +116,11 @@ def _matlab(path: Path, file: BinaryIO) -> Any:
 def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
     """Values that are tables of their own: those of a struct that has no arrays beside them."""
     struct = cast(Mapping[str, Any], value) if isinstance(value, Mapping) else dict[str, Any]()
-    inside = {key: one for key, one in struct.items() if not key.startswith("__") and _is_some(one)}
+    inside = {
+        key: struct[key]
+        for key, one in struct.items()
+        if not key.startswith("__") and (isinstance(one, Mapping | list) or np.size(one) > 1)
+    }
     if inside and all(isinstance(one, Mapping) and not _is_column(one) for one in inside.values()):
         for key, one in inside.items():
             yield from _apart(one, f"{name}.{key}" if name else key)
@@ -128,10 +128,6 @@ def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield from _apart(only, name)
     else:
         yield name, value
-
-
-def _is_some(value: Any) -> bool:
-    return isinstance(value, Mapping | list) or (isinstance(value, np.ndarray) and value.size > 1)
 
 
 def _is_column(value: Any) -> bool:
@@ -196,10 +192,9 @@ def _columns(value: Any, name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
 
 def _as_array(rows: Sequence[Any]) -> npt.NDArray[Any]:
     """A list as an array: of numbers with NaN for none, or of text; empty of anything else."""
+    if any(isinstance(one, str) for one in rows):
+        return np.array(["" if one is None else str(one) for one in rows])
     try:
-        if any(isinstance(one, str) for one in rows):
-            return np.array(["" if one is None else str(one) for one in rows])
-        whole = np.array(rows) if all(type(one) is int for one in rows) else np.array(rows, dtype=np.float64)
+        return np.array(rows, dtype=None if all(type(one) is int for one in rows) else np.float64)
     except (ValueError, TypeError, OverflowError):
         return np.empty(0)
-    return whole

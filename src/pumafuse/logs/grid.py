@@ -177,11 +177,8 @@ def assigned_ticks(place: FloatArray) -> IntArray | None:
 def _cheapest_ticks(place: FloatArray, tied: BoolArray) -> IntArray | None:
     """Ticks that ascend within each group at the least total cost, (n,); None if there are too few about the stamps.
 
-    A stamp's cost is the square of its distance from the tick in periods; beyond 0.7 late it hardly grows.
-
-    Args:
-        place: Each stamp in periods; ticks are whole numbers, (n,).
-        tied: Stamps in the group of the one before, (n,).
+    A stamp's cost is the square of its distance from the tick in periods; beyond 0.7 late it hardly grows. ``tied`` are
+    stamps in the group of the one before, (n,).
     """
     first = np.floor(place).astype(np.int64) - _MOST_LATE
     choices = np.arange(_CHOICES)
@@ -213,8 +210,12 @@ def _places(since: FloatArray, tick: float) -> FloatArray:
     the circular mean of the stamps over blocks, which no missing tick disturbs; over pauses it is extrapolated with the
     drift between neighbouring blocks.
     """
-    pauses = np.flatnonzero(np.diff(since) > _BLOCK * tick) + 1
-    edges = _blocks(np.concatenate(([0], pauses)), len(since))
+    start = np.concatenate(([0], np.flatnonzero(np.diff(since) > _BLOCK * tick) + 1))
+    # What is between two pauses is cut evenly, so that each block has enough stamps for a phase.
+    size = np.diff(np.append(start, len(since)))
+    count = -(-size // _BLOCK)
+    number = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    edges = np.repeat(start, count) + number * np.repeat(size, count) // np.repeat(count, count)
     size = np.diff(np.append(edges, len(since)))
     turn = np.add.reduceat(np.exp(2j * np.pi * since / tick), edges)
     phase = np.angle(turn) * tick / (2.0 * np.pi)
@@ -226,11 +227,3 @@ def _places(since: FloatArray, tick: float) -> FloatArray:
     phase = np.unwrap(phase - drift * middle, period=tick) + drift * middle
     block = np.repeat(np.arange(len(edges)), size)
     return (since - phase[block] - drift * (since - middle[block])) / tick
-
-
-def _blocks(start: IntArray, end: int) -> IntArray:
-    """First rows of blocks: what is between two pauses is cut evenly, so that each has enough stamps for a phase."""
-    size = np.diff(np.append(start, end))
-    count = -(-size // _BLOCK)
-    number = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
-    return np.repeat(start, count) + number * np.repeat(size, count) // np.repeat(count, count)

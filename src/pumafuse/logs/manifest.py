@@ -15,6 +15,7 @@ from .. import toml
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..space import rotations
+from ..space.kinematics import Chain
 from ..space.rotations import CONVENTIONS, TURNING
 from ..toml import NotNegative
 from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
@@ -152,7 +153,7 @@ class Robot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     """A serial chain of a URDF, by which joints are a pose.
 
     Attributes:
-        urdf: The file, beside ``run.toml``.
+        urdf: The file; in ``run.toml`` and ``fusion.toml`` beside these.
         base: The link that stands.
         tip: The link whose pose it is: the tool.
     """
@@ -160,6 +161,19 @@ class Robot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     urdf: str
     base: str
     tip: str
+
+    def beside(self, folder: Path) -> Robot:
+        """The same with its file in a folder."""
+        return msgspec.structs.replace(self, urdf=str(folder / self.urdf))
+
+
+def chain_of(robot: Robot) -> Chain:
+    """The kinematics of a robot.
+
+    Raises:
+        PumafuseError: See :meth:`pumafuse.space.kinematics.Chain.load`.
+    """
+    return Chain.load(robot.urdf, robot.base, robot.tip)
 
 
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
@@ -269,26 +283,20 @@ def load(path: Path) -> Manifest:
     Raises:
         ConfigError: The file is no manifest; names the key and the accepted ones.
     """
-    return _manifest(toml.read(path), str(path))
+    return of_tables(toml.read(path), str(path))
 
 
-def parse(text: str) -> Manifest:
-    """The same of the text of a ``run.toml``.
+def of_tables(tree: dict[str, Any], where: str = "run.toml") -> Manifest:
+    """What the tables of a ``run.toml`` say, with every number in SI.
 
     Raises:
-        ConfigError: It is no manifest; names the key and the accepted ones.
+        ConfigError: They are no manifest; names the key and the accepted ones.
     """
-    return _manifest(toml.parsed(text, "run.toml"), "run.toml")
-
-
-def _manifest(tree: dict[str, Any], where: str) -> Manifest:
-    for key, kind in (("command", CommandEntry), ("reference", ReferenceEntry)):
-        if key in tree:
-            tree[key] = _source(tree[key], kind, where, key)
-    sensors: Any = tree.get("sensors", {})
-    if not isinstance(sensors, dict):
+    kinds = {"command": CommandEntry, "reference": ReferenceEntry}
+    tree |= {key: _source(tree[key], kind, where, key) for key, kind in kinds.items() if key in tree}
+    if not isinstance(tree.setdefault("sensors", {}), dict):
         raise ConfigError(f"{where}: sensors: expected a table for each sensor, as in [sensors.tracker]")
-    named = cast(dict[str, Any], sensors)
+    named = cast(dict[str, Any], tree["sensors"])
     for name in named:
         refuse_name(f"{where}: sensor", name)
     tree["sensors"] = {name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in named.items()}

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 import numpy as np
 import numpy.typing as npt
 
+from .. import toml
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError, counted
 from ..model.arm import CANONICAL_AXES, ArmModel
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from .entities import Recording
 
 Clock = Literal["stamps", "regular"]
+REFERENCE = "reference"  # the name of a run's reference among its sensors
 
 _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
 _OUT_OF_ORDER_NS = 1_000_000_000  # by which rows are out of order without a word
@@ -111,17 +113,24 @@ class Source:
         """
         if self.joints is None or not any(later.values()):
             return self
-        told, names = self.joints.values.copy(), self.joints.chain.joints
-        if unknown := next((name for name in later if name not in names), None):
-            raise UnknownNameError(f"{self.label}: joints of the arm", "joint", unknown, names)
+        told, late = self.joints.values.copy(), self.joints.chain.columns(later, self.label)
         known = np.flatnonzero(np.isfinite(told).all(axis=1) & (self.stamp != NO_STAMP))
         set_back = np.flatnonzero(np.diff(self.stamp[known]) < -_OUT_OF_ORDER_NS) + 1
         for part in np.split(known, set_back):
             rows = part[np.argsort(self.stamp[part], kind="stable")]
-            time = (self.stamp[rows] - self.stamp[rows[:1]]) / 1e9
-            for column, by in ((names.index(name), by) for name, by in later.items()):
-                told[rows, column] = np.interp(time - by, time, told[rows, column])
+            time = self.stamp[rows]
+            last = np.flatnonzero(np.diff(time, append=NEVER))  # of a stamp the last command counts
+            for column, by in late.items():
+                told[rows, column] = _on_the_line(time[last], told[rows[last], column], time - by)
         return self.posed(Joints(self.joints.chain, told))
+
+    def in_joints(self) -> Source:
+        """The source with joints as its axes, in the place of the pose to which they move the tool."""
+        if self.joints is None:
+            return self
+        values = {axis: value for axis, value in self.values.items() if axis not in CARTESIAN}
+        values |= dict(zip(self.joints.chain.joints, self.joints.values.T.copy(), strict=True))
+        return replace(self, values=values, orientation=None, joints=None)
 
     def ordered(self, axis: str) -> IntArray:
         """The rows that have a stamp and a value of an axis, by stamp, (n,)."""
@@ -165,11 +174,6 @@ class Source:
         found = replace(self, stamp=self.stamp[row], values=values, apart=True)
         return found.rows(found.has_value)
 
-    def _of(self, axis: str) -> Source:
-        """The rows of one axis alone."""
-        own = self.rows(np.isfinite(self.values[axis]))
-        return replace(own, values={axis: own.values[axis]}, apart=False)
-
     def interpolated(self, step: float) -> Source:
         """The source with values between its rows, on the line from each to the next, for a controller that does so.
 
@@ -182,7 +186,16 @@ class Source:
             RunError: That is not between a thousandth of the median interval and the interval.
         """
         if self.apart:
-            return _side_by_side([self._of(axis).interpolated(step) for axis in self.values])
+            alone = {axis: self.rows(np.isfinite(value)) for axis, value in self.values.items()}
+            some = [replace(one, values={axis: one.values[axis]}, apart=False) for axis, one in alone.items()]
+            every = [one.interpolated(step) for one in some]
+            stamp = np.concatenate([one.stamp for one in every])
+            values = {
+                axis: np.concatenate([one.values.get(axis, np.full(len(one.stamp), np.nan)) for one in every])
+                for axis in self.values
+            }
+            whole = replace(every[0], stamp=stamp, values=values)
+            return whole.rows(np.argsort(stamp, kind="stable")).pivoted()
         gap = np.diff(self.stamp.astype(np.float64))  # far and negative where a row has no stamp
         interval = float(np.median(gap[gap > 0.0])) if (gap > 0.0).any() else np.nan
         if not interval / _MOST_STEPS <= step * 1e9 < interval:
@@ -238,13 +251,7 @@ class Source:
         turned = None if self.orientation is None else self.orientation[chosen]
         joints = None if self.joints is None else Joints(self.joints.chain, self.joints.values[chosen])
         return replace(
-            self,
-            stamp=self.stamp[chosen],
-            values=values,
-            spread=spread,
-            stray=stray,
-            orientation=turned,
-            joints=joints,
+            self, stamp=self.stamp[chosen], values=values, spread=spread, stray=stray, orientation=turned, joints=joints
         )
 
 
@@ -264,6 +271,7 @@ class Run:
         kinds: Of what kind the axes are, where the units of a log say so.
         notes: What was wrong with the files, a sentence each.
         recording: The Rerun recording that it was read from, if it was one.
+        robot: The chain by which its joints are poses, where there are any.
         without_strays: Whether stray stamps are removed already, see :func:`pumafuse.logs.clock.without_strays`.
         since: Where the part to use begins [s after the first command], see :meth:`between`; None: with the log.
         until: Where it ends, likewise.
@@ -279,23 +287,21 @@ class Run:
     kinds: Mapping[str, Kind] = field(default_factory=dict[str, Kind])
     notes: tuple[str, ...] = ()
     recording: Recording | None = None
+    robot: manifest.Robot | None = None
     without_strays: bool = False
     tool: tuple[float, float, float] | None = None
     since: float | None = None
     until: float | None = None
 
     def __repr__(self) -> str:
-        sources = {"commands": self.command, **self.sensors}
-        if self.reference is not None:
-            sources["reference"] = self.reference
+        sources = {"commands": self.command, **self.measured}
         counts = ", ".join(f"{len(source.stamp):,} {name}" for name, source in sources.items())
         return f"Run({self.name!r} of {', '.join(self.axes)}: {counts})"
 
     def __post_init__(self) -> None:
         where = f"run '{self.name}'"
         named = {f"sensor {name}": source.values for name, source in self.sensors.items()}
-        if self.reference is not None:
-            named["the reference"] = self.reference.values
+        named |= {} if self.reference is None else {"the reference": self.reference.values}
         framed = self.frame is not None or not set(self.axes).union(*named.values()).isdisjoint(CARTESIAN)
         accepted = dict.fromkeys((*self.axes, *CARTESIAN, *CANONICAL_AXES)) if framed else self.axes
         for what, values in {**named, "start": self.start}.items():
@@ -307,10 +313,9 @@ class Run:
         for axis, level in self.start.items():
             if not np.isfinite(_number(level, np.nan)):
                 raise RunError(f"{where}: the start level of {axis} is not finite")
-        if self.reference is not None:
-            for axis in self.reference.values:
-                if not 0.0 <= self.reference.sd_of(axis) < np.inf:
-                    raise RunError(f"{where}: the reference's sd must be finite and not negative")
+        scored = self.reference
+        if scored is not None and not all(0.0 <= scored.sd_of(axis) < np.inf for axis in scored.values):
+            raise RunError(f"{where}: the reference's sd must be finite and not negative")
         for axis, command in self.command.values.items():
             if not (np.isfinite(command) & (self.command.stamp != NO_STAMP)).any():
                 raise NoCommandError(f"{self.command.label}: no command for axis '{axis}' has both a stamp and a value")
@@ -321,10 +326,14 @@ class Run:
         return tuple(self.command.values)
 
     @property
+    def measured(self) -> dict[str, Source]:
+        """Its sensors, and ``reference``, by name."""
+        return {**self.sensors, **({} if self.reference is None else {REFERENCE: self.reference})}
+
+    @property
     def has_orientation(self) -> bool:
         """Whether one of its sources tells an orientation that is not yet made axes of."""
-        sources = [self.command, *self.sensors.values(), *([] if self.reference is None else [self.reference])]
-        return any(source.orientation is not None for source in sources)
+        return any(source.orientation is not None for source in (self.command, *self.measured.values()))
 
     def between(self, since: float | None = None, until: float | None = None) -> Run:
         """A part of the run, for example one that begins in mid-motion.
@@ -422,12 +431,26 @@ class Run:
             RunError: Lengths differ, or there is no command.
         """
         notes = list[str]()
-        commands = _from_arrays("command", time, command, notes)
-        streams = {name: _from_arrays(name, *_pair(name, arrays), notes) for name, arrays in (sensors or {}).items()}
-        scored = None
-        if reference is not None:
-            scored = replace(_from_arrays("reference", *_pair("reference", reference), notes), sd=reference_sd)
+        commands = _from_arrays("command", (time, command), notes)
+        streams = {name: _from_arrays(name, arrays, notes) for name, arrays in (sensors or {}).items()}
+        scored = None if reference is None else replace(_from_arrays(REFERENCE, reference, notes), sd=reference_sd)
         return Run(name, commands, streams, scored, dict(start or {}), clock, frame, notes=tuple(notes))
+
+
+def _on_the_line(stamp: TimeArray, value: FloatArray, at: TimeArray) -> FloatArray:
+    """Values at some instants on the lines from one to the next, (m,); before the first that.
+
+    No bit of it depends on other values than the two beside an instant: a stream tells the same of what it has by then.
+
+    Args:
+        stamp: Int ns, ascending, (n,).
+        value: (n,).
+        at: The instants, int ns, (m,).
+    """
+    before = np.clip(np.searchsorted(stamp, at, side="right") - 1, 0, None)
+    after = np.minimum(before + 1, len(stamp) - 1)
+    share = np.clip(at - stamp[before], 0, None) / np.maximum(stamp[after] - stamp[before], 1)
+    return value[before] + share * (value[after] - value[before])
 
 
 def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: str = "") -> None:
@@ -436,18 +459,6 @@ def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: s
     if len(found):
         plural = "row has" if len(found) == 1 else "rows have"
         notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1}{first})")
-
-
-def _side_by_side(sources: Sequence[Source]) -> Source:
-    """Sources of an axis each as one, in the order of their stamps; values of one stamp are in one row."""
-    stamp = np.concatenate([one.stamp for one in sources])
-    ends = np.cumsum([0, *(len(one.stamp) for one in sources)])
-    values = {axis: np.full(len(stamp), np.nan) for one in sources for axis in one.values}
-    for one, begin in zip(sources, ends, strict=False):
-        for axis, value in one.values.items():
-            values[axis][begin : begin + len(value)] = value
-    order = np.argsort(stamp, kind="stable")
-    return replace(sources[0], stamp=stamp, values=values).rows(order).pivoted()
 
 
 def standing_clock(source: Source) -> str:
@@ -479,16 +490,7 @@ def standing_clock(source: Source) -> str:
 
 
 def _note_standing_clock(notes: list[str], source: Source, advice: str) -> None:
-    """Append a note on rows with the stamp of the row before and another value; refuse a clock that stands still.
-
-    Args:
-        notes: Gets the note.
-        source: The rows.
-        advice: What to do, if the clock is refused.
-
-    Raises:
-        RunError: The clock stands still.
-    """
+    """Append a note on rows with the stamp of the row before and another value; refuse a clock that stands still."""
     if stands := standing_clock(source):
         raise RunError(f"{source.label}: {stands}; {advice}")
     axis, changes = _most_changes(source)
@@ -498,19 +500,13 @@ def _note_standing_clock(notes: list[str], source: Source, advice: str) -> None:
 
 def _most_changes(source: Source) -> tuple[str, BoolArray]:
     """The axis with the most rows that have the stamp of the row before and another value, and these rows, (rows,)."""
-    if not source.values or not (np.diff(source.stamp) == 0).any():
-        return "", np.zeros(len(source.stamp), dtype=np.bool_)
-    changes = {axis: _changes(source, axis) for axis in source.values}
+    changes = {"": np.zeros(len(source.stamp), dtype=np.bool_)}
+    for axis, value in source.values.items() if (np.diff(source.stamp) == 0).any() else ():
+        known = np.flatnonzero(np.isfinite(value) & (source.stamp != NO_STAMP))
+        changes[axis] = np.zeros(len(value), dtype=np.bool_)
+        changes[axis][known[1:]] = (np.diff(source.stamp[known]) == 0) & (np.diff(value[known]) != 0)
     axis = max(changes, key=lambda axis: changes[axis].sum())
     return axis, changes[axis]
-
-
-def _changes(source: Source, axis: str) -> BoolArray:
-    """Rows with the stamp of the row before that has a value of the axis, and another value, (rows,)."""
-    value, found = source.values[axis], np.zeros(len(source.stamp), dtype=np.bool_)
-    known = np.flatnonzero(np.isfinite(value) & (source.stamp != NO_STAMP))
-    found[known[1:]] = (np.diff(source.stamp[known]) == 0) & (np.diff(value[known]) != 0)
-    return found
 
 
 def _number(value: float | None, absent: float) -> float:
@@ -521,20 +517,13 @@ def _number(value: float | None, absent: float) -> float:
         return np.nan
 
 
-def _pair(label: str, arrays: Any) -> tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]]:
-    """Stamps and values of a source.
-
-    Raises:
-        RunError: It is no such pair.
-    """
-    if isinstance(arrays, tuple | list) and len(pair := tuple(cast(Sequence[Any], arrays))) == 2:
-        stamps, values = pair
-        if isinstance(values, Mapping):
-            return stamps, cast(Mapping[str, npt.ArrayLike], values)
-    raise RunError(f"{label}: give (stamps, {{axis: values}})")
-
-
-def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike], notes: list[str]) -> Source:
+def _from_arrays(label: str, arrays: Any, notes: list[str]) -> Source:
+    """A source of stamps and values."""
+    match arrays:
+        case [_, Mapping()]:
+            time, values = cast(tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]], arrays)
+        case _:
+            raise RunError(f"{label}: give (stamps, {{axis: values}})")
     try:
         stamp = _stamps(np.array(time))
         columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
@@ -559,12 +548,7 @@ def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.Array
 
 
 def _stamps(time: npt.NDArray[Any]) -> TimeArray:
-    """Int64 ns of datetime64, int ns or float seconds.
-
-    Raises:
-        ValueError: A stamp is beyond reach of int64 ns.
-        TypeError: The stamps are of another type.
-    """
+    """Int64 ns of datetime64, int ns or float seconds."""
     kind = time.dtype.kind
     if kind not in "Miuf":
         raise TypeError(f"got {time.dtype}")
@@ -584,7 +568,7 @@ def described(text: str, folder: Path) -> Run:
     Raises:
         PumafuseError: Not a recorded run; says what, where, and what is accepted.
     """
-    return _read(manifest.parse(text), folder)
+    return _read(manifest.of_tables(toml.parsed(text, "run.toml")), folder)
 
 
 def _read(listed: manifest.Manifest, folder: Path) -> Run:
@@ -613,8 +597,8 @@ def of_tables(
     """
     scored, notes, units = listed.reference, list[str](), dict(listed.command.kinds)
     entries, read = listed.entries, dict[tuple[str, ...], tables.Table]()
-    robot = listed.robot
-    chain = None if robot is None else Chain.load(folder / robot.urdf, robot.base, robot.tip)
+    robot = None if listed.robot is None else listed.robot.beside(folder)
+    chain = None if robot is None else manifest.chain_of(robot)
     naive, zoned = list[str](), list[str]()
 
     def source(name: str) -> Source:
@@ -640,8 +624,7 @@ def of_tables(
     has_value = {name: sources[name].has_value for name, entry in together.items() if tables_of[entry.rows] > 1}
     empty: dict[tuple[str, ...], BoolArray] = {}  # rows of a table in which none of its sources has a value
     for name, mine in has_value.items():
-        table = entries[name].rows
-        empty[table] = empty[table] & ~mine if table in empty else ~mine
+        empty[entries[name].rows] = ~mine & empty.get(entries[name].rows, True)
     for name, mine in has_value.items():  # where only others of its table have any, a row is theirs
         sources[name] = sources[name].rows(mine | empty[entries[name].rows])
     if listed.command.interpolation:
@@ -656,15 +639,11 @@ def of_tables(
     if naive and zoned:
         notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
     name, start, clock = listed.name or folder.resolve().name, listed.command.start, listed.command.clock
-    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
+    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes), robot=robot)
 
 
 def _on_ticks(source: Source, notes: list[str]) -> Source:
-    """A source on the even ticks of its own clock; those of the commands are of T, which is not known here.
-
-    Raises:
-        RunError: There are no such ticks.
-    """
+    """A source on the even ticks of its own clock; those of the commands are of T, which is not known here."""
     known = source.stamp != NO_STAMP
     distinct, place = np.unique(source.stamp[known], return_inverse=True)
     if len(distinct) < _FEW_ROWS:
@@ -708,13 +687,12 @@ def of_table(table: tables.Table) -> Run:
     """
     path, clock, listed = table.path, clock_of(table), ", ".join(table.columns)
     groups: dict[str, dict[str, list[manifest.Column]]] = {}
-    for column in table.columns:
-        source, dot, rest = column.partition(".")
-        if dot:
-            axis = rest.rpartition("_")[0]
-            if axis in groups.setdefault(source, {}):
-                raise RunError(f"{path}: two columns for {source}.{axis}; give one")
-            groups[source][axis] = [manifest.Column(column)]
+    for column in (name for name in table.columns if "." in name):
+        source, _, rest = column.partition(".")
+        axis = rest.rpartition("_")[0]
+        if axis in groups.setdefault(source, {}):
+            raise RunError(f"{path}: two columns for {source}.{axis}; give one")
+        groups[source][axis] = [manifest.Column(column)]
     if "command" not in groups:
         raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
     notes, sources, units = list(table.notes), dict[str, Source](), dict[str, Kind]()
@@ -740,14 +718,14 @@ def _source(
     stamp, of_time = time.stamps(table)
     values, found = dict[str, FloatArray](), list[str | None](of_time)
     for axis, columns in axes.items():
-        parts = [table.numbers(column.column, column.ending) for column in columns]
+        parts = [_own(table, column) for column in columns]
         for column in columns:
             kind = column.kind or "length"
             if units.setdefault(axis, kind) != kind:
                 raise RunError(
                     f"{table.path}: column '{column.column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
                 )
-        values[axis] = np.sum([_own(table, one, numbers) for one, (numbers, _) in zip(columns, parts, strict=True)], 0)
+        values[axis] = np.sum([numbers for numbers, _ in parts], 0)
         found.extend(note for _, note in parts)
     turned = None
     if orientation is not None:
@@ -770,24 +748,20 @@ def _posed(
     chain: Chain,
     units: dict[str, Kind],
 ) -> Source:
-    """The source with the pose of the tip to which its joints move a chain.
-
-    Raises:
-        RunError: A joint of the chain has no column, or one of another kind.
-    """
+    """The source with the pose of the tip to which its joints move a chain."""
     values = list[FloatArray]()
     for joint, kind in chain.kinds.items():
         if joint not in joints:
             raise RunError(f"{table.path}: no column for joint '{joint}' of the [robot]; there are {', '.join(joints)}")
-        for column in joints[joint]:
-            if column.kind not in (kind, None):
-                raise RunError(f"{table.path}: column '{column.column}' is no {kind}, which joint '{joint}' moves by")
-        values.append(np.sum([_own(table, one, table.numbers(one.column, one.ending)[0]) for one in joints[joint]], 0))
+        if wrong := next((one.column for one in joints[joint] if one.kind not in (kind, None)), None):
+            raise RunError(f"{table.path}: column '{wrong}' is no {kind}, which joint '{joint}' moves by")
+        values.append(np.sum([_own(table, one)[0] for one in joints[joint]], 0))
     units |= dict.fromkeys(CARTESIAN, "length")
     return source.posed(Joints(chain, np.column_stack(values)))
 
 
-def _own(table: tables.Table, column: manifest.Column, numbers: FloatArray) -> FloatArray:
-    """The numbers of a column, NaN in rows that are another axis's; an angle that begins anew goes on."""
+def _own(table: tables.Table, column: manifest.Column) -> tuple[FloatArray, str | None]:
+    """The numbers of a column, NaN in rows that are another axis's, and a note; an angle that begins anew goes on."""
+    numbers, note = table.numbers(column.column, column.ending)
     own = np.where(tables.meets(table, column.where), numbers, np.nan) if column.where else numbers
-    return unwrapped(own, column.turn) if column.turn else own
+    return unwrapped(own, column.turn) if column.turn else own, note

@@ -61,6 +61,13 @@ def without_stray_values(command: Source, sensors: Sequence[Source], notes: list
     One or two values that leap away from their neighbours and back by many times the usual step are stray, if no sensor
     follows them.
     """
+    if command.joints is not None:  # what nobody sent is among these, and a pose is of all of them
+        found = without_stray_values(command.in_joints(), [one.in_joints() for one in sensors], notes)
+        if not len(found.stray):
+            return command
+        told = np.column_stack([found.values[joint] for joint in command.joints.chain.joints])
+        values = {**command.values, **{axis: found.values[axis] for axis in found.values.keys() & command.values}}
+        return replace(command, values=values, stray=found.stray).posed(command.joints._replace(values=told))
     values, left_out = dict(command.values), np.zeros(len(command.stamp), dtype=np.bool_)
     for axis, value in command.values.items():
         told = command.ordered(axis)

@@ -87,7 +87,10 @@ def spread(stamp: TimeArray, number: FloatArray) -> TimeArray:
     for point in zip(at[order].tolist(), arrival[order].tolist(), strict=True):
         if hull and point[0] == hull[-1][0]:  # a number again, later
             continue
-        while len(hull) > 1 and _turns_down(hull[-2], hull[-1], point):
+        while len(hull) > 1:
+            (a, low), (b, high) = hull[-2:]
+            if (high - low) * (point[0] - a) < (point[1] - low) * (b - a):  # the way over the last one bends up
+                break
             hull.pop()
         hull.append(point)
     if len(hull) < 2:
@@ -97,8 +100,3 @@ def spread(stamp: TimeArray, number: FloatArray) -> TimeArray:
     slope = (high - low) / (end - begin)
     even = origin + np.rint(low + slope * (np.nan_to_num(number) - middle - begin)).astype(np.int64)
     return np.where(there, even, NO_STAMP)
-
-
-def _turns_down(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> bool:
-    """Whether the way from one point over the next to a third bends down, so that the middle one is above a hull."""
-    return (two[1] - one[1]) * (three[0] - one[0]) >= (three[1] - one[1]) * (two[0] - one[0])

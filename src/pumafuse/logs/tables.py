@@ -93,12 +93,17 @@ def read(
             f"{path}: a table has no {key}; leave the key out: 'topic' is for MCAP and bags (.mcap, .bag, .db3 or"
             " their folder), 'entity' for .rrd; rows are chosen by 'where'"
         )
-    with _one_line(path):
+    with one_line(path):
         if path.suffix == ".parquet":
             (table, names), notes = _parquet(path, listed, where), list[str]()
         else:
             choice = None if fields is None else partial(_asked, path, fields=fields, where=where)
-            whole, names, notes = _of_several(path, topic, choice) if of_several else _of_text(path, growing, choice)
+            if not of_several:
+                whole, names, notes = _of_text(path, growing, choice)
+            elif isinstance(whole := formats.table(path, topic), bytes):
+                whole, names, notes = _of_csv(path, whole, choice)
+            else:
+                names, notes = whole.column_names, []
             table = _only(path, whole, where)
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
@@ -122,13 +127,25 @@ def meets(table: Table, where: Where) -> BoolArray:
     return found
 
 
+def chosen(table: Table, where: Where) -> Table:
+    """The rows of a table in which each of some columns has a value.
+
+    Raises:
+        RunError: There is none, or a column is absent or never has such a value.
+    """
+    if not where:
+        return table
+    rows = _only(table.path, pa.table(dict(table.columns)), where)
+    return replace(table, columns=_named(rows), rows=rows.num_rows)
+
+
 def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
     """A Parquet table, some rows at a time; see :func:`read`.
 
     Raises:
         RunError: The file cannot be read.
     """
-    with _one_line(path), _opened(path) as file:
+    with one_line(path), _opened(path) as file:
         names = tuple(file.schema.column(place).path for place in range(len(file.schema)))
         wanted, empty = _wanted(path, file, fields, {})
         for part in _parts(file, wanted, None) if file.metadata.num_rows else [empty]:
@@ -172,7 +189,7 @@ def appending(path: Path) -> Generator[Callable[[pa.Table], None]]:
 
 
 @contextmanager
-def _one_line(path: Path) -> Generator[None]:
+def one_line(path: Path) -> Generator[None]:
     """Turn what pyarrow raises while it reads a table into an error of one line."""
     try:
         yield
@@ -200,29 +217,11 @@ def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None
     asked = None if fields is None else [*fields, *where]
     found = recordings.read(path, name, None if asked is None else prefixes(asked))
     _asked(path, found.names, fields=asked or (), where={})
-    if not where:
-        return found
-    table = _only(path, pa.table(dict(found.columns)), where)
-    return replace(found, columns=_named(table), rows=table.num_rows)
-
-
-def _text(path: Path) -> bytes:
-    """What a CSV file holds, decompressed."""
-    with pa.input_stream(str(path)) as stream:
-        content = stream.read(_MOST_TEXT + 1)
-    if not content:
-        raise RunError(f"{path}: the file is empty")
-    if len(content) > _MOST_TEXT:
-        raise RunError(f"{path}: more than {_MOST_TEXT >> 30} GB of text; as Parquet it is read some rows at a time")
-    return content
+    return chosen(found, where)
 
 
 def _asked(path: Path, names: Sequence[str], *, fields: Sequence[str] | Choice, where: Where) -> list[str]:
-    """The names of columns, whole or to a field, that have to be read.
-
-    Raises:
-        UnknownNameError: A field is absent: that is reported now, while all names are known.
-    """
+    """The names of columns, whole or to a field, that have to be read."""
     asked, known = [*(fields(names) if callable(fields) else fields), *where], set(names)
     for one in asked:
         if longest(known, one) is None:
@@ -230,15 +229,15 @@ def _asked(path: Path, names: Sequence[str], *, fields: Sequence[str] | Choice, 
     return prefixes(asked)
 
 
-def _of_several(path: Path, name: str, choice: Choice | None) -> _Text:
-    """A table of a file that may have several."""
-    found = formats.table(path, name)
-    return _of_csv(path, found, choice) if isinstance(found, bytes) else (found, found.column_names, [])
-
-
 def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
     """The table in a text; lines with the wrong number of cells, and a torn last line, are left out and noted."""
-    text, notes = _text(path), list[str]()
+    notes = list[str]()
+    with pa.input_stream(str(path)) as stream:  # decompressed
+        text = stream.read(_MOST_TEXT + 1)
+    if not text:
+        raise RunError(f"{path}: the file is empty")
+    if len(text) > _MOST_TEXT:
+        raise RunError(f"{path}: more than {_MOST_TEXT >> 30} GB of text; as Parquet it is read some rows at a time")
     if growing and b"\n" in text and not text.endswith((b"\n", b"\r")) and path.suffix not in _COMPRESSED:
         text = text[: text.rindex(b"\n") + 1]
         torn = "the last line has no end and may be torn: left out (if it is whole, end it with a line break)"
@@ -369,9 +368,6 @@ def _short_header(
     """The layout of a text whose header lacks one name, and a note; None of any other.
 
     R leaves out that of its row names, in quotes in front. Rows that count without quotes may be either.
-
-    Raises:
-        RunError: It cannot be told which name is missing.
     """
     if {one.actual_columns for one in rows} != {len(names) + 1}:
         return None
@@ -389,24 +385,17 @@ def _short_header(
 class _Layout(NamedTuple):
     """How a CSV text is laid out.
 
-    Attributes:
-        separator: Between cells; a blank stands for any number of them.
-        point: Of decimals: ``1,5;2`` as well as ``1.5,2``.
-        skipped: Lines above the header; with it where ``names`` are given.
-        names: Of the columns, where the header is a comment (``# t x y``) or several lines (Position above X, Y, Z), or
-            there is none, or they are many.
-        units: Whether a line with units is below the header.
-        above: How many of the lines above are no comments and not blank.
-        broken: Whether cells in quotes go on in the next line.
+    ``names`` are given where the header is a comment (``# t x y``) or several lines (Position above X, Y, Z), or there
+    is none, or they are many.
     """
 
-    separator: str
-    point: str
-    skipped: int
+    separator: str  # between cells; a blank stands for any number of them
+    point: str  # of decimals: 1,5;2 as well as 1.5,2
+    skipped: int  # lines above the header; with it where names are given
     names: list[str] | None
-    units: bool
-    above: int
-    broken: bool
+    units: bool  # whether a line with units is below the header
+    above: int  # how many of the lines above are no comments and not blank
+    broken: bool  # whether cells in quotes go on in the next line
 
 
 def _layout(text: bytes) -> _Layout:
@@ -425,9 +414,12 @@ def _layout(text: bytes) -> _Layout:
     separator = _separator(lines[first])
     header = -1 if _is_headless(lines, first, separator) else _header(lines, full)
     rows = next((n for n in full if n > header), header)
-    if header < 0 or (first < header < rows and _is_other(lines, header, rows)):
-        separator = _separator(lines[rows])
-        names = list(map(_column, range(len(_cells(lines[rows], separator)))))
+    of_rows = _separator(lines[rows])
+    width = len(_cells(lines[rows], of_rows))
+    # What stands above rows of numbers and has another number of cells is no header of theirs.
+    is_other = first < header < rows and _begins(lines, rows, of_rows) and len(_cells(lines[header], of_rows)) != width
+    if header < 0 or is_other:
+        separator, names = of_rows, list(map(_column, range(width)))
         above = sum(n < rows for n in full)
         return _Layout(separator, _point(text, separator), rows, names, units=False, above=above, broken=broken)
     separator = _separator(lines[header])
@@ -478,10 +470,9 @@ def _header(lines: Sequence[str], full: Sequence[int]) -> int:
 
 
 def _told_apart(lines: Sequence[str], header: int, separator: str) -> tuple[int, list[str] | None]:
-    """Names of which some are the same, with those in the lines above them: X, Y, Z of a Rotation and of a Position.
+    """The first line that names are from, and these; None where the header has them all.
 
-    Returns:
-        The first line that names are from, and the names; None where the header has them all.
+    Those that are the same have the ones above before them: X, Y, Z of a Rotation and of a Position.
     """
     top, names = header, _cells(lines[header], separator)
     while top > 0 and len(set(names)) < len(names):
@@ -513,14 +504,6 @@ def _is_headless(lines: Sequence[str], first: int, separator: str) -> bool:
         map(_NUMBER.fullmatch, (one for one, other in zip(row, below, strict=True) if _NUMBER.fullmatch(other)))
     )
     return alike and row != list(map(str, range(len(row))))
-
-
-def _is_other(lines: Sequence[str], header: int, rows: int) -> bool:
-    """Whether what stands above rows of numbers is no header of theirs, as it has another number of cells."""
-    separator = _separator(lines[rows])
-    return _begins(lines, rows, separator) and len(_cells(lines[header], separator)) != len(
-        _cells(lines[rows], separator)
-    )
 
 
 def _column(place: int) -> str:
@@ -566,7 +549,7 @@ def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa
         groups = [
             place for place in range(file.num_row_groups) if _may_hold(file.metadata.row_group(place), conditions)
         ]
-        kept = [_chosen(path, part, conditions) for part in _parts(file, wanted, groups)]
+        kept = [part.filter(_met(path, part, conditions)) if where else part for part in _parts(file, wanted, groups)]
         if where and not any(part.num_rows for part in kept):
             raise _no_row(path, _parts(file, prefixes(list(where)), None), where)
         names = [file.schema.column(place).path for place in range(len(file.schema))]
@@ -585,11 +568,7 @@ def _opened(path: Path) -> papq.ParquetFile:
 def _wanted(
     path: Path, file: papq.ParquetFile, fields: Sequence[str] | None, where: Where
 ) -> tuple[list[str] | None, pa.Table]:
-    """Which columns have to be read, None: all; and the table of these without rows.
-
-    Raises:
-        RunError: A field is absent: that is reported now, while all names are known.
-    """
+    """Which columns have to be read, None: all; and the table of these without rows."""
     schema = file.schema_arrow
     wanted = None if fields is None else _asked(path, schema.names, fields=fields, where=where)
     if wanted is not None:
@@ -611,54 +590,36 @@ def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] 
 
 def _filterable(table: pa.Table) -> pa.Table:
     """A table with plain text for text in views, as polars writes it: pyarrow cannot filter these."""
-    for place, field in enumerate(table.schema):
-        if pa.types.is_string_view(field.type):
-            table = table.set_column(place, field.name, table.column(place).cast(pa.string()))
-    return table
+    kinds = [one.with_type(pa.string()) if pa.types.is_string_view(one.type) else one for one in table.schema]
+    return table.cast(pa.schema(kinds))
 
 
 def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
-    """The rows of a table that ``where`` chooses.
-
-    Raises:
-        RunError: There is none.
-    """
-    chosen = _chosen(path, whole, _conditions(path, whole, where))
+    """The rows of a table that ``where`` chooses."""
+    chosen = whole.filter(_met(path, whole, _conditions(path, whole, where))) if where else whole
     if where and not chosen.num_rows:
         raise _no_row(path, [whole], where)
     return chosen
 
 
 def _conditions(path: Path, table: pa.Table, where: Where) -> dict[str, pa.Scalar]:
-    """What the columns of ``where`` are compared with.
-
-    Raises:
-        RunError: A column is absent, or of a type that cannot have such a value.
-    """
-    columns = _named(table)
-    return {name: _like(path, name, find(columns, name, str(path)).type, value) for name, value in where.items()}
-
-
-def _like(path: Path, name: str, kind: pa.DataType, value: bool | float | str) -> pa.Scalar:
-    """A value to compare a column of a type with."""
-    numeric = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind)
-    if isinstance(value, str) and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
-        return pa.scalar(value, kind)
-    if isinstance(value, bool) and pa.types.is_boolean(kind):
-        return pa.scalar(value)
-    if not isinstance(value, str | bool) and numeric:
-        # In the column's own precision: 0.1 is found among float32, too.
-        return pa.scalar(value, kind) if pa.types.is_floating(kind) else pa.scalar(value)
-    raise RunError(f"{path}: where: column '{shortened(name)}' holds {shortened(str(kind))}, never {_written(value)}")
-
-
-def _chosen(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.Table:
-    """The rows of a table that meet all conditions; what is null meets none."""
-    return rows.filter(_met(path, rows, conditions)) if conditions else rows
+    """What the columns of ``where`` are compared with: in their own precision, 0.1 is found among float32, too."""
+    columns, found = _named(table), dict[str, pa.Scalar]()
+    for name, value in where.items():
+        kind = find(columns, name, str(path)).type
+        text, floating = pa.types.is_string(kind) or pa.types.is_large_string(kind), pa.types.is_floating(kind)
+        of_type = pa.types.is_integer(kind) or floating or pa.types.is_decimal(kind)
+        if isinstance(value, str | bool):
+            of_type = text if isinstance(value, str) else pa.types.is_boolean(kind)
+        if not of_type:
+            what = f"column '{shortened(name)}' holds {shortened(str(kind))}, never {_written(value)}"
+            raise RunError(f"{path}: where: {what}")
+        found[name] = pa.scalar(value, kind) if text or floating else pa.scalar(value)
+    return found
 
 
 def _met(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.ChunkedArray:
-    """Which rows of a table meet all conditions."""
+    """Which rows of a table meet all conditions; what is null meets none."""
     columns = _named(rows)
     met = [pc.equal(find(columns, name, str(path), part=True), value) for name, value in conditions.items()]
     return reduce(pc.and_, met)
@@ -684,25 +645,19 @@ def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
             known = sorted(found)
             held[name] = known[:_SOME] if isinstance(where[name], str) else known[:1] + known[1:][-1:]
     wanted = " and ".join(f"{shortened(name)} = {_written(value)}" for name, value in where.items())
-    ranges = ", ".join(f"{shortened(name)} {_held(values)}" for name, values in held.items())
-    return RunError(f"{path}: no row has {wanted}; in this file {ranges}")
-
-
-def _held(values: Sequence[Any]) -> str:
-    """Which values a column holds, by its least and its greatest number, or by some of its texts."""
-    if not values:
-        return "has no value"
-    if isinstance(values[0], str):
-        return f"is {', '.join(map(_written, values))}{', …' if len(values) == _SOME else ''}"
-    first, last = _written(values[0]), _written(values[-1])
-    return f"is {first}" if first == last else f"goes from {first} to {last}"
+    ranges = list[str]()
+    for name, values in held.items():
+        said = list(map(_written, values))
+        words = f"is {', '.join(said)}{', …' if len(said) == _SOME else ''}" if said else "has no value"
+        if len(set(said)) > 1 and not isinstance(where[name], str):
+            words = f"goes from {said[0]} to {said[-1]}"
+        ranges.append(f"{shortened(name)} {words}")
+    return RunError(f"{path}: no row has {wanted}; in this file {', '.join(ranges)}")
 
 
 def _written(value: Any) -> str:
     """A value as it is written in run.toml."""
-    return shortened(
-        str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, str) else str(value)
-    )
+    return shortened(repr(value) if isinstance(value, str) else str(value).lower())
 
 
 def _named(table: pa.Table) -> dict[str, pa.ChunkedArray]:

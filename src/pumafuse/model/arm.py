@@ -14,12 +14,13 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
-from ..toml import Interval, Positive, Time
-from ..units import AN, KINDS, MM, MS, SCREEN, Kind, Screen, refuse_name
+from ..toml import Interval, NotNegative, Positive, Time
+from ..units import AN, KINDS, MM, MS, SCREEN, Kind, Screen, of_kind, refuse_name
 from .plants import PLANTS, Delay
 from .presets import PRESETS
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")
+Slope = Annotated[float, msgspec.Meta(gt=-1, le=1e3)]  # at -1 or less a tool would go backwards, at 1000 run away
 _EXCEEDED = 1.005  # share of a limit from which two decimals show that it is exceeded
 
 
@@ -43,6 +44,33 @@ class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         return self.slope * speed + self.intercept
 
 
+class Sag(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How far a static load holds the tool off, by its position p as commanded: a line, or one in two pieces.
+
+    Attributes:
+        offset: At p = 0 [m or rad], along the line that holds there below the knee.
+        slope: What each 1 of p adds.
+        knee: The p [m or rad] above which another slope holds; None: none does.
+        slope_beyond: The slope there.
+    """
+
+    offset: float = msgspec.field(name="offset_mm", default=0.0)
+    slope: Slope = 0.0
+    knee: float | None = msgspec.field(name="knee_mm", default=None)
+    slope_beyond: Slope | None = None
+
+    def __post_init__(self) -> None:
+        if (self.knee is None) != (self.slope_beyond is None):
+            raise ConfigError("sag: a knee and slope_beyond belong together")
+
+    def at(self, position: FloatArray) -> FloatArray:
+        """Off by how much [m or rad] at positions as commanded; the shape of ``position``."""
+        line = self.offset + self.slope * position
+        if self.knee is None or self.slope_beyond is None:
+            return line
+        return line + (self.slope_beyond - self.slope) * np.maximum(position - self.knee, 0.0)
+
+
 class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model of one axis.
 
@@ -52,6 +80,9 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         gain: The gain over speed, which acts on the command before the plant.
         gain_recovery: Time constant [s] with which the gain error decays, by the servo's integral action; None: never.
         gain_recovery_ci95: Its 95 % interval [s], if it was fitted.
+        max_speed: The fastest that the axis itself goes [m/s or rad/s]; None: as fast as it is asked to.
+        play: Width of the backlash between drive and tool [m or rad].
+        sag: How far a static load holds the tool off.
         delay: Dead time [s] of this axis if it differs from the arm's.
         delay_ci95: Its 95 % interval [s], if it was fitted.
         lag_ci95: The 95 % interval of :meth:`lag` at slow motion [s], if it was fitted: delay and plant make up for
@@ -63,6 +94,9 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     gain: Gain = Gain()
     gain_recovery: Time | None = msgspec.field(name="gain_recovery_ms", default=None)
     gain_recovery_ci95: Interval | None = msgspec.field(name="gain_recovery_ms_ci95", default=None)
+    max_speed: Positive | None = msgspec.field(name="max_speed_mm_s", default=None)
+    play: NotNegative = msgspec.field(name="play_mm", default=0.0)
+    sag: Sag | None = None
     delay: Delay | None = msgspec.field(name="delay_ms", default=None)
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
     lag_ci95: Interval | None = msgspec.field(name="lag_ms_ci95", default=None)
@@ -174,12 +208,15 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def _check(self, name: str, axis: AxisModel) -> None:
         """Refuse numbers that no file may have: an arm may be made in Python, too."""
         plant = [one for one in msgspec.structs.astuple(axis.plant) if isinstance(one, float | int)]
-        positive = (self.update_period, 1.0 if axis.gain_recovery is None else axis.gain_recovery, *plant)
-        delays = self.delay, 0.0 if axis.delay is None else axis.delay
-        if not math.isfinite(sum(positive) + sum(delays) + axis.gain.slope + axis.gain.intercept):
-            raise ConfigError(f"axes.{name}: period, delay, plant and gain must be finite")
-        if min(positive) <= 0.0 or min(delays) < 0.0:
-            raise ConfigError(f"axes.{name}: period, plant and recovery must be > 0, the delay >= 0")
+        optional = [1.0 if one is None else one for one in (axis.gain_recovery, axis.max_speed)]
+        positive = self.update_period, *optional, *plant
+        not_negative = self.delay, 0.0 if axis.delay is None else axis.delay, axis.play
+        if not math.isfinite(sum(positive) + sum(not_negative) + axis.gain.slope + axis.gain.intercept):
+            raise ConfigError(f"axes.{name}: period, delay, plant, gain, fastest speed and play must be finite")
+        if min(positive) <= 0.0 or min(not_negative) < 0.0:
+            raise ConfigError(
+                f"axes.{name}: period, plant, recovery and fastest speed must be > 0, delay and play >= 0"
+            )
         for key, ci95 in {"lag_ms_ci95": axis.lag_ci95, "gain.intercept_ci95": axis.gain.intercept_ci95}.items():
             if ci95 is not None and not ci95[0] <= ci95[1]:
                 raise ConfigError(f"axes.{name}.{key}: an interval has its lower end first, then its upper end")
@@ -306,8 +343,9 @@ def _axis(table: Any, where: str, path: str) -> AxisModel:
         raise ConfigError(f"{where}: {path}.plant: unknown plant '{name}'; {suggestion(name, plants)}")
     plant = [field.encode_name for field in msgspec.structs.fields(plants[name])]
     kind: Kind = "angle" if keys.get("kind") == "angle" else "length"
-    accepted = dict.fromkeys(["plant", *plant, *(field.encode_name for field in msgspec.structs.fields(AxisModel))])
-    for key in keys.keys() - accepted.keys():
+    own = [field.encode_name for field in msgspec.structs.fields(AxisModel)]
+    accepted = dict.fromkeys(["plant", *plant, *(of_kind(key, kind) for key in own)])
+    for key in keys.keys() - accepted.keys() - {of_kind(key, other) for key in own for other in KINDS}:
         raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, accepted)}")
     parameters = {key: keys.pop(key) for key in plant if key in keys}
     made = toml.struct(parameters, plants[name], where, path)

@@ -46,7 +46,8 @@ def arm_of(runs: Sequence[Run], found: Mapping[str, Registration]) -> FusionConf
         axes=axes,
     )
     sensors = {name: Sensor(sd=max(one.rms or 0.0, SD_BOUNDS[0])) for name, one in found.items()}
-    return FusionConfig(arm=arm, sensors=sensors, tool=None if tool is None else Tool(reference=tool))
+    turned = None if tool is None else Tool(reference=tool)
+    return FusionConfig(arm=arm, sensors=sensors, tool=turned, robot=runs[0].robot)
 
 
 def configuration(
@@ -77,7 +78,8 @@ def configuration(
     known = {axis: one for axis, one in config.arm.axes.items() if axis in guessed.arm.axes}
     arm = msgspec.structs.replace(guessed.arm, delay=config.arm.delay, axes={**guessed.arm.axes, **known})
     start = Start(offset_sd=offsets)
-    return msgspec.structs.replace(guessed, arm=arm, tool=config.tool, sensors=sensors, start=start)
+    guessed = msgspec.structs.replace(guessed, tool=config.tool, robot=config.robot)
+    return msgspec.structs.replace(guessed, arm=arm, sensors=sensors, start=start)
 
 
 def placed_by(

@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import msgspec
 
-from ..units import DEG
+from ..units import DEG, MS
 
 Vector: TypeAlias = tuple[float, float, float]
 
@@ -27,6 +27,7 @@ class Finding(enum.Enum):
     READING = "reading"  # an orientation follows if it is read in another way
     ATTITUDE = "attitude"  # orientations are told in another frame than positions
     ATTITUDE_UNRELATED = "attitude-unrelated"  # orientations follow in no way
+    AHEAD = "ahead"  # it moves before an arm can that holds each command
     ALONG_BASE = "along-base"  # the frame is the base's, as nearly as an arm tells
 
 
@@ -47,8 +48,8 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         finding: What it is.
-        size: SHORT: how long [s]; UNRELATED: correlation of speeds; UNEXPLAINED: share of the motion; SCALE: the base's
-            lengths over the sensor's; ATTITUDE: the angle between the frames [rad].
+        size: SHORT: how long [s]; AHEAD: by how much [s]; UNRELATED: correlation of speeds; UNEXPLAINED: share of the
+            motion; SCALE: the base's lengths over the sensor's; ATTITUDE: the angle between the frames [rad].
         axis: LINE: in the base; ONE_AXIS: on the tool.
         source: READING: whose, command or sensor.
         reading: READING: how it follows.
@@ -113,6 +114,11 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
             case Finding.ATTITUDE_UNRELATED:
                 unit = f"; {self.unit} (run.toml)" if self.unit else ""
                 what = f"tells orientations that do not follow the commanded ones: they are not used{unit}"
+            case Finding.AHEAD:
+                what = (
+                    f"moves {size * MS:.1f} ms before an arm can that holds each command: are these samples of a path"
+                    " (interpolation_ms in run.toml), or is a clock off (shift_s)?"
+                )
             case Finding.ALONG_BASE:
                 what = "measures along the base's axes, as far as the motion tells: no frame is written"
         return f"{sensor} {what}"

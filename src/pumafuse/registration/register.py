@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, median
 from ..fusion.config import Placement
 from ..space.rotations import crossed, left_jacobian
 from ..toml import Interval
@@ -24,7 +24,10 @@ from .start import Rough, aligned_turns, despiked, kabsch, ratio, read, rough, u
 _SETTLED = 6.0  # rough lags after the first command: how the arm moved before is forgotten
 _AT_LEAST, _FEWEST = 5.0, 60  # s and rows of a sensor beside commands
 _ROWS, _COARSE = 8000, 1000  # that are looked at, evenly, in the end and to begin with
-_DEAD = 0.6  # of the lag, to begin with
+_DEAD, _SMOOTH = 0.6, 0.02  # of the lag, to begin with; s: a shorter τ is stuck among the steps of held commands
+_MANY_AT_REST = 0.25  # of the rows
+_GAP = 5.0  # usual intervals of the commands, from which one is a gap
+_AROUND_ROW, _RESTS, _AGAIN = 0.25, 0.02, 1.0  # s; of the speed of the motion; s, within which a rest counts once
 _FOLLOWS, _MOVES = 0.3, 0.8  # correlation of speeds: it may follow; it surely moves with the tool
 _LEFT = 0.5  # of what a sensor saw, which no frame explains: it does not move with the tool
 _WELL = 0.03  # likewise: a frame explains it
@@ -158,7 +161,8 @@ def registered(
     about = rough(told, seen)
     if about.correlation < _FOLLOWS:
         return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
-    seen = [within(b, a.time, _SETTLED * max(about.lag, 0.0)) for a, b in both]
+    settling = _SETTLED * max(about.lag, 0.0)
+    seen = [news(a, without_gaps(a.time, within(b, a.time, settling), settling)) for a, b in both]
     begun = _begun(told, seen, about, marker or Placement(), fix_marker, loosely)
     return _fitted(begun, fix_marker, loosely)
 
@@ -168,6 +172,39 @@ def within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
     if not len(given):
         return sensor.only(np.zeros(0, np.int64))
     return sensor.only((sensor.time >= given[0] + settling) & (sensor.time <= given[-1]))
+
+
+def without_gaps(given: FloatArray, sensor: Motion, settling: float) -> Motion:
+    """What a sensor told, but for gaps of the commands: where the tool was told to be then is not known.
+
+    Args:
+        given: When commands came [s], (n,).
+        sensor: What it told.
+        settling: For how long [s] after a gap the tool may still move as was told in it.
+    """
+    interval = np.diff(given)
+    usual, lost = median(interval), np.zeros(len(sensor.time), dtype=np.bool_)
+    for row in np.flatnonzero(interval > _GAP * usual).tolist():
+        lost |= (sensor.time > given[row] + usual) & (sensor.time < given[row + 1] + settling)
+    return sensor.only(~lost) if np.count_nonzero(~lost) >= _FEWEST else sensor
+
+
+def news(command: Motion, sensor: Motion) -> Motion:
+    """What a sensor told; where much of it was at rest, that around a motion of the commands, and now and then at rest.
+
+    Rows at rest say the same again. Where they are many, what one pose errs by would decide, and rows in motion, which
+    alone tell a lag, would be the outliers.
+    """
+    ends = [sensor.time - _AROUND_ROW, sensor.time + _AROUND_ROW]
+    before, after = (np.clip(np.searchsorted(command.time, one, side="right") - 1, 0, None) for one in ends)
+    moved = np.linalg.norm(command.position[after] - command.position[before], axis=1)
+    if command.quaternion is not None:
+        turned = Rotation.from_quat(command.quaternion)
+        moved += _LEVER * (turned[after] * turned[before].inv()).magnitude()
+    moving = moved >= _RESTS * float(moved @ moved) / max(float(moved.sum()), 1e-300)  # the mean over the path
+    kept = moving | (np.diff(sensor.time // _AGAIN, prepend=-np.inf) > 0.0)
+    many = np.count_nonzero(~moving) > _MANY_AT_REST * len(moving)
+    return sensor.only(kept) if many and np.count_nonzero(kept) >= _FEWEST else sensor
 
 
 def thinned(sensor: Sequence[Motion], rows: int) -> list[Motion]:
@@ -308,14 +345,15 @@ def _coarse(
     begin = State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant)
     held, free = (_free(np.eye(3), markers, turn=False, scale=one, own=False) for one in (False, moves))
     nearer = fitted(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
-    again = _plant(nearer.position.lag)  # a short τ from far away may be stuck among the steps of held commands
+    again = _plant(nearer.position.lag)
     both = (fitted(rows, one, free) for one in (begin, nearer._replace(position=again, angle=again)))
     return min(both, key=lambda one: one.left() / one.state.scale)
 
 
 def _plant(lag: float) -> Plant:
     """A plant to begin with."""
-    return Plant(_DEAD * lag, max((1.0 - _DEAD) * lag, 1e-3))
+    time_constant = max((1.0 - _DEAD) * lag, _SMOOTH)
+    return Plant(lag - time_constant, time_constant)
 
 
 def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -550,6 +588,7 @@ def _told(
     noise = fit.off.rms()
     turned = values[3:6] - loose @ (loose.T @ values[3:6])
     along = is_here(state.centre - begin.mean, turned)
+    ahead = [Found(finding=Finding.AHEAD, size=-position.lag.value)] if position.lag.ci95[1] < 0.0 else []
     return Registration(
         frame=_registered(told[:6]),
         marker=_registered(told[6:12]),
@@ -559,7 +598,7 @@ def _told(
         noise=_jitter(begin.sensor),
         rms_rotation=noise[1] if begin.attitude else None,
         rows=len(fit.off.blocks[0]),
-        findings=(*begin.findings, *([Found(finding=Finding.ALONG_BASE)] if along else [])),
+        findings=(*begin.findings, *ahead, *([Found(finding=Finding.ALONG_BASE)] if along else [])),
     )
 
 

@@ -16,7 +16,7 @@ from ..discovery.own_frames import own_frames
 from ..errors import ConfigError, PumafuseWarning, RunError, UnknownNameError
 from ..fusion.config import FusionConfig
 from ..fusion.placing import with_tool
-from ..logs.clock import without_strays
+from ..logs.clock import missing_commands, without_strays
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run
 from ..model.arm import Joint
@@ -145,6 +145,9 @@ def register(
     joints = _joints([complete(run) for run in every], names) if config is None else config.arm.joints
     config = config and with_joints(config, {})  # they are heeded in the commands from here on
     later = {name: joint.later for name, joint in joints.items()}
+    for run in every:
+        if missing := missing_commands(run.command):
+            notes.append(f"run '{run.name}': {missing}: what sensors saw in a gap is not used")
     every = [replace(run, command=run.command.delayed(later)) for run in every]
     whole = [complete(run) for run in every]
     found = {name: _registered(whole, name, config, fixed="marker" in fixed) for name in names}

@@ -5,11 +5,15 @@ event, the gain error e decays as exp(−bt) with b = 1 / recovery, so that over
 
     z⁺ = e^(pΔ) z + (e^(pΔ) − 1)/p · u + (e^(pΔ) − e^(−bΔ))/(p + b) · e + ∫ e^(p(Δ−s)) dW(s).
 
+A drive with a fastest speed is no sum of poles: what the commands make of it is integrated (:func:`_limited`), and the
+noise moves it as it moves the plant below that speed.
+
 Nothing of the filter's discretisation is used here: the filter is tested against this.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import accumulate
 
@@ -55,6 +59,7 @@ def simulate_axis(
     command: FloatArray,
     period: float,
     rng: np.random.Generator,
+    start: float = 0.0,
 ) -> Motion:
     """Simulate the motion of one axis through its commands.
 
@@ -66,6 +71,7 @@ def simulate_axis(
         command: Relative to the start level [m], (n,).
         period: T [s].
         rng: Draws everything random of this axis.
+        start: The start level [m], for its sag.
 
     Returns:
         The motion, exact on the grid, until one period after the last command.
@@ -101,11 +107,18 @@ def simulate_axis(
             continue  # its conjugate stands for both
         share = residue if pole.imag == 0.0 else 2.0 * residue
         response = np.exp(pole * 0.5 * (node + 1.0) * distinct[:, None])[place]
-        forced = _response(pole, 0.0, distinct)[place] * level + _response(pole, -decay_rate, distinct)[place] * error
+        forced = np.zeros(len(interval), dtype=np.complex128)
+        if axis.max_speed is None:
+            forced = _response(pole, 0.0, distinct)[place] * level
+            forced = forced + _response(pole, -decay_rate, distinct)[place] * error
         forced += np.einsum("ij,ij->i", response, white)
         position[1:] += (share * sum_of_decays(np.exp(pole * distinct)[place], forced)).real
+    if axis.max_speed is not None:
+        position[1:] += _limited(axis, axis.max_speed, time, level, error, decay_rate)
 
-    position = _backlash(position, axis.backlash)
+    position = _backlash(position, axis.backlash or 0.0)
+    if axis.sag is not None:
+        position += axis.sag.at(start + position)
     position[1:] += np.cumsum(np.sqrt(drift * interval) * noises[2].standard_normal(len(interval)))
     position += offset_sd * noises[3].standard_normal()
     if process.disturbance_sd:
@@ -185,6 +198,45 @@ def _events(acting: TimeArray, instants: TimeArray, fastest: float) -> TimeArray
     finer = np.arange(0, end if longest < instants[1] else 0, longest, dtype=np.int64)
     time = np.sort(np.concatenate((acting[acting <= end], instants, finer)), kind="stable")  # merges what ascends
     return time[np.diff(time, prepend=-1) > 0]
+
+
+def _limited(
+    axis: TrueAxis, max_speed: float, time: TimeArray, level: FloatArray, error: FloatArray, decay_rate: float
+) -> FloatArray:
+    """Where a drive with a fastest speed is, from what its input is from each instant to the next [m].
+
+    It is asked for the speed that takes back the gap within the plant's lag, but for no more than the fastest. A plant
+    of second order follows that with the time constant 1/(2ζω).
+
+    Args:
+        axis: The true axis.
+        max_speed: The fastest [m/s].
+        time: Int64 ns, (k + 1,).
+        level: What is constant of the input from each instant on, (k,).
+        error: What decays, as it is at that instant, (k,).
+        decay_rate: How fast [1/s].
+
+    Returns:
+        The position at all instants but the first [m], (k,).
+    """
+    from scipy.integrate import odeint
+
+    plant, late = axis.plant, axis.extra_pole
+    follows = None if isinstance(plant, FirstOrder) else 2.0 * plant.damping * plant.natural_frequency
+
+    def rates(state: FloatArray, t: float, u: float, e: float) -> list[float]:
+        x, speed, behind = state.tolist()
+        asked = min(max((u + e * math.exp(-decay_rate * t) - x) / plant.lag, -max_speed), max_speed)
+        moves = [asked, 0.0] if follows is None else [speed, follows * (asked - speed)]
+        return [*moves, 0.0 if late is None else (x - behind) / late]
+
+    state, position = np.zeros(3), np.empty(len(level))
+    begins = np.flatnonzero(np.diff(level, prepend=np.nan) != 0.0)  # elsewhere the input goes on as it did
+    for begin, end in zip(begins.tolist(), [*begins[1:].tolist(), len(level)], strict=True):
+        since = (time[begin : end + 1] - time[begin]) / 1e9
+        solved = odeint(rates, state, since, (level[begin], error[begin]), rtol=1e-9, atol=1e-12)
+        position[begin:end], state = solved[1:, 0 if late is None else 2], solved[-1]
+    return position
 
 
 def _backlash(position: FloatArray, width: float) -> FloatArray:

@@ -80,7 +80,8 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
     for axis, command in commands.items():
         process, draws = scenario.process.get(axis, PROCESS[scenario.arm.axes[axis].kind]), _stream(seed, "axis", axis)
         offset_sd = of_axis(scenario.start.offset_sd, axis)
-        motions[axis] = simulate_axis(true_axes[axis], process, offset_sd, tick, command, period, draws)
+        level = scenario.start.level.get(axis, 0.0)
+        motions[axis] = simulate_axis(true_axes[axis], process, offset_sd, tick, command, period, draws, level)
 
     sensors: dict[str, Source] = {}
     for name, sensor in scenario.sensors.items():

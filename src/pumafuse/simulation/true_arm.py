@@ -10,7 +10,7 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError
-from ..model.arm import AxisModel, Gain
+from ..model.arm import AxisModel, Gain, Sag
 from ..model.plants import PLANTS, FirstOrder, SecondOrder
 from ..toml import NotNegative, Positive
 
@@ -29,13 +29,13 @@ class GainCurve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class Imperfections(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a true axis does that no arm model has.
+    """What a true axis does that no arm model has, but for play.
 
     Attributes:
         delay_jitter: Standard deviation of each command's own Td [s]; commands do not overtake one another.
         gain_curve: K as a curve over speed, instead of the gain's line.
         extra_pole: Time constant of a lag in series with the plant [s].
-        backlash: Width of the play between plant and tool [m].
+        backlash: Width of the play between plant and tool [m]; None: the model's.
         stiction: When a command acts, the drive goes to its input (command and gain error) if that is farther away
             than this [m]; it holds its place until the next command.
         slow_drift: Amplitude of a slow sine on the position, as of warming up [m].
@@ -45,7 +45,7 @@ class Imperfections(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     delay_jitter: NotNegative = msgspec.field(name="delay_jitter_ms", default=0.0)
     gain_curve: GainCurve | None = None
     extra_pole: Positive | None = msgspec.field(name="extra_pole_ms", default=None)
-    backlash: NotNegative = msgspec.field(name="backlash_mm", default=0.0)
+    backlash: NotNegative | None = msgspec.field(name="backlash_mm", default=None)
     stiction: NotNegative = msgspec.field(name="stiction_mm", default=0.0)
     slow_drift: NotNegative = msgspec.field(name="slow_drift_mm", default=0.0)
     slow_drift_period: Positive = msgspec.field(name="slow_drift_period_s", default=600.0)
@@ -59,12 +59,16 @@ class TrueAxis(Imperfections, frozen=True, kw_only=True):
         gain: K as a line over speed.
         gain_recovery: Time constant [s] with which the gain error decays; None: it stays.
         delay: Td [s].
+        max_speed: The fastest that the plant goes [m/s or rad/s]; None: as fast as it is asked to.
+        sag: How far a static load holds the tool off.
     """
 
     plant: PLANTS
     gain: Gain
     gain_recovery: float | None
     delay: float
+    max_speed: float | None = None
+    sag: Sag | None = None
 
     def gain_at(self, speed: FloatArray) -> FloatArray:
         """K at ``speed`` [m/s]."""
@@ -84,6 +88,8 @@ class TrueArm(Imperfections, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         delay: Td [s].
         gain: K as a line over speed.
         gain_recovery: Time constant [s], or "never".
+        max_speed: The fastest that the plant goes [m/s or rad/s], or "none".
+        sag: How far a static load holds the tool off.
     """
 
     plant: Literal["first-order", "second-order"] | None = None
@@ -93,6 +99,8 @@ class TrueArm(Imperfections, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     delay: NotNegative | None = msgspec.field(name="delay_ms", default=None)
     gain: Gain | None = None
     gain_recovery: Positive | Literal["never"] | None = msgspec.field(name="gain_recovery_ms", default=None)
+    max_speed: Positive | Literal["none"] | None = msgspec.field(name="max_speed_mm_s", default=None)
+    sag: Sag | None = None
 
     def over(self, model: AxisModel, delay: float, where: str) -> TrueAxis:
         """The true axis: these differences over the ``model``, whose Td is ``delay`` [s]; errors call it ``where``.
@@ -101,12 +109,17 @@ class TrueArm(Imperfections, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             ConfigError: A parameter of the other plant is given, or one of a new plant is missing.
         """
         recovery = model.gain_recovery if self.gain_recovery is None else self.gain_recovery
+        max_speed = model.max_speed if self.max_speed is None else self.max_speed
+        imperfections = {name: getattr(self, name) for name in Imperfections.__struct_fields__}
+        imperfections["backlash"] = model.play if self.backlash is None else self.backlash
         return TrueAxis(
             plant=self._plant(model.plant, where),
             gain=model.gain if self.gain is None else self.gain,
             gain_recovery=None if recovery == "never" else recovery,
             delay=delay if self.delay is None else self.delay,
-            **{name: getattr(self, name) for name in Imperfections.__struct_fields__},
+            max_speed=None if max_speed == "none" else max_speed,
+            sag=model.sag if self.sag is None else self.sag,
+            **imperfections,
         )
 
     def _plant(self, model: PLANTS, where: str) -> PLANTS:

@@ -127,8 +127,8 @@ class ArmSearch:
         self._measured, self.freedom, self.sensors = measured, freedom, measured.sensors
         self._longest = longest_delay(measured.period)
         self.plain = plain_arm(measured)
-        self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS) if near is None else near.limits
-        self._fits = self._on_excerpt(least, believed) if near is None else near._fits
+        self.limits: Limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS) if near is None else near.limits
+        self._fits: dict[Model, Fit] = self._on_excerpt(least, believed) if near is None else near._fits
         peaks, branches = self._peaks(least, believed), list[Branch]()
         for evidence, model, peak in peaks:
             walked = (one for one in branches if one.model == model)

@@ -18,12 +18,12 @@ from ..arrays import FloatArray
 from ..discovery.guesses import ArmGuess, AxisGuess, Pair, SensorGuess, guess
 from ..discovery.own_frames import own_frames
 from ..discovery.roles import relations
-from ..discovery.sensors import REFERENCE, Alignment, aligned
+from ..discovery.sensors import Alignment, aligned
 from ..discovery.survey import SOONER, Survey, early, interpolation, soonest, too_early
 from ..errors import PumafuseWarning, UnknownNameError
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor, Start
 from ..logs.axes import in_axes
-from ..logs.run import Run
+from ..logs.run import REFERENCE, Run
 from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..toml import Interval
