@@ -32,8 +32,8 @@ def trials() -> pf.StepTrials:
 
 
 WRONG: dict[str, tuple[Callable[[], object], str]] = {
-    "no period": (lambda: arm(update_period=0.0), "axes.x: period, plant and recovery must be > 0"),
-    "negative delay": (lambda: arm(delay=-0.06), "the delay >= 0"),
+    "no period": (lambda: arm(update_period=0.0), "axes.x: period, plant, recovery and fastest speed must be > 0"),
+    "negative delay": (lambda: arm(delay=-0.06), "delay and play >= 0"),
     "a delay that is none": (lambda: arm(delay=math.nan), "must be finite"),
     "a gain that is none": (lambda: arm(gain=pf.Gain(intercept=math.nan)), "must be finite"),
     "negative time constant": (lambda: arm(plant=pf.FirstOrder(time_constant=-1.0)), "must be > 0"),

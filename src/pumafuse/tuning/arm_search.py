@@ -128,7 +128,7 @@ class ArmSearch:
         self._longest = longest_delay(measured.period)
         self.plain = plain_arm(measured)
         self.limits: Limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS) if near is None else near.limits
-        self._fits: dict[Model, Fit] = self._on_excerpt(least, believed) if near is None else near._fits
+        self._fits: dict[Model, Fit] = self._by_least_squares() if near is None else near._fits
         peaks, branches = self._peaks(least, believed), list[Branch]()
         for evidence, model, peak in peaks:
             walked = (one for one in branches if one.model == model)
@@ -179,15 +179,14 @@ class ArmSearch:
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
-    def _on_excerpt(self, least: Sequence[float], believed: bool) -> dict[Model, Fit]:
-        """Each model, fitted to the part with the most motion: by least squares, then under what the best one leaves.
-
-        Noise that is fitted to a poor arm explains what a better one would.
-        """
+    def _by_least_squares(self) -> dict[Model, Fit]:
+        """Each model by least squares of the most motion: noise of a poor arm explains what a better one would."""
         whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
         self.rest = Rest(np.ones(len(self.sensors)))
         self.rest = self._measured.white(self._on_grid(1)[0])
         self._fits = self._fitted(self._on_grid(_STARTS), {})
+        self.rest = self._measured.white(self.best)  # beside which what is believed of a gain weighs less
+        self._fits = self._again()
         still = {model: fit for model, fit in self._fits.items() if model.gain == "static"}
         gain = max(still.values(), key=lambda one: one.log_posterior).arm.gain if still else 1.0
         low, high = _USUAL_GAIN
@@ -195,12 +194,6 @@ class ArmSearch:
         self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
         self._measured = whole
         return self._fits
-
-    def _gate(self, arm: Arm, least: Sequence[float], believed: bool) -> None:
-        """Leave out what is far from an arm, beside the most likely rest."""
-        for _ in range(_GATED):
-            self.rest = self._likely_rest(arm, least, believed)
-            self._measured = self._measured.gated(arm, self.rest, _GATE)
 
     def _likely(self, found: Mapping[Model, Fit]) -> dict[Model, Fit]:
         """Those models that a better noise could still bring near the best."""
@@ -210,10 +203,12 @@ class ArmSearch:
 
     def _peaks(self, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
-        self._gate(self.best, least, believed)
+        for _ in range(_GATED):
+            self.rest = self._likely_rest(self.best, least, believed)
+            self._measured = self._measured.gated(self.best, self.rest, _GATE)
         self._fits = self._likely(self._fitted([self.best, *self._on_grid(1)], self._fits))
         self.rest = self._likely_rest(self.best, least, believed)
-        self._fits = self._likely({model: self._fit(model, fit.arm) for model, fit in self._fits.items()})
+        self._fits = self._likely(self._again())
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
         highest = max(one[0] for one in every)
         for evidence, model, fit in list(every) if "delay" in self.freedom.free else ():
@@ -273,6 +268,10 @@ class ArmSearch:
             there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)
             found[best] = max(found[best], self._fit(best, there), key=lambda one: one.log_posterior)
         return found
+
+    def _again(self) -> dict[Model, Fit]:
+        """Each model fitted from where it was, under another rest."""
+        return {model: self._fit(model, fit.arm) for model, fit in self._fits.items()}
 
     def _likeliest(self, model: Model, arms: Iterable[Arm], count: int) -> list[Arm]:
         """The likeliest arms of a model that are as late as others."""

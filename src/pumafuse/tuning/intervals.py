@@ -22,7 +22,7 @@ from .parameters import Parameter, coordinates, moved, rounded
 Distances: TypeAlias = tuple[float, float]  # s; to the lower and upper end of an interval, infinite where it is open
 
 _STEPS = 3  # of Fisher scoring to a point of a profile, from where its neighbours lead: more change no end by 2 %
-_SKEWED = 0.1  # relative error of the curvature's drop at an end, beyond which the profile is computed: 5 % of the way
+_SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is computed
 _CLOSE = 0.03  # relative, of √(2 drop)
 _FARTHER = 1.5  # times the distance, while an end is not yet between two
 _HALVINGS = 26
