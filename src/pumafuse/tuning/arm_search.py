@@ -103,7 +103,8 @@ class ArmSearch:
         plain: The arm of least squares; None where nothing moves.
         limits: Where its numbers may lie.
         rest: What the best arm leaves.
-        disturbed: What the rest gains by a disturbance in log-posterior, after the penalty for its numbers.
+        slow_rest: Likewise, with no disturbance that is too quick for an arm.
+        disturbed: What that gains by a disturbance in log-posterior, after the penalty for its numbers.
         posterior: All models that count, along their dead times.
     """
 
@@ -248,12 +249,13 @@ class ArmSearch:
         (without, height), *others = rests(self._measured, arm, quickest, least, believed)
         dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
         gains = [log - height - dearer + _WANDERS - _SMOOTHER * (rest.smoothness > 1.0) for rest, log in others]
-        gains = [
+        slow = [
             gain if rest.disturbance_time > _SLOWER * quickest else -np.inf
             for gain, (rest, _) in zip(gains, others, strict=True)
         ]
-        self.disturbed = max(gains)
-        return others[gains.index(self.disturbed)][0] if self.disturbed > 0.0 else without
+        self.disturbed = max(slow)
+        self.slow_rest = others[slow.index(self.disturbed)][0] if self.disturbed > 0.0 else without
+        return others[gains.index(max(gains))][0] if max(gains) > 0.0 else without
 
     def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit]) -> dict[Model, Fit]:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
@@ -262,7 +264,7 @@ class ArmSearch:
             tries = self._likeliest(model, arms, 1 if known else 2)
             tries += [known[model].arm] if known else []
             found[model] = max((self._fit(model, arm) for arm in tries), key=lambda one: one.log_posterior)
-            arms = [*starts, max(found.values(), key=lambda one: one.log_posterior).arm]
+            arms = [max(found.values(), key=lambda one: one.log_posterior).arm]
         best = max(found, key=lambda model: found[model].log_posterior)
         for ticks in _TICKS if "delay" in self.freedom.free else ():
             there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)

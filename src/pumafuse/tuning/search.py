@@ -177,7 +177,7 @@ def _with_noise(config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeO
     """The configuration with what the arms leave as its noise, as far as that is free."""
     model = disturbed = config
     for axis, search in arms.items():
-        model = with_rest(model, axis, search.rest, search.sensors)
+        model = with_rest(model, axis, search.slow_rest, search.sensors)
         disturbed = with_disturbance(disturbed, axis, 1.0, 1.0)
     for axis in {str(one.axis): None for one in free(disturbed) if one.path[-1] == "disturbance_sd"}:
         new, gain = model.process[axis], arms[axis].disturbed
