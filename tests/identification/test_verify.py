@@ -20,6 +20,7 @@ from scipy.signal import lfilter
 import pumafuse as pf
 from pumafuse import toml
 from pumafuse.arrays import FloatArray
+from pumafuse.filter.response import response
 from pumafuse.identification.best_in_class import ModelFit
 from pumafuse.identification.verify import Trace
 from pumafuse.logs.frames import Rotated
@@ -113,6 +114,17 @@ def test_a_gain_that_recovers_recovers_as_the_arm_says(recovery: float, held: in
 
 
 # ---- definitions ----------------------------------------------------------------------------------------------------
+
+
+def test_an_arm_with_play_and_a_fastest_speed_is_verified_as_one() -> None:
+    """To nine digits; without them it is far off."""
+    linear = arm()
+    bent = msgspec.structs.replace(linear.axes["tip"], play=2e-3, max_speed=0.1)
+    known = msgspec.structs.replace(linear, axes={"tip": bent})
+    given, at = (np.rint(1e9 * time).astype(np.int64) for time in (TIME, SAMPLED))
+    run = run_of(response(bent, PERIOD, DELAY, given, BINARY, LOW, at) + LOW + noise(), start={"tip": LOW})
+    assert only(run, known).model.rms == pytest.approx(np.std(noise()), rel=1e-9)
+    assert only(run, linear).model.rms > 1.5 * NOISE
 
 
 def test_the_numbers_are_what_their_names_say() -> None:

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as replaced
 from scipy.stats import multivariate_normal
 
 from pumafuse.filter.response import response
+from pumafuse.model.arm import Sag
 from pumafuse.tuning.arms import Arm, Limits, Measured, Recording, Rest, rests
 
 T = 0.02
@@ -48,6 +50,20 @@ ARMS = [
     Arm(0.11, 0.2, damping=1.3, recovery=0.2, gain=1.2),
     Arm(0.02, 0.05, recovery=0.1, gain=0.8, slope=0.05),
 ]
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_what_bends_an_axis_and_is_known_is_part_of_its_response(arm: Arm) -> None:
+    """Play, a fastest speed and sag; of parts of a recording, too."""
+    bent = {"max_speed": 0.4, "play": 0.01, "sag": Sag(offset=0.01, slope=-0.05)}
+    axis = replaced(arm.model, **bent)
+    one = recording(3)
+    expected = response(axis, T, arm.delay, one.given, one.command, one.start, one.time)
+    straight = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+    assert np.abs(expected - straight).max() > 0.005
+    measured = Measured([one], T, ["a"], axis).of([one._replace(value=expected).of(slice(None, None, 2))])
+    np.testing.assert_allclose(measured.responses(arm)[0], expected[::2], rtol=0.0, atol=1e-12)  # cut elsewhere
+    assert np.abs(measured.residuals(arm)[0]).max() < 1e-12
 
 
 @pytest.mark.parametrize("rest", RESTS)

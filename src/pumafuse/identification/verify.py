@@ -151,7 +151,7 @@ def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[Ax
                 continue
             time, value = rows.time[here], rows.value[here, number] - first
             recording = Recording(given, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
-            measured = Measured([recording], arm.update_period, [source])
+            measured = Measured([recording], arm.update_period, [source], arm.axes[axis])
             notes = [*jumps, *segment.notes] if not found else []
             counts = dict(segment.command_counts), _used(segment.counts[source])
             found.append(_verified(measured, run, axis, arm, counts, notes))
@@ -231,10 +231,7 @@ def _started(measured: Measured, own: Arm, given: bool) -> tuple[Measured, str]:
     levels = np.unique(one.command)
     if given or len(levels) > _MOST_LEVELS:
         return measured, "given" if given else "the first command"
-    tried = [
-        Measured([one._replace(start=level, value=one.value + one.start - level)], measured.period, measured.sensors)
-        for level in levels.tolist()
-    ]
+    tried = [measured.of([one._replace(start=level, value=one.value + one.start - level)]) for level in levels.tolist()]
     best = min(tried, key=lambda other: float(np.std(other.left(own))))
     return best, f"chosen among the run's {len(levels)} levels by RMS"
 
@@ -251,7 +248,7 @@ def _without_spikes(measured: Measured, own: Arm) -> Measured:
     (residual,) = measured.residuals(own)
     jump = residual - median_filter(residual, size=5, mode="nearest")
     kept = np.abs(jump) <= _SPIKE * max(float(median_abs_deviation(residual, scale="normal")), 1e-9)
-    return Measured([measured.recordings[0].of(kept)], measured.period, measured.sensors)
+    return measured.of([measured.recordings[0].of(kept)])
 
 
 def _verdict(model: ModelFit, lag: float, best: BestInClass) -> str:

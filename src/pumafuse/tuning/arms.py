@@ -16,6 +16,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..filter.core import AXIS, Record, at, library
+from ..filter.response import record_of
 from ..model.arm import AxisModel, Gain
 from ..model.plants import FirstOrder, SecondOrder
 from .steps import bounded_step
@@ -192,15 +193,19 @@ class Fit(NamedTuple):
 class Measured:
     """All recordings of an axis, as a function of the arm and the rest."""
 
-    def __init__(self, recordings: Sequence[Recording], period: float, sensors: Sequence[str]) -> None:
-        """By these ``sensors``, of an axis whose update period is ``period`` [s]."""
-        self.recordings, self.period, self.sensors = recordings, period, sensors
+    def __init__(
+        self, recordings: Sequence[Recording], period: float, sensors: Sequence[str], known: AxisModel | None = None
+    ) -> None:
+        """By these ``sensors``, of an axis of update period ``period`` [s], whose play, limit and sag are ``known``."""
+        self.recordings, self.period, self.sensors, self._known = recordings, period, sensors, known
+        self._linear_gain = known is None or (known.max_speed is None and not known.play and known.sag is None)
         self.count = int(sum(one.weight.sum() for one in recordings))
         self.range = max((float(np.ptp(one.value)) for one in recordings if len(one.value)), default=0.0)
         self._offset = _FAR * max(self.range, 1e-6)
 
-    def _with(self, recordings: Sequence[Recording]) -> Measured:
-        return Measured(recordings, self.period, self.sensors)
+    def of(self, recordings: Sequence[Recording]) -> Measured:
+        """Other recordings of the same axis by the same sensors."""
+        return Measured(recordings, self.period, self.sensors, self._known)
 
     def left(self, arm: Arm) -> FloatArray:
         """What an arm leaves of the measurements that count, of each recording about its mean [m]."""
@@ -227,7 +232,7 @@ class Measured:
             one._replace(weight=np.where(far <= limit, one.weight, 0.0))
             for one, far in zip(self.recordings, apart, strict=True)
         ]
-        return self._with(parts)
+        return self.of(parts)
 
     def white(self, arm: Arm) -> Rest:
         """All that an arm leaves as noise of the sensors: for least squares."""
@@ -261,12 +266,12 @@ class Measured:
             begins = np.flatnonzero(np.append(True, far[1:] != far[:-1]))
             in_a_row = np.repeat(np.diff(begins, append=len(far)), np.diff(begins, append=len(far)))
             parts.append(one._replace(weight=np.where(far & (in_a_row <= _FEW), 0.0, one.weight)))
-        return self._with(parts)
+        return self.of(parts)
 
     def excerpt(self, commands: int, rows: int) -> Measured:
         """The part of each recording with the most motion, and some of its measurements, evenly."""
         parts = [_liveliest(one, commands) for one in self.recordings]
-        return self._with([one.of(slice(None, None, len(one.time) // rows + 1)) for one in parts])
+        return self.of([one.of(slice(None, None, len(one.time) // rows + 1)) for one in parts])
 
     def responses(self, arm: Arm) -> list[FloatArray]:
         """The response of each recording [m], relative to its start."""
@@ -392,8 +397,8 @@ class Measured:
         here, rows = self._response(one, arm), list[FloatArray]()
         for name in names:
             step = _LOG_SHIFT if name in LOGARITHMIC else _SHIFT
-            if name in ("gain", "slope"):
-                step = 1.0  # they are linear
+            if name in ("gain", "slope") and self._linear_gain:
+                step = 1.0
             there = arm.moved([name], [arm.coordinate(name) + step])
             rows.append((self._response(one, there) - here) / step)
         return np.array([here, *rows])
@@ -414,6 +419,8 @@ class Measured:
     def _records(self, arms: Sequence[Arm], start: float = 0.0) -> Record:
         """Arms as the core takes them, (n,)."""
         found, (delay, lag, damping, recovery, gain, slope) = np.zeros(len(arms), AXIS), np.array(arms).T
+        if self._known is not None:
+            found[:] = record_of(self._known, self.period, 0.0, start)
         found["period"], found["delay"], found["start"] = self.period, delay, start
         found["time_constant"] = np.where(damping > 0.0, 0.0, lag)
         found["natural_frequency"], found["damping"] = 2.0 * damping / lag, damping

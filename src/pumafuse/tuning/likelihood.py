@@ -221,7 +221,7 @@ class Likelihood:
                 time, value, source = (np.concatenate(column) for column in zip(*parts, strict=True))
                 every = Recording(*segment.given(axis), start, time, value, source, np.ones(len(time)))
                 found.append(every.of(np.argsort(time, kind="stable")))
-        return Measured(found, config.arm.update_period, names)
+        return Measured(found, config.arm.update_period, names, config.arm.axes[axis])
 
     def of_axis(self, axis: str) -> Likelihood:
         """The likelihood of the measurements of one axis; ``axes`` stay as they are."""
