@@ -81,7 +81,9 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         gain_recovery: Time constant [s] with which the gain error decays, by the servo's integral action; None: never.
         gain_recovery_ci95: Its 95 % interval [s], if it was fitted.
         max_speed: The fastest that the axis itself goes [m/s or rad/s]; None: as fast as it is asked to.
+        max_speed_ci95: Its 95 % interval [m/s or rad/s], if it was fitted.
         play: Width of the backlash between drive and tool [m or rad].
+        play_ci95: Its 95 % interval [m or rad], if it was fitted.
         sag: How far a static load holds the tool off.
         delay: Dead time [s] of this axis if it differs from the arm's.
         delay_ci95: Its 95 % interval [s], if it was fitted.
@@ -95,7 +97,9 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     gain_recovery: Time | None = msgspec.field(name="gain_recovery_ms", default=None)
     gain_recovery_ci95: Interval | None = msgspec.field(name="gain_recovery_ms_ci95", default=None)
     max_speed: Positive | None = msgspec.field(name="max_speed_mm_s", default=None)
+    max_speed_ci95: Interval | None = msgspec.field(name="max_speed_mm_s_ci95", default=None)
     play: NotNegative = msgspec.field(name="play_mm", default=0.0)
+    play_ci95: Interval | None = msgspec.field(name="play_mm_ci95", default=None)
     sag: Sag | None = None
     delay: Delay | None = msgspec.field(name="delay_ms", default=None)
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)

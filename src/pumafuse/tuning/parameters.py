@@ -205,6 +205,8 @@ _TABLE = (
     _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
     _line("plant", "axes.{axis}.natural_frequency_rad_s", "arm.axes.{axis}.plant.natural_frequency", 0.5, 5e3),
     _line("plant", "axes.{axis}.damping", "arm.axes.{axis}.plant.damping", 0.05, 20.0),
+    _line("plant", "axes.{axis}.max_speed_mm_s", "arm.axes.{axis}.max_speed", 1e-3, 100.0),
+    _line("plant", "axes.{axis}.play_mm", "arm.axes.{axis}.play", 1e-6, 1.0),
     _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.5, 0.5, **_INTERCEPT),
     _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *RECOVERY, prior=RECOVERY_PRIOR),
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
@@ -258,7 +260,7 @@ def _noise(
 
 
 def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
-    """Whether a configuration has it: a plant's order, an axis's own delay, a recovery, a disturbance, a drift."""
+    """Whether a configuration has it: a plant's order, play, an own delay, a recovery, a disturbance, a drift."""
     if one.axis is not None and one.path[-1].startswith("disturbance"):
         return config.process[one.axis].disturbance_sd > 0.0
     if one.fit == "bias" and one.sensor is not None:
@@ -269,7 +271,7 @@ def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
     if one.fit == "delay":
         shares = [axis for axis in axes if config.arm.axes[axis].delay is None]
         return bool(shares) if one.axis is None else one.axis not in shares
-    return one.given(config) is not None
+    return one.given(config) is not None and (one.path[-1] != "play" or one.get(config) > 0.0)
 
 
 def kinds_of(fit: Iterable[str]) -> list[Fit]:
