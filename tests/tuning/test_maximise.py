@@ -70,8 +70,8 @@ def test_a_search_ends_at_a_maximum(seed: int, fit: Sequence[Fit]) -> None:
         assert point(likelihood, there, free, outcomes).log_posterior < best.log_posterior + 0.01
 
 
-def test_a_search_of_few_steps_ends_on_the_way() -> None:
-    """Each step leads where that of a whole search does; so it is three at most, and short of the maximum here."""
+def test_a_search_ends_early_only_where_it_cannot_be_worth_it() -> None:
+    """Half below the maximum, the end is the same to the bit; far above it, a few steps show it out of reach."""
     sim = outage(1)
     config = spoiled_arm(sim.config)
     likelihood = Likelihood([sim.run], config)
@@ -79,8 +79,10 @@ def test_a_search_of_few_steps_ends_on_the_way() -> None:
     free = free_of(likelihood, config, ("noise", "delay", "plant"))
     whole, some = list[Point](), list[Point]()
     best = maximise(likelihood, config, free, whole.append, outcomes)
-    left = maximise(likelihood, config, free, some.append, outcomes, steps=3)
-    assert [one.log_posterior for one in some] == [one.log_posterior for one in whole[:3]]
+    worth = maximise(likelihood, config, free, outcomes=outcomes, worth=best.log_posterior - 0.5)
+    assert worth.log_posterior == best.log_posterior
+    left = maximise(likelihood, config, free, some.append, outcomes, worth=best.log_posterior + 1e5)
+    assert len(some) < len(whole) // 2
     assert left.log_posterior == some[-1].log_posterior < best.log_posterior - 0.5
 
 

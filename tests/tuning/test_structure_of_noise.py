@@ -8,6 +8,7 @@ import pytest
 import pumafuse as pf
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import point
+from pumafuse.tuning.parameters import quickest
 from pumafuse.tuning.search import _penalised  # pyright: ignore[reportPrivateUsage]
 from pumafuse.tuning.stage import Stage
 from tuning_runs import (
@@ -102,26 +103,40 @@ def test_no_disturbance_is_invented() -> None:
         assert invented <= 1
 
 
-def price_of_input_noise(**changes: float) -> float:
-    """What the score of one axis whose process has ``changes`` is less where its input noise is free."""
+def score_of(without: str = "", of_noise: float = 1.0, **changes: float) -> float:
+    """The penalised log-posterior of one axis whose process has ``changes``, all noise but ``without`` being free."""
     config, command, path = moving()
     config = with_process(config, **changes)
     likelihood = Likelihood([measured(command, path, 1)], config)
     free = free_of(likelihood, config, ("noise",))
-    others = [one for one in free if one.path[-1] != "input_noise"]
-    assert len(others) == len(free) - 1
-    at = point(likelihood, config, free)
-    (whole,), (without,) = (_penalised(likelihood, at, some) for some in (free, others))
-    return float(without - whole)
+    kept = [one for one in free if one.path[-1] != without]
+    assert len(kept) == len(free) - bool(without)
+    (found,) = _penalised(likelihood, point(likelihood, config, free), kept, of_noise)
+    return float(found)
 
 
 def test_a_noise_costs_more_beside_a_disturbance() -> None:
-    """Alone ½ ln n, beside a disturbance twice that; at its bound it is none and costs nothing."""
-    once = pytest.approx(0.5 * np.log(COUNT // 2), rel=1e-9)
-    assert price_of_input_noise(input_noise=2e-7) == once
-    assert price_of_input_noise(input_noise=2e-7, disturbance_sd=1e-3) / 2.0 == once
-    assert price_of_input_noise(input_noise=1e-7) == 0.0
-    assert price_of_input_noise(input_noise=1e-7, disturbance_sd=1e-3) == 0.0
+    """Input noise and drift, at twice the price: ½ ln n more for each of the two; without a disturbance no more."""
+    alone, beside = {"disturbance_sd": 0.0}, {"disturbance_sd": 1e-3}
+    more = score_of(**beside) - score_of(of_noise=2.0, **beside)
+    assert more == pytest.approx(2 * 0.5 * np.log(COUNT // 2), rel=1e-9)
+    assert score_of(of_noise=2.0, **alone) == score_of(**alone)
+
+
+def test_a_noise_that_is_none_costs_nothing() -> None:
+    """At its bound the score is that of a fit in which it is not free; above it ½ ln n less."""
+    without = "input_noise"
+    assert score_of(input_noise=1e-7) == score_of(without, input_noise=1e-7)
+    more = score_of(without, input_noise=2e-7) - score_of(input_noise=2e-7)
+    assert more == pytest.approx(0.5 * np.log(COUNT // 2), rel=1e-9)
+
+
+def test_a_disturbance_that_is_too_quick_is_never_worth_it() -> None:
+    """Forgotten within two update periods or less: no likelihood makes up for it. One that lasts longer may be."""
+    least = quickest(moving()[0])
+    assert least == 2.0 * PERIOD
+    assert score_of(disturbance_sd=1e-3, disturbance_time=least) == -np.inf
+    assert np.isfinite(score_of(disturbance_sd=1e-3, disturbance_time=1.01 * least))
 
 
 def test_noise_that_is_correlated_for_ten_milliseconds_is_no_disturbance() -> None:

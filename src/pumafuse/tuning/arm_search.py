@@ -45,9 +45,8 @@ _GATED = 2  # times: outliers widen the noise by which they are told
 _GATE = 6.0  # standard deviations, from which a measurement does not count
 _EARLIER, _DAMPED = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no dead time, ζ
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
-_WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
-_SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
-_SLOWER = 1.001  # times the quickest disturbance, which is a bound
+WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
+SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
 _DOUBT = 20.0  # log-likelihood that a recovery at a bound must gain: mostly another model says the same
 _FORLORN = 8.0  # log-likelihood behind the best, from which a model or a dead time counts for nothing
 # Update periods, by which a dead time may be on a wrong bump of the likelihood
@@ -103,8 +102,7 @@ class ArmSearch:
         plain: The arm of least squares; None where nothing moves.
         limits: Where its numbers may lie.
         rest: What the best arm leaves.
-        slow_rest: Likewise, with no disturbance that is too quick for an arm.
-        disturbed: What that gains by a disturbance in log-posterior, after the penalty for its numbers.
+        rests: Likewise, without a disturbance, with a smooth one and with a rough one.
         posterior: All models that count, along their dead times.
     """
 
@@ -127,9 +125,14 @@ class ArmSearch:
         """
         self._measured, self.freedom, self.sensors = measured, freedom, measured.sensors
         self._longest = longest_delay(measured.period)
-        self.plain = plain_arm(measured)
-        self.limits: Limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS) if near is None else near.limits
-        self._fits: dict[Model, Fit] = self._by_least_squares() if near is None else near._fits
+        self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
+        self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
+        self._fits = self._by_least_squares() if near is None else near._fits
+        still = {model: fit for model, fit in self._fits.items() if model.gain == "static"}
+        gain = self._best(still).arm.gain if still else 1.0
+        low, high = _USUAL_GAIN
+        gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
+        self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
         peaks, branches = self._peaks(least, believed), list[Branch]()
         for evidence, model, peak in peaks:
             walked = (one for one in branches if one.model == model)
@@ -141,20 +144,15 @@ class ArmSearch:
         self.posterior = AxisPosterior(branches)
 
     @property
-    def best(self) -> Arm:
-        """The most likely arm of all models."""
-        return max(self._fits.values(), key=lambda one: one.log_posterior).arm
-
-    @property
     def likely_noise(self) -> dict[str, float]:
         """The white noise that each sensor is believed to have [m]."""
-        found = SHOWN * self._measured.jitter(self.best)
+        found = SHOWN * self._measured.jitter(self._best(self._fits).arm)
         return dict(zip(self.sensors, found.tolist(), strict=True))
 
     @property
     def spread(self) -> float:
         """How far the measurements are from the best arm, as a standard deviation [m]."""
-        return float(self._measured.white(self.best).sd[0])
+        return float(self._measured.white(self._best(self._fits).arm).sd[0])
 
     def arm(self, model: Model, delay: float | None = None) -> Arm:
         """The most likely arm of a model; the one with this dead time [s]."""
@@ -181,20 +179,14 @@ class ArmSearch:
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
     def _by_least_squares(self) -> dict[Model, Fit]:
-        """Each model by least squares of the most motion: noise of a poor arm explains what a better one would."""
+        """Each model, from the grid: noise that is fitted to a poor arm explains what a better one would."""
         whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
-        self.rest = Rest(np.ones(len(self.sensors)))
         self.rest = self._measured.white(self._on_grid(1)[0])
-        self._fits = self._fitted(self._on_grid(_STARTS), {})
-        self.rest = self._measured.white(self.best)  # beside which what is believed of a gain weighs less
-        self._fits = self._again()
-        still = {model: fit for model, fit in self._fits.items() if model.gain == "static"}
-        gain = max(still.values(), key=lambda one: one.log_posterior).arm.gain if still else 1.0
-        low, high = _USUAL_GAIN
-        gains = min(low, gain / _BEYOND), max(high, gain * _BEYOND)
-        self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
+        found = self._fitted(self._on_grid(_STARTS))
+        self.rest = self._measured.white(self._best(found).arm)
+        found = self._fitted([self._best(found).arm], found)
         self._measured = whole
-        return self._fits
+        return found
 
     def _likely(self, found: Mapping[Model, Fit]) -> dict[Model, Fit]:
         """Those models that a better noise could still bring near the best."""
@@ -205,11 +197,11 @@ class ArmSearch:
     def _peaks(self, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
         for _ in range(_GATED):
-            self.rest = self._likely_rest(self.best, least, believed)
-            self._measured = self._measured.gated(self.best, self.rest, _GATE)
-        self._fits = self._likely(self._fitted([self.best, *self._on_grid(1)], self._fits))
-        self.rest = self._likely_rest(self.best, least, believed)
-        self._fits = self._likely(self._again())
+            self.rest = self._likely_rest(self._best(self._fits).arm, least, believed)
+            self._measured = self._measured.gated(self._best(self._fits).arm, self.rest, _GATE)
+        self._fits = self._likely(self._fitted([self._best(self._fits).arm, *self._on_grid(1)], self._fits))
+        self.rest = self._likely_rest(self._best(self._fits).arm, least, believed)
+        self._fits = self._likely(self._fitted([self._best(self._fits).arm], self._fits))
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
         highest = max(one[0] for one in every)
         for evidence, model, fit in list(every) if "delay" in self.freedom.free else ():
@@ -241,39 +233,27 @@ class ArmSearch:
         return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
 
     def _likely_rest(self, arm: Arm, least: Sequence[float], believed: bool) -> Rest:
-        """The most likely of what an arm leaves, after the penalty for its numbers.
-
-        A disturbance that is forgotten within two update periods is no motion of an arm, but noise of its sensors.
-        """
-        quickest = QUICKEST * self._measured.period
-        (without, height), *others = rests(self._measured, arm, quickest, least, believed)
+        """The most likely of what an arm leaves, after the penalty for its numbers."""
+        found = list(rests(self._measured, arm, QUICKEST * self._measured.period, least, believed))
+        self.rests = [rest for rest, _ in found]
         dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
-        gains = [log - height - dearer + _WANDERS - _SMOOTHER * (rest.smoothness > 1.0) for rest, log in others]
-        slow = [
-            gain if rest.disturbance_time > _SLOWER * quickest else -np.inf
-            for gain, (rest, _) in zip(gains, others, strict=True)
-        ]
-        self.disturbed = max(slow)
-        self.slow_rest = others[slow.index(self.disturbed)][0] if self.disturbed > 0.0 else without
-        return others[gains.index(max(gains))][0] if max(gains) > 0.0 else without
+        prices = [WANDERS, dearer + SMOOTHER, dearer]
+        return max(zip(found, prices, strict=True), key=lambda one: one[0][1] - one[1])[0][0]
 
-    def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit]) -> dict[Model, Fit]:
+    def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None) -> dict[Model, Fit]:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
-        found, arms = dict[Model, Fit](), list(starts)
+        found = dict[Model, Fit]()
         for model in known or self.freedom.models:
-            tries = self._likeliest(model, arms, 1 if known else 2)
-            tries += [known[model].arm] if known else []
-            found[model] = max((self._fit(model, arm) for arm in tries), key=lambda one: one.log_posterior)
-            arms = [max(found.values(), key=lambda one: one.log_posterior).arm]
+            arms = starts if not found else [self._best(found).arm]
+            tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, 1 if known else 2)]
+            if known:
+                tries.append(self._fit(model, known[model].arm))
+            found[model] = max(tries, key=lambda one: one.log_posterior)
         best = max(found, key=lambda model: found[model].log_posterior)
         for ticks in _TICKS if "delay" in self.freedom.free else ():
             there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)
             found[best] = max(found[best], self._fit(best, there), key=lambda one: one.log_posterior)
         return found
-
-    def _again(self) -> dict[Model, Fit]:
-        """Each model fitted from where it was, under another rest."""
-        return {model: self._fit(model, fit.arm) for model, fit in self._fits.items()}
 
     def _likeliest(self, model: Model, arms: Iterable[Arm], count: int) -> list[Arm]:
         """The likeliest arms of a model that are as late as others."""
@@ -322,6 +302,9 @@ class ArmSearch:
     def _fit(self, model: Model, start: Arm) -> Fit:
         names = self.freedom.names(model)
         return self._measured.fitted(start, names, self.rest, self.limits)
+
+    def _best(self, found: Mapping[Model, Fit]) -> Fit:
+        return max(found.values(), key=lambda one: one.log_posterior)
 
     def _evidence(self, model: Model, fit: Fit) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly."""

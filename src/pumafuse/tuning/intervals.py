@@ -21,7 +21,8 @@ from .parameters import Parameter, coordinates, moved, rounded
 
 Distances: TypeAlias = tuple[float, float]  # s; to the lower and upper end of an interval, infinite where it is open
 
-_STEPS = 3  # of Fisher scoring to a point of a profile, from where its neighbours lead: more change no end by 2 %
+_TOLERANCE = 0.05  # log-likelihood to which a profile is maximised: 1.3 % of the distance to an end
+_FAR_BELOW = 8.0  # log-likelihood; where a profile has dropped by more, it is enough to know that
 _SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is computed
 _CLOSE = 0.03  # relative, of √(2 drop)
 _FARTHER = 1.5  # times the distance, while an end is not yet between two
@@ -330,7 +331,8 @@ class _Side:
             self._along(distance, others),
             self._others,
             outcomes=self._view.outcomes,
-            steps=_STEPS,
+            tolerance=_TOLERANCE,
+            worth=self._top - _FAR_BELOW,
         )
         drop = self._top - peak.log_posterior - self._one.log_prior(peak.config)
         return _Known(drop, coordinates(peak.config, self._others))

@@ -20,7 +20,7 @@ from .likelihood import Derivatives, Likelihood, in_threads
 from .parameters import Parameter, coordinates, moved, with_axis_of
 from .steps import bounded_step
 
-_STEPS = 60
+_ITERATIONS = 60
 _TOLERANCE = 2e-3  # expected gain in log-likelihood that is not worth another step
 _FIRST_DAMPING = 1e-4
 _LAST_DAMPING = 1e8  # at which the search gives up
@@ -28,6 +28,7 @@ _DOUBLES = (2.0, 4.0, 8.0)
 _NOTHING, _CREEPING = 2e-4, 3  # log-likelihood; steps in a row that gain less: at a cusp, the score promises too much
 _POOR = 0.1  # of the expected gain, from which a step was too long
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
+_PROMISE = 5.0  # times the gain expected of the last step, beyond which no further steps are hoped to lead
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
 _SHARES = (1.0, 0.5, 0.2)
@@ -99,7 +100,7 @@ def maximise(
     notify: Notify = ignore,
     outcomes: Sequence[CodeArray] | None = None,
     tolerance: float = _TOLERANCE,
-    steps: int = _STEPS,
+    worth: float = -np.inf,
 ) -> Point:
     """Find the nearest maximum of the log-posterior.
 
@@ -110,11 +111,11 @@ def maximise(
         notify: Called with each better point.
         outcomes: The outcome of each component, to be repeated; None: the gates decide.
         tolerance: Gain in log-likelihood that is not worth another step.
-        steps: How many to take at most.
+        worth: The log-posterior below which a maximum is not wanted: where it is out of reach, the search ends early.
     """
     best, small = point(likelihood, start, free, outcomes), 0
     ascent = _Ascent(likelihood, free, outcomes, tolerance)
-    for _ in range(steps if free else 0):
+    for _ in range(_ITERATIONS if free else 0):
         trial, step, expected = ascent.better(best)
         if trial is best:
             return best
@@ -122,7 +123,7 @@ def maximise(
         best = ascent.farther(best, trial, step, gained / expected)
         notify(best)
         small = small + 1 if gained < _NOTHING else 0
-        if small == _CREEPING or max(gained, expected) < tolerance:
+        if small == _CREEPING or max(gained, expected) < tolerance or best.log_posterior + _PROMISE * expected < worth:
             return best
     return best
 

@@ -1,19 +1,21 @@
 """The search for the most likely configuration: arms from any motion, then their noise, then everything together.
 
-The arm of each axis comes from :mod:`.arm_search`, which needs no guess, and with it what that arm leaves: with a
-disturbance where one is worth its numbers. From there all numbers are maximised, under the gates.
+The arm of each axis comes from :mod:`.arm_search`, which needs no guess, and with it what that arm leaves: without a
+disturbance and with one of each kind. Each of these is maximised with all numbers free, under the gates; the one that
+is worth its numbers is taken.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeAlias
 
+import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
-from .arm_search import ArmSearch, Freedom, chosen_arms
+from .arm_search import SMOOTHER, WANDERS, ArmSearch, Freedom, chosen_arms
 from .arms import Arm
 from .identifiability import covariance
 from .likelihood import Likelihood, in_threads
@@ -59,6 +61,7 @@ def search(
     arms: Mapping[str, ArmSearch],
     notify: Notify,
     one_delay: bool = False,
+    begun: bool = False,
 ) -> tuple[Point, dict[str, str]]:
     """Find the most likely configuration.
 
@@ -69,6 +72,7 @@ def search(
         arms: What was looked for of each axis's arm.
         notify: Called with each better point.
         one_delay: Whether all axes whose delay is free share one whatever the measurements say.
+        begun: Whether the configuration has the noise that was found on a part of the measurements: one start more.
 
     Returns:
         The best point; and for each axis the reasons for the order of its plant, its gain, its disturbance and whether
@@ -79,8 +83,13 @@ def search(
     for one in free(config):
         if one.fit == "latency":
             config = _nearest_latency(likelihood, config, one, free)
-    at = _with_noise(config, arms, free, reasons)
-    best = _from_wider_gates(likelihood, _maximum(likelihood, at, free, notify).config, free, notify)
+    found = list[Point]()
+    starts = _noise_models(likelihood, config, arms, free)
+    for start in [*starts, config] if begun else starts:
+        if found:  # an arm that is likeliest under one noise is near that under another
+            start = _with_arm_of(start, found[0].config, free)
+        found.append(_maximum(likelihood, start, free, notify))
+    best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
     best = _without_needless(likelihood, best, free, notify)
     best = _under_gates(likelihood, best, config, free, notify)
     return best, {axis: "; ".join(why) for axis, why in reasons.items() if why}
@@ -173,24 +182,45 @@ def _nearest_latency(likelihood: Likelihood, config: FusionConfig, one: Paramete
 # ---- noise ----------------------------------------------------------------------------------------------------------
 
 
-def _with_noise(config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf, reasons: Reasons) -> FusionConfig:
-    """The configuration with what the arms leave as its noise, as far as that is free."""
-    model = disturbed = config
-    for axis, search in arms.items():
-        model = with_rest(model, axis, search.slow_rest, search.sensors)
+def _noise_models(
+    likelihood: Likelihood, config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf
+) -> list[FusionConfig]:
+    """The configuration with what the arms leave: without a disturbance, and where one may be fitted with either kind.
+
+    Noise that is not free stays as it is.
+    """
+    models = list[FusionConfig]()
+    for number in range(3):
+        model = config
+        for axis, search in arms.items():
+            model = with_rest(model, axis, search.rests[number], search.sensors)
+        models.append(_with_free_noise(config, model, free, likelihood.sensors))
+    distinct = [model for place, model in enumerate(models) if model not in models[:place]]
+    return [_with_quiet(one, arms, free) for one in distinct]
+
+
+def _with_free_noise(config: FusionConfig, model: FusionConfig, free: FreeOf, axes: Iterable[str]) -> FusionConfig:
+    """The configuration with the noises of a model that are free."""
+    disturbed = config
+    for axis in axes:
         disturbed = with_disturbance(disturbed, axis, 1.0, 1.0)
-    for axis in {str(one.axis): None for one in free(disturbed) if one.path[-1] == "disturbance_sd"}:
-        new, gain = model.process[axis], arms[axis].disturbed
-        config = with_disturbance(config, axis, new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
-        kind = _KINDS[new.disturbance_kind] if new.disturbance_sd else "none"
-        why = f"one {gain:+.1f}"
-        if np.isinf(gain):
-            why = f"one would be forgotten within {1e3 * quickest(config):.0f} ms, too soon for an arm"
-        reasons[axis].append(f"disturbance: {kind} ({why})")
+    may_be = {one.axis for one in free(disturbed) if one.path[-1] == "disturbance_sd"}
+    for axis in may_be:
+        new = model.process[str(axis)]
+        config = with_disturbance(config, str(axis), new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
     for one in free(config):
         if one.fit == "noise" and (one.sensor or one.path[-1] in _WALKING):
             config = one.put(config, one.clipped(one.get(model)))
-    return _with_quiet(config, arms, free)
+    return config
+
+
+def _with_arm_of(config: FusionConfig, other: FusionConfig, free: FreeOf) -> FusionConfig:
+    """The configuration with the arm of another, and with its numbers that all axes share."""
+    config = msgspec.structs.replace(config, arm=other.arm)
+    for one in free(other):
+        if one.axis is None:
+            config = one.put(config, one.get(other))
+    return config
 
 
 def _with_quiet(config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf) -> FusionConfig:
@@ -260,6 +290,36 @@ def _under_gates(
     return found
 
 
+def _likeliest(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf, reasons: Reasons) -> FusionConfig:
+    """The model of noise that is best for each axis after the penalty for its numbers."""
+    scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
+    for number, axis in enumerate(likelihood.axes):
+        for peak, score in zip(peaks, scores, strict=True):
+            process = peak.config.process[axis]
+            if process.disturbance_sd == 0.0:
+                score[number] -= WANDERS
+            elif process.disturbance_kind == "matern":
+                score[number] -= SMOOTHER
+        kinds = [_kind(peak.config, axis) for peak in peaks]
+        if len(set(kinds)) > 1 and axis in likelihood.sensors:
+            mine = dict[str, float]()
+            for kind, score in zip(kinds, scores, strict=True):
+                mine[kind] = max(float(score[number]), mine.get(kind, -np.inf))
+            gain = max(mine[kind] for kind in mine if kind != "none") - mine.get("none", -np.inf)
+            why = f"(one {gain:+.1f})"
+            if np.isinf(gain):
+                soon = 1e3 * quickest(peaks[0].config)
+                why = f"(one would be forgotten within {soon:.0f} ms, too soon for an arm)"
+            reasons[axis].append(f"disturbance: {max(mine, key=lambda kind: mine[kind])} {why}")
+    return _best_by_axis(likelihood, peaks, scores)
+
+
+def _kind(config: FusionConfig, axis: str) -> str:
+    """What disturbance an axis has, in words."""
+    process = config.process[axis]
+    return "none" if process.disturbance_sd == 0.0 else _KINDS[process.disturbance_kind]
+
+
 def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
     """The configuration without the noises that are not worth their penalty, one kind after the other.
 
@@ -277,7 +337,7 @@ def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf
         peaks = [point(likelihood, config, free(config))]
         own = [one for one in free(without) if one.axis is not None]
         peaks.append(maximise_by_axis(likelihood, without, own, notify, _ROUGHLY))
-        scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
+        scores = [_penalised(likelihood, peak, free(peak.config), of_noise=2.0) for peak in peaks]
         config = _best_by_axis(likelihood, peaks, scores)
     return config
 
@@ -290,17 +350,20 @@ def _well_known(likelihood: Likelihood, config: FusionConfig, free: Sequence[Par
     return {one.key for one, known in zip(inside, sd.tolist(), strict=True) if known < _WELL_KNOWN}
 
 
-def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
+def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter], of_noise: float = 1.0) -> FloatArray:
     """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,).
 
-    A noise at its lower bound is none, and costs nothing. Another one of the random walk costs twice as much beside a
-    disturbance.
+    A noise at its lower bound is none, and costs nothing. ``of_noise``: how many times its penalty another one of the
+    random walk costs beside a disturbance. A disturbance that is forgotten within two update periods is never worth it:
+    it is no motion of an arm, but noise of its sensors.
     """
     price = np.zeros(len(likelihood.axes))
     for one in free:
         if one.axis is not None and not (one.vanishes and one.at_bound(peak.config) == "lower"):
             beside = one.path[-1] in _WALKING and peak.config.process[one.axis].disturbance_sd > 0.0
-            price[likelihood.axes.index(one.axis)] += 2.0 if beside else 1.0
+            price[likelihood.axes.index(one.axis)] += of_noise if beside else 1.0
+            if one.path[-1] == "disturbance_time" and one.at_bound(peak.config) == "lower":
+                price[likelihood.axes.index(one.axis)] = np.inf
     return peak.axes - 0.5 * price * np.log(np.maximum(likelihood.count, 2))
 
 

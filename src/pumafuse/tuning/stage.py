@@ -144,7 +144,7 @@ def run_stage(
     if plan.sd_prior:
         believed |= likelihood.scatter
         believed |= {(name, axis): noise for axis, one in arms.items() for name, noise in one.likely_noise.items()}
-    best, orders = search(likelihood, start, free, arms, notify, plan.one_delay)
+    best, orders = search(likelihood, start, free, arms, notify, plan.one_delay, begun=near is not None)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
