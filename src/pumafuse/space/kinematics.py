@@ -1,7 +1,6 @@
 """Forward kinematics of one serial chain of a URDF: the pose of its tip, of its links, and the Jacobian.
 
-The frame of a joint is that of its parent link, placed by ``origin`` and moved by the joint about or along ``axis``. Of
-n configurations a vector is (3, n) in here and a quaternion x, y, z, w (4, n): each component is contiguous.
+The frame of a joint is that of its parent link, placed by ``origin`` and moved by the joint about or along ``axis``.
 """
 
 from __future__ import annotations
@@ -17,9 +16,10 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError
 from ..units import Kind
+from .rotations import cross, of_angles, product, turned
 from .urdf import MOST, Joint, read
 
-_STRAIGHT = np.array([[0.0], [0.0], [0.0], [1.0]])  # the quaternion of no turn
+_STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])  # the quaternion of no turn
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Chain:
                     raise ConfigError(f"{joint.where}: axis 0 0 0 is no direction")
                 kinds.setdefault(driver, kind)
                 column = list(kinds).index(driver)
-            motions.append(_Motion(joint, _orientation(joint.rpy), column, multiplier, offset))
+            motions.append(_Motion(joint, of_angles(np.array([joint.rpy]), "xyz"), column, multiplier, offset))
         return cls((base, *(motion.joint.child for motion in motions)), kinds, tuple(motions))
 
     def pose(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -102,8 +102,7 @@ class Chain:
             Position (n, 3) [m], and quaternion x, y, z, w (n, 4), whose sign is continuous along a motion. NaN in rows
             where a joint is not finite.
         """
-        position, turn = deque(self._frames(q), maxlen=1).pop()
-        return np.ascontiguousarray(position.T), np.ascontiguousarray(turn.T)
+        return deque(self._frames(q), maxlen=1).pop()
 
     def jacobian(self, q: FloatArray) -> FloatArray:
         """How the tip moves with each joint, along the axes of the base.
@@ -117,16 +116,16 @@ class Chain:
         """
         frames = list(self._frames(q))
         tip, _ = frames[-1]
-        jacobian = np.zeros((6, len(self.kinds), 1)) + 0.0 * tip[0]  # what is NaN stays it
+        jacobian = np.zeros((6, len(self.kinds))) + 0.0 * tip[:, :1, None]  # what is NaN stays it
         for motion, (position, turn) in zip(self._motions, frames[1:], strict=True):
             if motion.joint.kind is None:
                 continue
-            velocity = motion.multiplier * _rotated(turn, motion.joint.axis)
+            velocity = motion.multiplier * turned(turn, motion.joint.axis)
             if motion.joint.kind == "angle":
-                jacobian[3:, motion.column] += velocity
-                velocity = np.cross(velocity, tip - position, axis=0)
-            jacobian[:3, motion.column] += velocity
-        return np.ascontiguousarray(np.moveaxis(jacobian, -1, 0))
+                jacobian[:, 3:, motion.column] += velocity
+                velocity = cross(velocity, tip - position)
+            jacobian[:, :3, motion.column] += velocity
+        return jacobian
 
     def frames(self, q: FloatArray) -> FloatArray:
         """Each of ``links`` in the frame of the base.
@@ -140,29 +139,29 @@ class Chain:
         frames = np.zeros((len(q), len(self.links), 4, 4))
         frames[..., 3, 3] = 1.0
         for link, (position, turn) in enumerate(self._frames(q)):
-            frames[:, link, :3, 3] = position.T
+            frames[:, link, :3, 3] = position
             for column, unit in enumerate(np.eye(3)):
-                frames[:, link, :3, column] = _rotated(turn, unit[:, None]).T
+                frames[:, link, :3, column] = turned(turn, unit[None])
         return frames
 
     def _frames(self, q: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Position (3, n) [m] and orientation (4, n) of each link in the frame of the base."""
+        """Position (n, 3) [m] and orientation (n, 4) of each link in the frame of the base."""
         if q.ndim != 2 or q.shape[1] != len(self.kinds):
             raise ConfigError(f"joints: shape {q.shape}; expected (n, {len(self.kinds)}): {', '.join(self.kinds)}")
-        finite = (np.abs(q) <= MOST).all(axis=1)
-        q = np.where(finite, q.T, np.nan)
-        position = np.where(finite, np.zeros((3, 1)), np.nan)
+        finite = (np.abs(q) <= MOST).all(axis=1, keepdims=True)
+        q = np.where(finite, q, np.nan)
+        position = np.where(finite, np.zeros(3), np.nan)
         turn = np.where(finite, _STRAIGHT, np.nan)
         yield position, turn
         for motion in self._motions:
-            position = position + _rotated(turn, motion.joint.at)
-            turn = _product(turn, motion.turn)
+            position = position + turned(turn, motion.joint.at)
+            turn = product(turn, motion.turn)
             if motion.joint.kind is not None:
-                value = motion.multiplier * q[motion.column] + motion.offset
+                value = motion.multiplier * q[:, motion.column, None] + motion.offset
                 if motion.joint.kind == "angle":
-                    turn = _product(turn, _about(motion.joint.axis, value))
+                    turn = product(turn, _about(motion.joint.axis, value))
                 else:
-                    position = position + value * _rotated(turn, motion.joint.axis)
+                    position = position + value * turned(turn, motion.joint.axis)
             yield position, turn
 
 
@@ -178,32 +177,6 @@ class Joints(NamedTuple):
     values: FloatArray
 
 
-def _orientation(rpy: tuple[float, ...]) -> FloatArray:
-    """The quaternion (4, 1) of turns about the fixed x, then y, then z [rad]."""
-    turn = _STRAIGHT
-    for unit, angle in zip(np.eye(3), rpy, strict=True):
-        turn = _product(_about(unit[:, None], np.array([angle])), turn)
-    return turn
-
-
 def _about(axis: FloatArray, angle: FloatArray) -> FloatArray:
-    """The quaternion (4, n) of turns by angles (n,) [rad] about an axis (3, 1)."""
-    return np.concatenate([np.sin(angle / 2.0) * axis, np.cos(angle / 2.0)[None]])
-
-
-def _product(p: FloatArray, q: FloatArray) -> FloatArray:
-    """The quaternion that turns by q, then by p."""
-    u, v = p[:3], q[:3]
-    return np.concatenate([p[3] * v + q[3] * u + _cross(u, v), (p[3] * q[3] - (u * v).sum(axis=0))[None]])
-
-
-def _rotated(q: FloatArray, v: FloatArray) -> FloatArray:
-    """Vectors turned by quaternions."""
-    across = 2.0 * _cross(q[:3], v)
-    return v + q[3] * across + _cross(q[:3], across)
-
-
-def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
-    """The cross products of vectors; numpy's own takes three times as long for one, as of a stream."""
-    one, two = [1, 2, 0], [2, 0, 1]
-    return u.take(one, 0) * v.take(two, 0) - u.take(two, 0) * v.take(one, 0)
+    """The quaternions (n, 4) of turns by angles (n, 1) [rad] about an axis (1, 3)."""
+    return np.concatenate([np.sin(angle / 2.0) * axis, np.cos(angle / 2.0)], axis=1)

@@ -28,9 +28,9 @@ class Joint:
         type: As written.
         parent: The link that holds it.
         child: The link that it moves.
-        at: Its origin in the parent's frame [m], (3, 1).
+        at: Its origin in the parent's frame [m], (1, 3).
         rpy: The turns of its origin about the parent's x, then y, then z [rad].
-        axis: The direction that it moves about or along, of length 1, (3, 1); some files have 0 0 0 where it is fixed.
+        axis: The direction that it moves about or along, of length 1, (1, 3); some files have 0 0 0 where it is fixed.
         mimic: The joint that drives it, a factor and an offset; None where it is driven by itself.
     """
 
@@ -181,8 +181,8 @@ def _joint(where: str, element: Element) -> Joint:
         type=element.get("type", ""),
         parent=text("parent", "link"),
         child=text("child", "link"),
-        at=np.array(numbers("origin", "xyz", "0 0 0"))[:, None],
+        at=np.array(numbers("origin", "xyz", "0 0 0"))[None],
         rpy=numbers("origin", "rpy", "0 0 0"),
-        axis=np.array(direction)[:, None] / (math.hypot(*direction) or 1.0),
+        axis=np.array(direction)[None] / (math.hypot(*direction) or 1.0),
         mimic=mimic,
     )
