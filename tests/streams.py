@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.arrays import NO_STAMP
+from pumafuse.live.sources import replayed
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import Lines
 
@@ -141,6 +142,18 @@ def axes_of(draw: st.DrawFn) -> pf.ArmModel:
         return pf.AxisModel(plant=plant, gain=gain, gain_recovery=recovery, delay=delay, lag_ci95=lag)
 
     return pf.ArmModel(name="any", update_period=0.028, delay=0.06, axes={"radial": one(), "vertical": one()})
+
+
+def replay_is_as_live(run: pf.Run, config: pf.FusionConfig) -> None:
+    """Assert that a run that is replayed as a stream ends with the last estimate of `fuse`, to the bit."""
+    offline, live = pf.fuse(run, config), pf.LiveEstimator(config)
+    stream = Stream(live, lambda _: None, lambda _: None)
+    for events in replayed(run, config, np.inf):
+        stream.take(events)
+    last = live.estimate(offline.origin + round(offline.time[-1] * 1e9))
+    for axis, track in offline.axes.items():
+        assert last[axis].position == track.position[-1]
+        assert last[axis].position_sd == track.position_sd[-1]
 
 
 def fused_in_any_order(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import pumafuse as pf
+from plants import PLANT
 from pumafuse import AxisModel, FirstOrder, Gain, Sag, SecondOrder
 from pumafuse.arrays import FloatArray, TimeArray
 from pumafuse.filter.response import at_rest, follow, record_of, response
@@ -31,14 +32,6 @@ KNOWN: dict[str, PLANTS] = {
     "critical": SecondOrder(natural_frequency=5.0, damping=1.0),
     "over-damped": SecondOrder(natural_frequency=60.0, damping=3.0),
 }
-PLANT = st.one_of(
-    st.builds(lambda tau: FirstOrder(time_constant=tau), st.floats(1e-3, 1.0)),
-    st.builds(
-        lambda omega, damping: SecondOrder(natural_frequency=omega, damping=damping),
-        st.floats(2.0, 500.0),
-        st.one_of(st.floats(0.05, 0.95), st.just(1.0), st.floats(1.05, 8.0)),
-    ),
-)
 RECOVERY = st.sampled_from([None, 0.004, 0.03, 0.3])
 SPEED, PLAY = st.sampled_from([0.02, 0.2, 2.0]), st.sampled_from([1e-4, 3e-3, 0.05])
 

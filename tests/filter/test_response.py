@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import pumafuse as pf
+from plants import PLANT
 from pumafuse import AxisModel, FirstOrder, Gain, SecondOrder
 from pumafuse.arrays import FloatArray, TimeArray
 from pumafuse.filter.response import at_rest, follow, record_of, response
@@ -22,14 +23,6 @@ KNOWN: dict[str, PLANTS] = {
     "nearly critical": SecondOrder(natural_frequency=60.0, damping=1.0 + 1e-9),
     "over-damped": SecondOrder(natural_frequency=60.0, damping=2.5),
 }
-PLANT = st.one_of(
-    st.builds(lambda tau: FirstOrder(time_constant=tau), st.floats(1e-3, 1.0)),
-    st.builds(
-        lambda omega, damping: SecondOrder(natural_frequency=omega, damping=damping),
-        st.floats(2.0, 500.0),
-        st.one_of(st.floats(0.05, 0.95), st.floats(0.95, 1.05), st.just(1.0), st.floats(1.05, 8.0)),
-    ),
-)
 plants = pytest.mark.parametrize("plant", KNOWN.values(), ids=KNOWN)
 
 

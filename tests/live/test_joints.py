@@ -20,13 +20,12 @@ from executable import EXECUTABLE
 from pumafuse.fusion.config import Placement
 from pumafuse.fusion.placing import with_tool
 from pumafuse.live.record import Recorder
-from pumafuse.live.sources import replayed
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import LineDecoder
 from pumafuse.logs.clock import without_strays
 from pumafuse.logs.manifest import chain_of
 from pumafuse.model.arm import Joint
-from streams import Event, delayed, differences, feed
+from streams import Event, delayed, differences, feed, replay_is_as_live
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 URDF = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"
@@ -192,15 +191,7 @@ def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
 def test_a_replay_is_as_live(tmp_path: Path) -> None:
     """A run that is replayed as a stream gives the estimates of `fuse`, a stray command in it or not."""
     run = run_of(tmp_path, stray=120)
-    config = known(run)
-    offline, live = pf.fuse(run, config), pf.LiveEstimator(config)
-    stream = Stream(live, lambda _: None, lambda _: None)
-    for events in replayed(run, config, math.inf):
-        stream.take(events)
-    last = live.estimate(offline.origin + round(offline.time[-1] * 1e9))
-    for axis, track in offline.axes.items():
-        assert last[axis].position == track.position[-1]
-        assert last[axis].position_sd == track.position_sd[-1]
+    replay_is_as_live(run, known(run))
 
 
 def test_a_configuration_keeps_its_robot(tmp_path: Path) -> None:

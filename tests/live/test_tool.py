@@ -16,11 +16,10 @@ from pumafuse.fusion.config import Placement
 from pumafuse.fusion.placing import with_tool
 from pumafuse.live.export import header
 from pumafuse.live.record import Recorder
-from pumafuse.live.sources import replayed
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import BadLine, Event, LineDecoder
 from pumafuse.logs.frames import Rotated
-from streams import delayed, differences, events_of, feed, fused_in_any_order
+from streams import delayed, differences, events_of, feed, fused_in_any_order, replay_is_as_live
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 LENGTH = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04), gain=pf.Gain(slope=0.001))
@@ -176,14 +175,7 @@ def test_a_replay_is_as_live() -> None:
     """A run that is replayed as a stream, a tenth of its rows without an orientation, gives the estimates of `fuse`."""
     run = run_of()
     run.sensors["mocap"].orientation[::10] = np.nan
-    offline, live = pf.fuse(run, KNOWN), pf.LiveEstimator(KNOWN)
-    stream = Stream(live, lambda _: None, lambda _: None)
-    for events in replayed(run, KNOWN, math.inf):
-        stream.take(events)
-    last = live.estimate(offline.origin + round(offline.time[-1] * 1e9))
-    for axis, track in offline.axes.items():
-        assert last[axis].position == track.position[-1]
-        assert last[axis].position_sd == track.position_sd[-1]
+    replay_is_as_live(run, KNOWN)
 
 
 class Watching:
