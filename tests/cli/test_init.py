@@ -85,6 +85,7 @@ def test_one_command_looks_fits_and_fuses(tmp_path: Path) -> None:
     assert ["camera.csv", "913", "29.74"] in [line[:3] for line in lines]
     (lag,) = [line for line in lines if line[:4] == ["lag", "of", "x,", "ms"]]
     assert 130.0 < float(lag[5]) < 145.0
+    assert "the latency of camera is taken to be 0 ms, not found" in " ".join(out.split())
     assert {"run.toml", "arm.toml", "fusion.toml", "summary.json", "fused.png"} < names(tmp_path / "fused")
     summary = json.loads((tmp_path / "fused" / "summary.json").read_text())
     assert summary["run"] == "log"

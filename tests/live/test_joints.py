@@ -216,6 +216,7 @@ BAD = {
     "a joint lacks": ({"j1": 0.1, "j2": 0.2}, "needs all joints of the .robot.; it has no j3, j4, j5, j6"),
     "a joint is none": ({**dict.fromkeys(JOINTS, 0.1), "j6": math.nan}, "it has no j6"),
     "a pose, too": ({**dict.fromkeys(JOINTS, 0.1), "x": 0.5}, "gives joints and x"),
+    "a joint far away": ({**dict.fromkeys(JOINTS, 0.1), "j6": 1e300}, "joint j6 is told to be where no robot can be"),
     "an orientation, too": ({**dict.fromkeys(JOINTS, 0.1), "orientation": (0, 0, 0, 1)}, "gives joints and orient"),
 }
 
@@ -231,6 +232,14 @@ def test_joints_that_are_no_pose_are_refused(case: str, tmp_path: Path) -> None:
         assert result.outcome is pf.Outcome.INVALID
         assert re.search(reason, result.reason)
     assert live.estimate(0.1) == before
+
+
+def test_a_name_that_is_none_is_answered_with_those_of_joints_too(tmp_path: Path) -> None:
+    """A command that calls a joint by its column."""
+    live = pf.LiveEstimator(known(run_of(tmp_path, seconds=1.0)))
+    result = live.command(0.0, j1_deg=0.1)
+    assert result.outcome is pf.Outcome.UNKNOWN
+    assert "unknown axis 'j1_deg'" in result.reason and "j1" in result.reason.split(";", 1)[1]
 
 
 def test_a_robot_that_does_not_fit_is_refused_in_one_line(tmp_path: Path) -> None:

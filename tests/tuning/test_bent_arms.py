@@ -22,7 +22,7 @@ def tuned(scenario: str, **changes: float) -> pf.Tuning:
     return quietly(lambda: pf.tune([made.run], config, fit=["noise", "delay", "plant"]))
 
 
-def test_play_is_found_from_any_first_value() -> None:
+def test_play_is_found_from_a_value_of_its_size() -> None:
     """3.4 degrees, from 2 and from 5, the same one: within a tenth, as noise shakes the drive within its play."""
     found = [tuned("tool-with-play", play=degrees * 0.0174533) for degrees in (2.0, 5.0)]
     one, other = (each.params["axes.wrist.play_deg"] for each in found)

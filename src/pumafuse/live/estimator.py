@@ -648,7 +648,9 @@ class LiveEstimator:
         """Why what an event gives under a name is of no axis."""
         if stranger in CARTESIAN and self.config.frame is None:
             return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
-        return f"unknown axis '{stranger:.40}'; {suggestion(stranger, self.axes)}" if stranger else "gives no axis"
+        if not stranger:
+            return "gives no axis"
+        return f"unknown axis '{stranger:.40}'; {suggestion(stranger, [*self.axes, *self.joints])}"
 
     def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
         """The result of an event by the codes of its axes; the same object for equal codes, but for unknown names."""

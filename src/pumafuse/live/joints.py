@@ -15,6 +15,7 @@ from ..fusion.config import FusionConfig
 from ..logs.frames import CARTESIAN
 from ..logs.manifest import chain_of
 from ..space.rotations import TURNING
+from ..space.urdf import MOST
 from ..units import Kind
 from .commands import number
 from .tool import NO_TOOL, ORIENTATION, takes_orientation
@@ -59,7 +60,7 @@ class Joints:
         """Where an event tells the joints to be; None if it tells of none.
 
         Raises:
-            ValueError: It lacks some, or gives a pose as well.
+            ValueError: It lacks some, gives one that no robot has, or a pose as well.
         """
         if self.kinds.keys().isdisjoint(values):
             return None
@@ -67,6 +68,8 @@ class Joints:
         lacking = [joint for joint, one in zip(self.kinds, found, strict=True) if not math.isfinite(one)]
         if lacking:
             raise ValueError(f"a pose needs all joints of the [robot]; it has no {', '.join(lacking)}")
+        if far := next((joint for joint, one in zip(self.kinds, found, strict=True) if abs(one) > MOST), None):
+            raise ValueError(f"joint {far} is told to be where no robot can be")
         if twice := next((name for name in (*CARTESIAN, *TURNING, ORIENTATION) if name in values), None):
             raise ValueError(f"gives joints and {twice}, which their pose has; give one")
         return found
