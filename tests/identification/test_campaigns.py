@@ -82,7 +82,7 @@ def estimates_of(found: pf.Identification) -> dict[str, tuple[float, tuple[float
         name: (getattr(part, name), getattr(part, f"{name}_ci95"))
         for part, names in fields.items()
         for name in names
-        if f"{name}_ci95" in names and getattr(part, name) is not None
+        if f"{name}_ci95" in names and getattr(part, name) not in (None, 0.0)  # an arm without play has 0
     }
 
 

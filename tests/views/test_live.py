@@ -315,17 +315,19 @@ def test_nothing_is_left_when_the_estimator_is_killed() -> None:
     """Its end of the pipe closes, and with it all that was started."""
     code = (
         "import time, pumafuse as pf; from pumafuse.views import live as v\n"
-        f"v.PORT, v.WEB_PORT = {live_view.PORT}, {live_view.WEB_PORT}\n"
+        "v.PORT, v.WEB_PORT = 0, 0\n"
         "config = pf.FusionConfig(arm=pf.ArmModel.load('puma560-internal'))\n"
         "view, live = v.LiveView('web', config, print), pf.LiveEstimator(config)\n"
         "while True: time.sleep(0.05); view.tick(live.health)\n"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
-    until(lambda: live_viewer._listens(live_view.WEB_PORT))
-    left = psutil.Process(parent.pid).children(recursive=True)
+    with subprocess.Popen([sys.executable, "-u", "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        try:
+            assert any("http://" in notice for notice in parent.stdout)  # it is there
+            left = psutil.Process(parent.pid).children(recursive=True)
+        finally:
+            parent.kill()
     assert len(left) == 2
-    parent.kill()
-    parent.wait()
     until(lambda: not any(map(alive, left)))
 
 
