@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from pumafuse.fusion.config import Placement
 from pumafuse.registration.findings import Finding, Reading
 from pumafuse.registration.motion import Motion
-from pumafuse.registration.register import Registered, Registration, registered
+from pumafuse.registration.register import Registered, Registration, registered, without_gaps
 from setups import Setup, answer
 
 DATA = Path(__file__).parent / "data"
@@ -452,3 +452,13 @@ def test_rests_do_not_decide_the_lag() -> None:
     finely = registered(*([one] for one in rests_and_moves(0.002, 0.0)))
     assert finely.position is not None
     assert finely.position.lag.value == pytest.approx(-0.001, abs=2e-3)
+
+
+def test_what_is_seen_in_a_gap_of_the_commands_is_left_out() -> None:
+    """From one usual interval after the last command before it until the arm has settled after the next; no more."""
+    given = np.concatenate([np.arange(0.0, 1.01, 0.02), np.arange(3.0, 4.01, 0.02)])
+    time = np.arange(0.0, 4.0, 1.0 / 64.0)  # exact in binary
+    seen = Motion(time, np.zeros((len(time), 3)))
+    kept = without_gaps(given, seen, settling=0.5).time
+    np.testing.assert_array_equal(kept, time[(time <= 1.02) | (time >= 3.5)])
+    np.testing.assert_array_equal(without_gaps(given[:51], seen.only(time <= 1.0), 0.5).time, time[time <= 1.0])
