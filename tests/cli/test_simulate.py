@@ -9,7 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -199,6 +200,35 @@ def test_sweeping_up_takes_nothing_of_others(tmp_path: Path) -> None:
     assert names(tmp_path) == {".scan.backup", "scan"}
     assert (users / "notes.txt").read_text() == "mine"
     assert names(tmp_path / "scan") == {"x"}
+
+
+@contextmanager
+def _interrupted_bar(_what: str, _total: float) -> Generator[Callable[[float], None]]:
+    """A progress bar during whose first move the user presses Ctrl-C."""
+
+    def move(_done: float) -> None:
+        raise KeyboardInterrupt
+
+    yield move
+
+
+def _writes(folder: Path, seconds: float) -> None:
+    with folders.replacing(folder) as new:
+        time.sleep(seconds)
+        (new / "x").write_text("")
+
+
+@pytest.mark.usefixtures("two_cores")
+def test_no_worker_writes_any_more_when_the_sweep_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where Ctrl-C comes while the bar is drawn, not while a result is waited for."""
+    monkeypatch.setattr(many, "progress_bar", _interrupted_bar)
+    jobs = {
+        name: partial(_writes, tmp_path / name, seconds) for name, seconds in {"a": 0.1, "b": 1.0, "c": 1.0}.items()
+    }
+    with pytest.raises(KeyboardInterrupt):
+        many.run_jobs("testing", jobs, [tmp_path / name for name in jobs])
+    time.sleep(1.5)  # what is still running would still write
+    assert names(tmp_path) == {"a"}
 
 
 @pytest.mark.long

@@ -48,7 +48,7 @@ def moved(axis: AxisModel, given: TimeArray, command: FloatArray, time: TimeArra
 
 def solved(axis: AxisModel, given: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
     """A Runge-Kutta method over the equations, command by command; the tool is pushed to where the drive turns."""
-    plant, fastest, half = axis.plant, axis.max_speed or np.inf, 0.5 * axis.play
+    plant, fastest, half = axis.plant, axis.max_speed or np.inf, 0.5 * (axis.play or 0.0)
     first, lag = isinstance(plant, FirstOrder), plant.lag
     follows, shortest = (0.0, lag) if isinstance(plant, FirstOrder) else (2.0 / lag, 1.0 / plant.natural_frequency)
     if isinstance(plant, SecondOrder):
@@ -92,7 +92,7 @@ def test_the_differential_equation_is_solved(plant: PLANTS, recovery: float | No
         axis = AxisModel(plant=plant, gain=PAPER, gain_recovery=recovery, **bends)
         found, free = (
             moved(axis, given, command, time),
-            moved(changed(axis, max_speed=None, play=0.0), given, command, time),
+            moved(changed(axis, max_speed=None, play=None), given, command, time),
         )
         np.testing.assert_allclose(found, solved(axis, given, command, time), rtol=0.0, atol=1e-9)
         assert np.abs(found - free).max() > 1e-3

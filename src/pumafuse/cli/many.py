@@ -58,9 +58,11 @@ def run_jobs(
     results: dict[str, R] = {}
     failed: dict[str, str] = {}
     parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
+    work = (delayed(_guarded)(name, job) for name, job in jobs.items())
+    outcomes = cast(Generator[tuple[str, R | None, str | None]], parallel(work))
     try:
         with progress_bar(what, len(jobs)) as move:
-            for name, result, problem in parallel(delayed(_guarded)(name, job) for name, job in jobs.items()):
+            for name, result, problem in outcomes:
                 if problem is None:
                     results[name] = cast(R, result)
                 else:
@@ -73,6 +75,9 @@ def run_jobs(
         kept = f"{len(results)} of {len(jobs)} runs are done and kept"
         raise PumafuseError(f"a worker process died (out of memory?): {kept}") from None
     finally:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of work that is not used
+            outcomes.close()  # only now does no worker write any more
         sweep(places)
     done = {name: results[name] for name in jobs if name in results}
     return done, {name: failed[name] for name in jobs if name in failed}

@@ -26,7 +26,7 @@ def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Rec
     else:
         found["natural_frequency"], found["damping"] = plant.natural_frequency, plant.damping
     found["slope"], found["intercept"], found["recovery"] = gain.slope, gain.intercept, axis.gain_recovery or 0.0
-    found["max_speed"], found["play"] = axis.max_speed or 0.0, axis.play
+    found["max_speed"], found["play"] = axis.max_speed or 0.0, axis.play or 0.0
     if (sag := axis.sag) is not None:
         found["sag_offset"], found["sag_slope"], found["sag_knee"] = sag.offset, sag.slope, sag.knee or 0.0
         found["sag_slope_beyond"] = sag.slope if sag.slope_beyond is None else sag.slope_beyond

@@ -82,7 +82,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         gain_recovery_ci95: Its 95 % interval [s], if it was fitted.
         max_speed: The fastest that the axis itself goes [m/s or rad/s]; None: as fast as it is asked to.
         max_speed_ci95: Its 95 % interval [m/s or rad/s], if it was fitted.
-        play: Width of the backlash between drive and tool [m or rad].
+        play: Width of the backlash between drive and tool [m or rad]; None: it has none.
         play_ci95: Its 95 % interval [m or rad], if it was fitted.
         sag: How far a static load holds the tool off.
         delay: Dead time [s] of this axis if it differs from the arm's.
@@ -98,7 +98,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     gain_recovery_ci95: Interval | None = msgspec.field(name="gain_recovery_ms_ci95", default=None)
     max_speed: Positive | None = msgspec.field(name="max_speed_mm_s", default=None)
     max_speed_ci95: Interval | None = msgspec.field(name="max_speed_mm_s_ci95", default=None)
-    play: NotNegative = msgspec.field(name="play_mm", default=0.0)
+    play: NotNegative | None = msgspec.field(name="play_mm", default=None)
     play_ci95: Interval | None = msgspec.field(name="play_mm_ci95", default=None)
     sag: Sag | None = None
     delay: Delay | None = msgspec.field(name="delay_ms", default=None)
@@ -214,7 +214,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         plant = [one for one in msgspec.structs.astuple(axis.plant) if isinstance(one, float | int)]
         optional = [1.0 if one is None else one for one in (axis.gain_recovery, axis.max_speed)]
         positive = self.update_period, *optional, *plant
-        not_negative = self.delay, 0.0 if axis.delay is None else axis.delay, axis.play
+        not_negative = self.delay, *(0.0 if one is None else one for one in (axis.delay, axis.play))
         if not math.isfinite(sum(positive) + sum(not_negative) + axis.gain.slope + axis.gain.intercept):
             raise ConfigError(f"axes.{name}: period, delay, plant, gain, fastest speed and play must be finite")
         if min(positive) <= 0.0 or min(not_negative) < 0.0:

@@ -111,7 +111,7 @@ class TrueArm(Imperfections, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         recovery = model.gain_recovery if self.gain_recovery is None else self.gain_recovery
         max_speed = model.max_speed if self.max_speed is None else self.max_speed
         imperfections = {name: getattr(self, name) for name in Imperfections.__struct_fields__}
-        imperfections["backlash"] = model.play if self.backlash is None else self.backlash
+        imperfections["backlash"] = (model.play or 0.0) if self.backlash is None else self.backlash
         return TrueAxis(
             plant=self._plant(model.plant, where),
             gain=model.gain if self.gain is None else self.gain,
