@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 import typer
 
@@ -72,6 +73,21 @@ def test_one_command_fuses_the_shipped_scan_to_a_tenth_of_a_millimetre(tmp_path:
     summary = json.loads((tmp_path / "fused" / "summary.json").read_text())
     for axis in summary["axes"].values():
         assert axis["score"]["coverage"] > 0.9
+
+
+@pytest.mark.long
+def test_one_command_finds_play_and_says_it(tmp_path: Path) -> None:
+    """3.4 degrees within a tenth, in tables that nothing describes; what is left is consistent."""
+    made = pf.simulate(pf.Scenario.load(EXAMPLES.parent / "scenarios" / "tool-with-play.toml")).run
+    (tmp_path / "log").mkdir()
+    for name, source in (("robot", made.command), ("camera", made.sensors["camera"])):
+        rows = zip((source.stamp * 1e-9).tolist(), np.degrees(source.values["wrist"]).tolist(), strict=True)
+        lines = [f"{t:.6f},{value:.6f}" for t, value in rows]
+        (tmp_path / "log" / f"{name}.csv").write_text("\n".join(["time_s,wrist_deg", *lines]) + "\n")
+    out = pumafuse("fuse", tmp_path / "log", "-o", tmp_path / "fused").stdout
+    (play,) = [line.split() for line in out.splitlines() if line.split()[:1] == ["axes.wrist.play_deg"]]
+    assert float(play[2]) == pytest.approx(3.4, rel=0.1)
+    assert "consistent" in out and "turns with the direction" not in out
 
 
 def test_one_command_looks_fits_and_fuses(tmp_path: Path) -> None:

@@ -53,17 +53,18 @@ ARMS = [
 
 
 @pytest.mark.parametrize("arm", ARMS)
-def test_what_bends_an_axis_and_is_known_is_part_of_its_response(arm: Arm) -> None:
-    """Play, a fastest speed and sag; of parts of a recording, too."""
-    bent = {"max_speed": 0.4, "play": 0.01, "sag": Sag(offset=0.01, slope=-0.05)}
-    axis = replaced(arm.model, **bent)
+def test_what_bends_an_axis_is_part_of_its_response(arm: Arm) -> None:
+    """Play and a fastest speed of the arm, the sag that is known of the axis; of parts of a recording, too."""
+    bent = arm._replace(max_speed=0.4, play=0.01)
+    axis = replaced(bent.model, sag=Sag(offset=0.01, slope=-0.05))
+    assert Arm.of(axis, arm.delay) == pytest.approx(bent, rel=1e-12)
     one = recording(3)
     expected = response(axis, T, arm.delay, one.given, one.command, one.start, one.time)
     straight = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
     assert np.abs(expected - straight).max() > 0.005
     measured = Measured([one], T, ["a"], axis).of([one._replace(value=expected).of(slice(None, None, 2))])
-    np.testing.assert_allclose(measured.responses(arm)[0], expected[::2], rtol=0.0, atol=1e-12)  # cut elsewhere
-    assert np.abs(measured.residuals(arm)[0]).max() < 1e-12
+    np.testing.assert_allclose(measured.responses(bent)[0], expected[::2], rtol=0.0, atol=1e-12)  # cut elsewhere
+    assert np.abs(measured.residuals(bent)[0]).max() < 1e-12
 
 
 @pytest.mark.parametrize("rest", RESTS)

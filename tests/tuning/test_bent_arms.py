@@ -1,4 +1,4 @@
-"""A play and a fastest speed that an axis is said to have are fitted."""
+"""Play and a fastest speed of an axis are fitted, whether arm.toml has them or not."""
 
 from __future__ import annotations
 
@@ -13,34 +13,38 @@ from tuning_runs import quietly
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
-def tuned(scenario: str, **changes: float) -> pf.Tuning:
+def tuned(scenario: str, fix: tuple[str, ...] = (), **changes: float | None) -> pf.Tuning:
     """A scenario's run, tuned from its own arm with ``changes`` of its axis."""
     made = pf.simulate(pf.Scenario.load(SCENARIOS / f"{scenario}.toml"))
     ((axis, model),) = made.config.arm.axes.items()
     arm = replace(made.config.arm, axes={axis: replace(model, **changes)})
     config = replace(made.config, arm=arm)
-    return quietly(lambda: pf.tune([made.run], config, fit=["noise", "delay", "plant"]))
+    return quietly(lambda: pf.tune([made.run], config, fit=["noise", "delay", "plant"], fix=fix))
 
 
-def test_play_is_found_from_a_value_of_its_size() -> None:
-    """3.4 degrees, from 2 and from 5, the same one: within a tenth, as noise shakes the drive within its play."""
-    found = [tuned("tool-with-play", play=degrees * 0.0174533) for degrees in (2.0, 5.0)]
-    one, other = (each.params["axes.wrist.play_deg"] for each in found)
-    assert one == pytest.approx(3.4, rel=0.1)
-    assert one == pytest.approx(other, rel=1e-3)
+def test_play_is_found_from_any_value() -> None:
+    """3.4 degrees, from none, 2 and 40, the same: within a tenth, as noise shakes the drive within its play."""
+    found = [tuned("tool-with-play", play=degrees and degrees * 0.0174533) for degrees in (None, 2.0, 40.0)]
+    first, *others = (each.params["axes.wrist.play_deg"] for each in found)
+    assert first == pytest.approx(3.4, rel=0.1)
+    assert others == pytest.approx([first, first], rel=1e-3)
     low, high = found[0].config.arm.axes["wrist"].play_ci95 or (0.0, 0.0)
-    assert low < found[0].config.arm.axes["wrist"].play < high < 1.1 * low
+    assert low < found[0].config.arm.axes["wrist"].play < high < 1.2 * low
+    assert "play: about 3." in found[0].details.orders["wrist"]
 
 
 @pytest.mark.long
-def test_a_fastest_speed_is_found() -> None:
-    """365 degrees a second, from 290: within a hundredth, and written with its interval."""
-    found = tuned("saturating-servo", max_speed=290.0 * 0.0174533)
+@pytest.mark.parametrize("degrees", [None, 290.0])
+def test_a_fastest_speed_is_found(degrees: float | None) -> None:
+    """365 degrees a second, from none and from 290: within a hundredth, and written with its interval."""
+    found = tuned("saturating-servo", max_speed=degrees and degrees * 0.0174533)
     assert found.params["axes.joint.max_speed_deg_s"] == pytest.approx(365.0, rel=0.01)
     assert "max_speed_deg_s_ci95" in found.config.arm.to_toml()
 
 
-def test_an_arm_without_play_gets_none() -> None:
-    """Neither is fitted where arm.toml does not have it."""
-    found = tuned("tool-with-play", play=0.0)
-    assert not [key for key in found.params if "play" in key or "max_speed" in key]
+@pytest.mark.long
+def test_play_that_is_fixed_is_not_looked_for() -> None:
+    """``--fix play_deg`` leaves an arm without it as it is."""
+    found = tuned("tool-with-play", fix=("play_deg",), play=None)
+    assert not [key for key in found.params if "play" in key]
+    assert found.config.arm.axes["wrist"].play is None

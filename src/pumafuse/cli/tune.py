@@ -16,9 +16,9 @@ from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, ROBOT_FILE, FusionConfig
 from ..logs.run import Run
 from ..tuning.parameters import kinds_of
-from ..tuning.summary import TuningSummary
+from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Progress, tune
-from ..units import SCREEN
+from ..units import SCREEN, as_length
 from ..views import formatting
 from .tables import interval, number, print_tables, table
 
@@ -26,6 +26,7 @@ SUMMARY = "tuning.json"
 PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", ARM_FILE, ROBOT_FILE})
 _HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
+_BENDS = ("play_mm", "max_speed_mm_s")  # of an axis
 _PAIRS = 3  # of correlated parameters that are shown
 _WORSE, _INTERRUPTED = 3, 130
 
@@ -109,8 +110,9 @@ def fitting() -> Generator[Progress]:
 
 
 def show_lags(summary: TuningSummary, period: float) -> None:
-    """Print the lags alone; period [s]."""
-    print_tables([table(_HEADINGS, _lags(summary))])
+    """Print the lags, and play and fastest speeds where there are any; period [s]."""
+    bends = [_row(one) for one in summary.parameters if as_length(one.key.rpartition(".")[2]) in _BENDS]
+    print_tables([table(_HEADINGS, [*_lags(summary), *bends])])
     typer.echo(formatting.lag(period))
 
 
@@ -142,13 +144,14 @@ def _show(summary: TuningSummary, period: float) -> None:
 
 def _parameters(summary: TuningSummary) -> Table:
     """The lags and the parameters with their intervals."""
-    rows = [
-        [one.key, number(one.before, ".4g"), number(one.value, ".4g"), _limits(one.ci95), one.notes]
-        for one in summary.parameters
-    ]
+    rows = [[*_row(one), one.notes] for one in summary.parameters]
     made = table([*_HEADINGS, ""], [*([*row, ""] for row in _lags(summary)), *rows])
     made.columns[0].no_wrap = True
     return made
+
+
+def _row(one: Fitted) -> list[str]:
+    return [one.key, number(one.before, ".4g"), number(one.value, ".4g"), _limits(one.ci95)]
 
 
 def _lags(summary: TuningSummary) -> list[list[str]]:

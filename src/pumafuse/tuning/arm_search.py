@@ -16,6 +16,8 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray
 from .arms import SHOWN, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
+from .bends import BENDS, Bend, Bent, bent_arm
+from .bends import BOUNDS as BENT_BOUNDS
 from .parameters import QUICKEST, RECOVERY, RECOVERY_PRIOR
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
 from .posterior import (
@@ -33,11 +35,11 @@ from .posterior import (
     sharing,
 )
 
-BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": RECOVERY, "gain": (0.3, 3.0)}  # s, but ζ and K
+BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": RECOVERY, "gain": (0.3, 3.0), **BENT_BOUNDS}
 _USUAL_GAIN, _BEYOND = (0.7, 1.3), 1.25  # where it may be; where least squares find another, so many times that
 # A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
 PRIORS = {"gain": (1.0, 0.1), "damping": (0.0, 0.7), "recovery": RECOVERY_PRIOR}
-_LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each share of which is as likely
+_LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each share of which is as likely; so of play and speed
 _STARTS = 3  # maxima of the grid from which an arm is fitted
 _NEARLY = 40.0  # log-likelihood that a better noise may gain
 _NEAR = 20.0  # log-likelihood behind the best, up to which a maximum of the grid is looked at
@@ -71,7 +73,7 @@ class Freedom(NamedTuple):
     """
 
     given: Arm
-    free: Collection[str] = ("delay", "lag", "damping", "recovery", "gain")
+    free: Collection[str] = ("delay", "lag", "damping", "recovery", "gain", *BENDS)
     orders: Sequence[int] = (1, 2)
     gains: Sequence[GainKind] = GAINS
 
@@ -80,11 +82,23 @@ class Freedom(NamedTuple):
         """The models to try, the simplest first."""
         return sorted((Model(*one) for one in product(self.orders, self.gains)), key=lambda model: model.size)
 
+    @property
+    def bends(self) -> list[Bend]:
+        """What of play and a fastest speed the arm has."""
+        return [kind for kind in BENDS if getattr(self.given, kind)]
+
     def names(self, model: Model) -> list[str]:
         """The coordinates of a model that are free, the dead time first."""
         found = ["delay", "lag"] if model.order == 1 else ["delay", "lag", "damping"]
         found += {"given": [], "static": ["gain"], "recovering": ["gain", "recovery"]}[model.gain]
+        found += self.bends
         return [name for name in found if name in self.free]
+
+    def bent(self, bent: Bent | None) -> Freedom:
+        """With the play and the fastest speed that were found; without any, those that are given stay."""
+        if bent is None:
+            return self
+        return self._replace(given=self.given._replace(play=bent.arm.play, max_speed=bent.arm.max_speed))
 
     def shaped(self, arm: Arm, gain: GainKind) -> Arm:
         """An arm with the kind of gain; one as it is given keeps what is known of it."""
@@ -99,7 +113,8 @@ class ArmSearch:
     Attributes:
         freedom: What was to be found.
         sensors: By which it is known.
-        plain: The arm of least squares; None where nothing moves.
+        plain: The linear arm of least squares; None where nothing moves.
+        bent: Their arm with play, a fastest speed or both; None for a linear axis.
         limits: Where its numbers may lie.
         rest: What the best arm leaves.
         rests: Likewise, without a disturbance, with a smooth one and with a rough one.
@@ -123,11 +138,14 @@ class ArmSearch:
             believed: Whether the sensors' noise is believed to be what second differences show.
             near: What was found on a part of the measurements, to begin from.
         """
-        self._measured, self.freedom, self.sensors = measured, freedom, measured.sensors
+        self._measured, self.sensors = measured, measured.sensors
         self._longest = longest_delay(measured.period)
         self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
+        self.bent = self._bent(freedom)
+        self.freedom = freedom.bent(self.bent)
         self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
-        self._fits = self._by_least_squares() if near is None else near._fits
+        likewise = near is not None and near.freedom.bends == self.freedom.bends
+        self._fits = near._fits if near is not None and likewise else self._by_least_squares()
         still = {model: fit for model, fit in self._fits.items() if model.gain == "static"}
         gain = self._best(still).arm.gain if still else 1.0
         low, high = _USUAL_GAIN
@@ -175,6 +193,11 @@ class ArmSearch:
         information, scatter = self._measured.scattered(arm, free, self.rest, self.limits, _PIECES)
         cov = covariance(information)
         return max(1.0, math.sqrt(float(slope @ cov @ scatter @ cov @ slope) / float(slope @ cov @ slope)))
+
+    def _bent(self, freedom: Freedom) -> Bent | None:
+        if self.plain is None or not {"delay", "lag"} <= set(freedom.free):
+            return None
+        return bent_arm(self.plain, freedom.given, [*freedom.free])
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
@@ -323,7 +346,7 @@ class ArmSearch:
             if name in PRIORS:
                 log -= math.log(PRIORS[name][1] * math.sqrt(2.0 * math.pi))
             else:  # uniform: where the likelihood is flat, it ends at its bounds all the same
-                width = _LOG_RANGE if name == "lag" else self._longest
+                width = self._longest if name == "delay" else _LOG_RANGE
                 log -= math.log(width)
                 information[place, place] += 12.0 / width**2
         if free:
@@ -433,4 +456,8 @@ def _quantities(arm: Arm) -> dict[Quantity, float]:
         found["time_constant"] = math.log(arm.lag)
     if arm.recovery:
         found["gain_recovery"] = math.log(arm.recovery)
+    if arm.play:
+        found["play"] = math.log(arm.play)
+    if arm.max_speed:
+        found["max_speed"] = math.log(arm.max_speed)
     return found

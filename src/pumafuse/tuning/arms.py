@@ -40,12 +40,15 @@ _CLOSE = 0.01  # log-likelihood: what is expected to gain less is no step
 _STEPS = 12  # of Gauss and Newton, at most
 _SHIFT, _LOG_SHIFT = 1e-4, 1e-3  # s, 1: by which responses are varied; delays are coarser than a nanosecond's rounding
 # longest step of each coordinate; a slope is linear, and its unit is of any size
-_REACH = {"delay": 0.03, "lag": 0.7, "damping": 0.7, "recovery": 0.7, "gain": 1.0, "slope": math.inf}
+_REACH = {
+    "delay": 0.03, "lag": 0.7, "damping": 0.7, "recovery": 0.7, "gain": 1.0, "slope": math.inf,
+    "play": 0.7, "max_speed": 0.3,
+}  # fmt: skip
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _LOG_2PI = math.log(2.0 * math.pi)
 
 Coordinates: TypeAlias = Sequence[str]  # among the fields below
-LOGARITHMIC = ("lag", "damping", "recovery")
+LOGARITHMIC = ("lag", "damping", "recovery", "play", "max_speed")
 
 
 class Recording(NamedTuple):
@@ -109,6 +112,8 @@ class Arm(NamedTuple):
         recovery: Time constant with which the gain recovers [s]; 0: it stays.
         gain: K of slow motion.
         slope: What it gains with speed [s/m].
+        play: Width of the backlash between drive and tool [m]; 0: it has none.
+        max_speed: The fastest that the drive goes [m/s]; 0: as fast as it is asked to.
     """
 
     delay: float
@@ -117,6 +122,8 @@ class Arm(NamedTuple):
     recovery: float = 0.0
     gain: float = 1.0
     slope: float = 0.0
+    play: float = 0.0
+    max_speed: float = 0.0
 
     @property
     def total(self) -> float:
@@ -125,19 +132,25 @@ class Arm(NamedTuple):
 
     @property
     def model(self) -> AxisModel:
-        """Plant and gain."""
+        """Plant, gain, fastest speed and play."""
         plant: FirstOrder | SecondOrder = FirstOrder(time_constant=self.lag)
         if self.damping:
             plant = SecondOrder(natural_frequency=2.0 * self.damping / self.lag, damping=self.damping)
         gain = Gain(slope=self.slope, intercept=self.gain)
-        return AxisModel(plant=plant, gain=gain, gain_recovery=self.recovery or None)
+        return AxisModel(
+            plant=plant,
+            gain=gain,
+            gain_recovery=self.recovery or None,
+            max_speed=self.max_speed or None,
+            play=self.play or None,
+        )
 
     @classmethod
     def of(cls, axis: AxisModel, delay: float) -> Arm:
         """That of an axis's model and its dead time [s]."""
         damping = axis.plant.damping if isinstance(axis.plant, SecondOrder) else 0.0
-        gain = axis.gain
-        return cls(delay, axis.plant.lag, damping, axis.gain_recovery or 0.0, gain.intercept, gain.slope)
+        gain, bends = axis.gain, (axis.play or 0.0, axis.max_speed or 0.0)
+        return cls(delay, axis.plant.lag, damping, axis.gain_recovery or 0.0, gain.intercept, gain.slope, *bends)
 
     def coordinate(self, name: str) -> float:
         """One of its numbers; of what can only be positive the logarithm."""
@@ -196,9 +209,8 @@ class Measured:
     def __init__(
         self, recordings: Sequence[Recording], period: float, sensors: Sequence[str], known: AxisModel | None = None
     ) -> None:
-        """By these ``sensors``, of an axis of update period ``period`` [s], whose play, limit and sag are ``known``."""
+        """By these ``sensors``, of an axis of update period ``period`` [s], which sags as the ``known`` model does."""
         self.recordings, self.period, self.sensors, self._known = recordings, period, sensors, known
-        self._linear_gain = known is None or (known.max_speed is None and not known.play and known.sag is None)
         self.count = int(sum(one.weight.sum() for one in recordings))
         self.range = max((float(np.ptp(one.value)) for one in recordings if len(one.value)), default=0.0)
         self._offset = _FAR * max(self.range, 1e-6)
@@ -397,11 +409,14 @@ class Measured:
         here, rows = self._response(one, arm), list[FloatArray]()
         for name in names:
             step = _LOG_SHIFT if name in LOGARITHMIC else _SHIFT
-            if name in ("gain", "slope") and self._linear_gain:
+            if name in ("gain", "slope") and self._is_linear(arm):
                 step = 1.0
             there = arm.moved([name], [arm.coordinate(name) + step])
             rows.append((self._response(one, there) - here) / step)
         return np.array([here, *rows])
+
+    def _is_linear(self, arm: Arm) -> bool:
+        return not (arm.play or arm.max_speed) and (self._known is None or self._known.sag is None)
 
     def _columns(self, one: Recording) -> FloatArray:
         """The measurements, and for each sensor but the first which are its, (s, m)."""
@@ -418,13 +433,17 @@ class Measured:
 
     def _records(self, arms: Sequence[Arm], start: float = 0.0) -> Record:
         """Arms as the core takes them, (n,)."""
-        found, (delay, lag, damping, recovery, gain, slope) = np.zeros(len(arms), AXIS), np.array(arms).T
+        found, (delay, lag, damping, recovery, gain, slope, play, max_speed) = (
+            np.zeros(len(arms), AXIS),
+            np.array(arms).T,
+        )
         if self._known is not None:
             found[:] = record_of(self._known, self.period, 0.0, start)
         found["period"], found["delay"], found["start"] = self.period, delay, start
         found["time_constant"] = np.where(damping > 0.0, 0.0, lag)
         found["natural_frequency"], found["damping"] = 2.0 * damping / lag, damping
         found["slope"], found["intercept"], found["recovery"] = slope, gain, recovery
+        found["play"], found["max_speed"] = play, max_speed
         return found
 
     def _variance(self, one: Recording, rest: Rest) -> FloatArray:

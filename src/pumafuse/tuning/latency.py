@@ -27,9 +27,10 @@ from ..logs.run import REFERENCE, Run
 from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..toml import Interval
-from ..units import MS
+from ..units import MS, SCREEN, Kind
 from .arm_search import ArmSearch, Chosen, Freedom, chosen_arms
 from .arms import Arm
+from .bends import BENDS
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
 from .parameters import (
@@ -84,6 +85,11 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
         gain_ci95: Its interval; null where it was taken to be 1.
         gain_recovery: Time constant with which the gain recovers [s]; null: it does not.
         gain_recovery_ci95: Its interval.
+        kind: Whether its positions are lengths [m] or angles [rad].
+        play: Width of the backlash between drive and tool [m or rad]; null: none was found.
+        play_ci95: Its interval.
+        max_speed: The fastest that the axis itself goes [m/s or rad/s]; null: no limit was found.
+        max_speed_ci95: Its interval.
         drift: How much later it is at the end than at the beginning [s]; null: not known.
         drift_sd: Its standard deviation [s].
         drifts: Whether that is more than chance.
@@ -110,6 +116,11 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
     gain_ci95: Interval | None = None
     gain_recovery: float | None = msgspec.field(name="gain_recovery_ms", default=None)
     gain_recovery_ci95: Interval | None = msgspec.field(name="gain_recovery_ms_ci95", default=None)
+    kind: Kind = "length"
+    play: float | None = msgspec.field(name="play_mm", default=None)
+    play_ci95: Interval | None = msgspec.field(name="play_mm_ci95", default=None)
+    max_speed: float | None = msgspec.field(name="max_speed_mm_s", default=None)
+    max_speed_ci95: Interval | None = msgspec.field(name="max_speed_mm_s_ci95", default=None)
     drift: float | None = msgspec.field(name="drift_ms", default=None)
     drift_sd: float | None = msgspec.field(name="drift_sd_ms", default=None)
     drifts: bool = False
@@ -210,8 +221,8 @@ class Latency:
                 if hasattr(arm.axes[axis].plant, name):
                     arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(one, f"{name}_ci95"))
             arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), one.gain_ci95)
-            arm = changed(arm, ("axes", axis, "gain_recovery_ci95"), one.gain_recovery_ci95)
-            arm = changed(arm, ("axes", axis, "lag_ci95"), one.lag_ci95)
+            for name in ("gain_recovery", "play", "max_speed", "lag"):
+                arm = changed(arm, ("axes", axis, f"{name}_ci95"), getattr(one, f"{name}_ci95"))
             own = arm.axes[axis].delay is not None
             arm = changed(arm, ("axes", axis, "delay_ci95") if own else ("delay_ci95",), one.delay_ci95)
         provenance = {"identified_on": self.details.runs, "sensor": self.details.sensor}
@@ -220,6 +231,7 @@ class Latency:
     def to_json(self) -> str:
         """All of it as JSON, in the units of the names."""
         tree = toml.reported(self.details)
+        tree["axes"] = {axis: toml.reported(one, one.kind) for axis, one in self.details.axes.items()}
         return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode() + "\n"
 
 
@@ -414,7 +426,7 @@ def _arm(config: FusionConfig, found: Mapping[str, ArmSearch], trusted: str) -> 
     for axis, one in chosen.items():
         arm = Arm(*(rounded(number) for number in one.arm))
         config = with_rest(with_arm(config, axis, arm), axis, found[axis].rest, [trusted])
-        lags[axis] = _axis_lag(found[axis], one._replace(arm=arm), trusted)
+        lags[axis] = _axis_lag(found[axis], one._replace(arm=arm), trusted, config.arm.axes[axis].kind)
     shares = [axis for axis, one in chosen.items() if one.shares]
     return with_shared_delay(config, shares, rounded(delay)) if delay is not None else config, lags
 
@@ -443,7 +455,7 @@ def _notes(one: AxisLag, gains: tuple[float, float]) -> list[str]:
     return found
 
 
-def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str) -> AxisLag:
+def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> AxisLag:
     arm, model, mixture, shared = chosen
 
     def interval(quantity: Quantity, value: float, margin: float = _MARGIN) -> Interval:
@@ -453,7 +465,7 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str) -> AxisLag:
         def alike(one: Model) -> bool:
             if quantity in ("gain", "gain_recovery"):
                 return one.gain == model.gain
-            return quantity in ("lag", "delay") or one.order == model.order
+            return quantity in ("lag", "delay", *BENDS) or one.order == model.order
 
         middle = math.log(value) if log else value
         low, high = mixture.quantiles(quantity, alike)
@@ -478,15 +490,19 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str) -> AxisLag:
         plant="first-order" if model.order == 1 else "second-order",
         gain=arm.gain,
         gain_ci95=None if model.gain == "given" else interval("gain", arm.gain),
+        kind=kind,
     )
     values: dict[str, Any] = {}
     for name in ("time_constant", "natural_frequency", "damping"):
         if (value := getattr(plant, name, None)) is not None:
             values |= {name: value, f"{name}_ci95": interval(name, value)}
+    for bend in search.freedom.bends:
+        values |= {bend: getattr(arm, bend), f"{bend}_ci95": interval(bend, getattr(arm, bend))}
     if arm.recovery:
         values |= {"gain_recovery": arm.recovery, "gain_recovery_ci95": interval("gain_recovery", arm.recovery)}
     found = msgspec.structs.replace(found, **values)
-    return msgspec.structs.replace(found, notes=_notes(found, search.limits.bounds["gain"]))
+    notes = ["; ".join(search.bent.sentences(SCREEN[kind]))] if search.bent is not None else []
+    return msgspec.structs.replace(found, notes=[*notes, *_notes(found, search.limits.bounds["gain"])])
 
 
 def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:

@@ -301,6 +301,8 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
     for order in (1, 2):
         for axis in sensors:
             config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
+            for bend in ("play", "max_speed"):
+                config = changed(config, ("arm", "axes", axis, bend), 1.0)
         config = with_drifts(with_own_delays(config, sensors))
         keys |= {one.key for one in parameters(config, config, sensors, FITS)}
     for name in fixed:
@@ -410,7 +412,7 @@ def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> Fusion
 def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     """The configuration with another arm of an axis, and a delay of its own."""
     model = arm.model
-    for name in ("plant", "gain", "gain_recovery"):
+    for name in ("plant", "gain", "gain_recovery", "max_speed", "play"):
         config = changed(config, ("arm", "axes", axis, name), getattr(model, name))
     return changed(config, ("arm", "axes", axis, "delay"), arm.delay)
 

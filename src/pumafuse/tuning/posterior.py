@@ -20,8 +20,8 @@ from ..arrays import FloatArray
 from .arms import Arm
 
 Quantity: TypeAlias = Literal[
-    "lag", "delay", "gain", "gain_recovery", "time_constant", "natural_frequency", "damping"
-]  # s, but for the gain, ω [rad/s] and ζ
+    "lag", "delay", "gain", "gain_recovery", "time_constant", "natural_frequency", "damping", "play", "max_speed"
+]  # s, but for the gain, ω [rad/s], ζ, play [m] and the fastest speed [m/s]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 GainKind: TypeAlias = Literal["given", "static", "recovering"]
 GAINS: tuple[GainKind, ...] = get_args(GainKind)

@@ -17,6 +17,7 @@ from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
 from .arm_search import SMOOTHER, WANDERS, ArmSearch, Freedom, chosen_arms
 from .arms import Arm
+from .bends import BENDS
 from .identifiability import covariance
 from .likelihood import Likelihood, in_threads
 from .maximise import Notify, Point, derivatives, maximise, maximise_by_axis, maximise_with_gates, point
@@ -48,6 +49,8 @@ _NAMES = {  # of an arm's coordinates, by the fields that they are in a configur
     "damping": "damping",
     "intercept": "gain",
     "gain_recovery": "recovery",
+    "play": "play",
+    "max_speed": "max_speed",
 }
 
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
@@ -125,7 +128,7 @@ def arm_searches(
 def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom:
     """What of an axis's arm the free parameters leave open."""
     given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
-    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if given.damping else 1.0, 0.1))
+    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if given.damping else 1.0, 0.1, play=1e-3, max_speed=1.0))
     here, there = ({one.path[-1] for one in free(at) if one.axis == axis} for at in (config, other))
     if any(one.fit == "delay" for one in free(config) if one.axis in (None, axis)):
         here.add("delay")
@@ -136,7 +139,7 @@ def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom:
         here, gains, given = here | {"gain_recovery"}, GAINS, given._replace(gain=1.0, recovery=0.0, slope=0.0)
     elif "intercept" in here:
         gains = ("recovering" if given.recovery else "static",)
-    here |= plants[0] if whole else here
+    here |= plants[0] | (there & {*BENDS}) if whole else here
     names = {_NAMES[field] for field in here if field in _NAMES}
     order = 2 if given.damping else 1
     return Freedom(given, names, (1, 2) if whole else (order,), gains)
@@ -153,6 +156,8 @@ def _with_arms(
     for axis, one in found.items():
         config = with_arm(config, axis, one.arm)
         reasons[axis] += _why(searched[axis].freedom, one.mixture, one.model)
+        if (bent := searched[axis].bent) is not None:
+            reasons[axis] += bent.sentences(config.arm.screen_of(axis))
         if len(delayed) > 1 and axis in delayed:
             gain = f" (own {worth[axis]:+.1f})" if axis in worth else ""
             reasons[axis].append(f"delay: {'shared' if one.shares else 'its own'}{gain}")

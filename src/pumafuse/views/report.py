@@ -231,10 +231,17 @@ def lags(found: LatencySummary) -> TextTable:
 
 
 def _plant_of(one: AxisLag) -> str:
+    lines, screen = list[str](), SCREEN[one.kind]
     if one.time_constant is not None:
-        return f"τ {formatting.between(one.time_constant, one.time_constant_ci95, MS)} ms"
-    frequency = formatting.between(one.natural_frequency or 0.0, one.natural_frequency_ci95)
-    return f"ω {frequency} rad/s\nζ {formatting.between(one.damping or 0.0, one.damping_ci95)}"
+        lines.append(f"τ {formatting.between(one.time_constant, one.time_constant_ci95, MS)} ms")
+    else:
+        lines.append(f"ω {formatting.between(one.natural_frequency or 0.0, one.natural_frequency_ci95)} rad/s")
+        lines.append(f"ζ {formatting.between(one.damping or 0.0, one.damping_ci95)}")
+    if one.play:
+        lines.append(f"play {formatting.between(one.play, one.play_ci95, screen.scale)} {screen.unit}")
+    if one.max_speed:
+        lines.append(f"up to {formatting.between(one.max_speed, one.max_speed_ci95, screen.scale)} {screen.unit}/s")
+    return "\n".join(lines)
 
 
 def _gain_of(one: AxisLag) -> str:

@@ -1,0 +1,154 @@
+"""Whether an axis has play or a fastest speed: tried on its motion, judged where it was not fitted.
+
+What turns with the direction looks like a resonance in one motion, and what clips with the speed like a longer lag. The
+likelihood of that motion cannot tell them apart; another part of it can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from itertools import product
+from typing import Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..units import Screen
+from .arms import Arm, Limits, Measured, Recording
+from .plain import PlainArm
+
+Bend: TypeAlias = Literal["play", "max_speed"]
+BENDS: tuple[Bend, ...] = get_args(Bend)
+
+BOUNDS = {"play": (1e-6, 1.0), "max_speed": (1e-3, 100.0)}  # m, m/s
+_ANY = {"delay": (0.0, 10.0), "lag": (1e-4, 4.0), "damping": (0.2, 8.0), "gain": (0.3, 3.0)}
+_PARTS = 24  # of the time, every second of which arms are fitted to; they are judged on the others
+_SEEMS, _PAYS = 0.98, 0.9  # of the squares: what a bend may leave anywhere, and of both halves where it was not fitted
+_SOONER = np.linspace(0.0, 1.0, 5)  # of the linear arm's dead time and lag: what of it is play, or the limit
+_WIDTHS, _SPEEDS = (0.7, 1.5, 3.0), (0.95, 0.8, 0.6)  # of what that arm leaves, as sd; of the fastest that it goes
+_EARLIER = (0.0, 0.6)  # starts: of a first-order arm's dead time, what is lag of a second-order plant
+_FASTEST = 0.98  # of the time it goes no faster
+
+
+class Bent(NamedTuple):
+    """An arm with play, a fastest speed or both.
+
+    Attributes:
+        arm: The arm, fitted to all of the motion.
+        off: How far it is off where it was not fitted [m].
+        linear_off: How far the linear arm is off there [m].
+    """
+
+    arm: Arm
+    off: float
+    linear_off: float
+
+    def sentences(self, screen: Screen) -> list[str]:
+        """What it has, and what that is worth, in the units of its axis."""
+        play, fastest = (one * screen.scale for one in (self.arm.play, self.arm.max_speed))
+        found = [f"play: about {play:.3g} {screen.unit}"] if play else []
+        found += [f"fastest speed: about {fastest:.4g} {screen.unit}/s"] if fastest else []
+        off, linear = self.off * screen.scale, self.linear_off * screen.scale
+        return [*found, f"with it {off:.3g} {screen.unit} off where it was not fitted, without it {linear:.3g}"]
+
+
+def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
+    """The least-squares arm with what pays of play and a fastest speed; None for a linear axis.
+
+    Args:
+        plain: What least squares say of a linear arm.
+        given: What is known of it: what is not ``free`` stays.
+        free: The coordinates that are, among them dead time and lag.
+    """
+    search = _Search(plain, given, free)
+    chosen: list[Bend] = []
+    squares: list[FloatArray] = []  # that are left without a bend, with one, with both
+    while kinds := _kinds(search, chosen, free):
+        squares = squares or [search.off([])]
+        tried = {kind: search.off([*chosen, kind]) for kind in kinds}
+        best = min(kinds, key=lambda kind: float(tried[kind].sum()))
+        if tried[best].sum() > _PAYS * squares[-1].sum() or np.any(tried[best] > _SEEMS * squares[-1]):
+            break
+        chosen.append(best)
+        squares.append(tried[best])
+    if not chosen:
+        return None
+    linear, bent = (float(np.sqrt(one.mean())) for one in (squares[0], squares[-1]))
+    return Bent(search.fitted(search.measured, chosen), bent, linear)
+
+
+def _kinds(search: _Search, chosen: Sequence[Bend], free: Collection[str]) -> list[Bend]:
+    """The bends that are worth a trial beside those that are chosen."""
+    allowed = filter(free.__contains__, BENDS)
+    return [kind for kind in allowed if kind not in chosen and search.seems(kind, chosen)]
+
+
+class _Search:
+    """Arms of least squares with and without bends, of all of the motion and of its halves."""
+
+    def __init__(self, plain: PlainArm, given: Arm, free: Collection[str]) -> None:
+        self.measured, self._names = plain.measured, [name for name in _ANY if name in free]
+        self._limits, self._rest = Limits({**_ANY, **BOUNDS}, {}), self.measured.white(plain.arm)
+        self._start = given._replace(delay=plain.arm.delay, lag=plain.arm.lag, play=0.0, max_speed=0.0)
+        if "gain" in free:
+            self._start = self._start._replace(gain=plain.arm.gain, recovery=0.0, slope=0.0)
+        self._starts: dict[Bend, float] = {}
+        self._halves = _halves(self.measured)
+
+    def seems(self, kind: Bend, beside: Sequence[Bend]) -> bool:
+        """Whether one bend more leaves less of all of the motion; fits begin from the best of a rough grid."""
+        arm = self.fitted(self.measured, beside)
+        sd, fastest = float(np.std(self.measured.left(arm))), _fastest(self.measured, arm)
+        sizes = [sd * one for one in _WIDTHS] if kind == "play" else [fastest * one for one in _SPEEDS]
+        if min(sizes) <= BOUNDS[kind][0]:
+            return False
+        shares = product((arm.delay * _SOONER).tolist(), (arm.lag * _SOONER[1:]).tolist(), sizes)
+        arms = [arm._replace(delay=delay, lag=lag, **{kind: size}) for delay, lag, size in shares]
+        log, _ = self.measured.weighed(arms, self._rest, self._limits)
+        self._starts[kind] = getattr(arms[int(np.argmax(log))], kind)
+        bent = self.fitted(self.measured, [*beside, kind])
+        return _square(self.measured, bent) < _SEEMS * _square(self.measured, arm)
+
+    def off(self, kinds: Sequence[Bend]) -> FloatArray:
+        """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
+        first, second = self._halves
+        pairs = (first, second), (second, first)
+        return np.array([_square(there, self.fitted(here, kinds)) for here, there in pairs])
+
+    def fitted(self, measured: Measured, kinds: Sequence[Bend]) -> Arm:
+        """The arm of least squares with these bends, of first or second order."""
+        start = self._start._replace(**{str(kind): self._starts[kind] for kind in kinds})
+        names: list[str] = [*(name for name in self._names if name != "damping"), *kinds]
+        found = [measured.fitted(start._replace(damping=0.0), names, self._rest, self._limits)]
+        first = found[0].arm
+        for earlier in _EARLIER if "damping" in self._names else ():  # dead time and plant make up for each other
+            by = earlier * first.delay
+            second = first._replace(delay=first.delay - by, lag=first.lag + by, damping=1.0)
+            found.append(measured.fitted(second, [*names, "damping"], self._rest, self._limits))
+        return max(found, key=lambda one: one.log_posterior).arm
+
+
+def _fastest(measured: Measured, arm: Arm) -> float:
+    """The speed that an arm hardly ever exceeds between two measurements [m/s]."""
+    parts = [
+        np.abs(np.diff(moved)) / np.maximum(np.diff(one.time), 1) * 1e9
+        for moved, one in zip(measured.responses(arm), measured.recordings, strict=True)
+    ]
+    return float(np.quantile(np.concatenate(parts), _FASTEST))
+
+
+def _square(measured: Measured, arm: Arm) -> float:
+    """The mean square that an arm leaves [m²]."""
+    return float(np.mean(measured.left(arm) ** 2))
+
+
+def _halves(measured: Measured) -> tuple[Measured, Measured]:
+    """The measurements of every second part of the time, and the others."""
+
+    def half(one: Recording, which: int) -> Recording:
+        since = one.time - one.time[:1]
+        part = since * _PARTS // (since[-1:] + 1)
+        return one._replace(weight=np.where(part % 2 == which, one.weight, 0.0))
+
+    first, second = (measured.of([half(one, which) for one in measured.recordings]) for which in (0, 1))
+    return first, second

@@ -1,0 +1,110 @@
+"""Play and a fastest speed are tried by themselves, and taken where they predict motion they were not fitted to."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.tuning.arms import Arm, Measured, Recording
+from pumafuse.tuning.bends import Bent, bent_arm
+from pumafuse.tuning.plain import plain_arm
+from tuning_runs import quietly
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+T, LENGTH, RANGE = 0.02, 1500, 0.02  # s, commands, m
+FREE = ("delay", "lag", "damping", "recovery", "gain", "play", "max_speed")
+MOVED = 0.01  # of the range: the noise of the sensor, and what comes back within 0.3 s
+
+
+def arm_of(seed: int, **bends: float) -> Arm:
+    """An arm of either order with a gain near 1."""
+    rng = np.random.default_rng(seed)
+    damping = rng.uniform(0.6, 1.4) * (seed % 2)
+    return Arm(rng.uniform(0.0, 0.08), rng.uniform(0.02, 0.12), damping, gain=rng.uniform(0.93, 1.05))._replace(**bends)
+
+
+def measured(seed: int, true: Arm) -> Measured:
+    """Thirty seconds of a sine that gets faster, up to 1 Hz, beside a sensor of 25 Hz."""
+    rng, t = np.random.default_rng(seed + 1000), T * np.arange(LENGTH)
+    given = np.rint(t * 1e9).astype(np.int64)
+    command = RANGE * np.sin(2.0 * math.pi * (0.1 * t + 0.5 * 0.9 / t[-1] * t**2))
+    time = np.arange(given[0], given[-1], 40_000_000) + 7_000_000
+    one = Recording(given, command, 0.0, time, *np.zeros((2, len(time))), np.ones(len(time)))
+    one = one._replace(source=np.zeros(len(time), dtype=np.int64))
+    (moved,) = Measured([one], T, ["camera"]).responses(true)
+    back, wander = math.exp(-0.04 / 0.3), np.zeros(len(time))
+    for n in range(1, len(time)):
+        wander[n] = back * wander[n - 1] + math.sqrt(1.0 - back**2) * rng.standard_normal()
+    noise = MOVED * RANGE * (wander + rng.standard_normal(len(time)))
+    return Measured([one._replace(value=moved + noise)], T, ["camera"])
+
+
+def found(seed: int, true: Arm, free: tuple[str, ...] = FREE) -> Bent | None:
+    recorded = measured(seed, true)
+    plain = plain_arm(recorded)
+    assert plain is not None
+    return bent_arm(plain, Arm(0.0, 0.1), free)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_linear_arm_gets_neither(seed: int) -> None:
+    """None of twelve, of first and of second order."""
+    assert found(seed, arm_of(seed)) is None
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_play_is_found(seed: int) -> None:
+    """A tenth of the range, within 15 % by least squares alone; and less is left where it was not fitted."""
+    bent = found(seed, arm_of(seed, play=0.1 * RANGE))
+    assert bent is not None and bent.arm.max_speed == 0.0
+    assert bent.arm.play == pytest.approx(0.1 * RANGE, rel=0.15)
+    assert bent.off < 0.95 * bent.linear_off
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_fastest_speed_is_found(seed: int) -> None:
+    """Six tenths of the fastest commanded, within 3 %."""
+    fastest = 0.6 * RANGE * 2.0 * math.pi
+    bent = found(seed, arm_of(seed, max_speed=fastest))
+    assert bent is not None and bent.arm.play == 0.0
+    assert bent.arm.max_speed == pytest.approx(fastest, rel=0.03)
+    assert bent.off < 0.95 * bent.linear_off
+
+
+def test_both_are_found() -> None:
+    """Where an axis has both."""
+    bent = found(1, arm_of(1, play=0.15 * RANGE, max_speed=0.6 * RANGE * 2.0 * math.pi))
+    assert bent is not None
+    assert bent.arm.play == pytest.approx(0.15 * RANGE, rel=0.15)
+    assert bent.arm.max_speed == pytest.approx(0.6 * RANGE * 2.0 * math.pi, rel=0.03)
+
+
+def test_what_is_fixed_is_not_tried() -> None:
+    """Neither play nor a speed is found where it may not vary."""
+    true = arm_of(2, play=0.15 * RANGE)
+    assert found(2, true) is not None
+    assert found(2, true, tuple(name for name in FREE if name != "play")) is None
+
+
+def test_a_bend_that_shows_late_in_a_run_is_found() -> None:
+    """A run in which only the last fifth is beyond the limit: every second part of it is held out, not its end."""
+    fastest = 0.85 * RANGE * 2.0 * math.pi
+    bent = found(3, arm_of(3, max_speed=fastest))
+    assert bent is not None
+    assert bent.arm.max_speed == pytest.approx(fastest, rel=0.03)
+
+
+def test_latency_says_play_with_its_interval() -> None:
+    """3.4 degrees of a simulated tool within a tenth; the lag is that of the drive, 42 ms, not some 15 ms more."""
+    run = pf.simulate(pf.Scenario.load(SCENARIOS / "tool-with-play.toml")).run
+    told = quietly(lambda: pf.latency(run, sensor="camera"))
+    axis = told.details.axes["wrist"]
+    assert axis.play is not None and axis.play_ci95 is not None
+    assert axis.play == pytest.approx(3.4 * math.pi / 180.0, rel=0.1)
+    assert axis.play_ci95[0] < axis.play < axis.play_ci95[1]
+    assert axis.lag - 0.04 == pytest.approx(0.042, abs=0.006)  # the camera's latency counts as the arm's
+    assert '"play_deg": 3.' in told.to_json() and "play_deg = 3." in told.arm.to_toml()
