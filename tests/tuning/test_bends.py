@@ -98,6 +98,18 @@ def test_a_bend_that_shows_late_in_a_run_is_found() -> None:
     assert bent.arm.max_speed == pytest.approx(fastest, rel=0.03)
 
 
+def test_few_measurements_are_not_asked() -> None:
+    """Thirty of them do not tell play from noise in both halves, nor do 200 that are all in one half."""
+    recorded = measured(4, arm_of(4, play=0.15 * RANGE))
+    (one,) = recorded.recordings
+    first = np.arange(len(one.time)) < 200
+    far = np.append(np.flatnonzero(first & (np.arange(len(one.time)) // 31 % 2 == 0)), len(one.time) - 1)
+    for rows in (slice(None, None, len(one.time) // 30), far):
+        few = recorded.of([one.of(rows)])
+        plain = plain_arm(few)
+        assert plain is None or bent_arm(plain, Arm(0.0, 0.1), FREE) is None
+
+
 def test_latency_says_play_with_its_interval() -> None:
     """3.4 degrees of a simulated tool within a tenth; the lag is that of the drive, 42 ms, not some 15 ms more."""
     run = pf.simulate(pf.Scenario.load(SCENARIOS / "tool-with-play.toml")).run

@@ -27,6 +27,7 @@ _SEEMS, _PAYS = 0.98, 0.9  # of the squares: what a bend may leave anywhere, and
 _SOONER = np.linspace(0.0, 1.0, 5)  # of the linear arm's dead time and lag: what of it is play, or the limit
 _WIDTHS, _SPEEDS = (0.7, 1.5, 3.0), (0.95, 0.8, 0.6)  # of what that arm leaves, as sd; of the fastest that it goes
 _EARLIER = (0.0, 0.6)  # starts: of a first-order arm's dead time, what is lag of a second-order plant
+_FEWEST = 20  # measurements of each half: four for each number that is fitted
 _FASTEST = 0.98  # of the time it goes no faster
 
 
@@ -61,6 +62,8 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
         free: The coordinates that are, among them dead time and lag.
     """
     search = _Search(plain, given, free)
+    if min(half.count for half in search.halves) < _FEWEST:
+        return None
     chosen: list[Bend] = []
     squares: list[FloatArray] = []  # that are left without a bend, with one, with both
     while kinds := _kinds(search, chosen, free):
@@ -93,7 +96,7 @@ class _Search:
         if "gain" in free:
             self._start = self._start._replace(gain=plain.arm.gain, recovery=0.0, slope=0.0)
         self._starts: dict[Bend, float] = {}
-        self._halves = _halves(self.measured)
+        self.halves = _halves(self.measured)
 
     def seems(self, kind: Bend, beside: Sequence[Bend]) -> bool:
         """Whether one bend more leaves less of all of the motion; fits begin from the best of a rough grid."""
@@ -111,7 +114,7 @@ class _Search:
 
     def off(self, kinds: Sequence[Bend]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
-        first, second = self._halves
+        first, second = self.halves
         pairs = (first, second), (second, first)
         return np.array([_square(there, self.fitted(here, kinds)) for here, there in pairs])
 
