@@ -18,7 +18,7 @@ from ..logs.run import Run
 from ..tuning.parameters import kinds_of
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Progress, tune
-from ..units import SCREEN, as_length
+from ..units import SCREEN
 from ..views import formatting
 from .tables import interval, number, print_tables, table
 
@@ -26,7 +26,7 @@ SUMMARY = "tuning.json"
 PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", ARM_FILE, ROBOT_FILE})
 _HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
-_BENDS = ("play_mm", "max_speed_mm_s")  # of an axis
+_BENDS = ("play_", "max_speed_")  # keys of an axis begin so
 _PAIRS = 3  # of correlated parameters that are shown
 _WORSE, _INTERRUPTED = 3, 130
 
@@ -111,7 +111,7 @@ def fitting() -> Generator[Progress]:
 
 def show_lags(summary: TuningSummary, period: float) -> None:
     """Print the lags, and play and fastest speeds where there are any; period [s]."""
-    bends = [_row(one) for one in summary.parameters if as_length(one.key.rpartition(".")[2]) in _BENDS]
+    bends = [_row(one) for one in summary.parameters if one.key.rpartition(".")[2].startswith(_BENDS)]
     print_tables([table(_HEADINGS, [*_lags(summary), *bends])])
     typer.echo(formatting.lag(period))
 

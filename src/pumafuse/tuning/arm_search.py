@@ -15,9 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from .arms import SHOWN, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
-from .bends import BENDS, Bend, Bent, bent_arm
-from .bends import BOUNDS as BENT_BOUNDS
+from .arms import BENDS, SHOWN, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
+from .bends import Bent, bent_arm
 from .parameters import QUICKEST, RECOVERY, RECOVERY_PRIOR
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
 from .posterior import (
@@ -35,7 +34,7 @@ from .posterior import (
     sharing,
 )
 
-BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": RECOVERY, "gain": (0.3, 3.0), **BENT_BOUNDS}
+BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": RECOVERY, "gain": (0.3, 3.0), **BENDS}
 _USUAL_GAIN, _BEYOND = (0.7, 1.3), 1.25  # where it may be; where least squares find another, so many times that
 # A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
 PRIORS = {"gain": (1.0, 0.1), "damping": (0.0, 0.7), "recovery": RECOVERY_PRIOR}
@@ -83,7 +82,7 @@ class Freedom(NamedTuple):
         return sorted((Model(*one) for one in product(self.orders, self.gains)), key=lambda model: model.size)
 
     @property
-    def bends(self) -> list[Bend]:
+    def bends(self) -> list[str]:
         """What of play and a fastest speed the arm has."""
         return [kind for kind in BENDS if getattr(self.given, kind)]
 
@@ -456,8 +455,4 @@ def _quantities(arm: Arm) -> dict[Quantity, float]:
         found["time_constant"] = math.log(arm.lag)
     if arm.recovery:
         found["gain_recovery"] = math.log(arm.recovery)
-    if arm.play:
-        found["play"] = math.log(arm.play)
-    if arm.max_speed:
-        found["max_speed"] = math.log(arm.max_speed)
-    return found
+    return found | {bend: math.log(size) for bend in BENDS if (size := getattr(arm, bend))}

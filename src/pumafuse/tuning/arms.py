@@ -48,7 +48,9 @@ _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the ot
 _LOG_2PI = math.log(2.0 * math.pi)
 
 Coordinates: TypeAlias = Sequence[str]  # among the fields below
-LOGARITHMIC = ("lag", "damping", "recovery", "play", "max_speed")
+# what no matrix does, and no kind of plant has: bounds in m and m/s
+BENDS = {"play": (1e-6, 1.0), "max_speed": (1e-3, 100.0)}
+LOGARITHMIC = ("lag", "damping", "recovery", *BENDS)
 
 
 class Recording(NamedTuple):
@@ -416,7 +418,7 @@ class Measured:
         return np.array([here, *rows])
 
     def _is_linear(self, arm: Arm) -> bool:
-        return not (arm.play or arm.max_speed) and (self._known is None or self._known.sag is None)
+        return not any(getattr(arm, bend) for bend in BENDS) and (self._known is None or self._known.sag is None)
 
     def _columns(self, one: Recording) -> FloatArray:
         """The measurements, and for each sensor but the first which are its, (s, m)."""

@@ -8,19 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from itertools import product
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import FloatArray
 from ..units import Screen
-from .arms import Arm, Limits, Measured, Recording
+from .arms import BENDS, Arm, Limits, Measured, Recording
 from .plain import PlainArm
 
-Bend: TypeAlias = Literal["play", "max_speed"]
-BENDS: tuple[Bend, ...] = get_args(Bend)
-
-BOUNDS = {"play": (1e-6, 1.0), "max_speed": (1e-3, 100.0)}  # m, m/s
 _ANY = {"delay": (0.0, 10.0), "lag": (1e-4, 4.0), "damping": (0.2, 8.0), "gain": (0.3, 3.0)}
 _PARTS = 24  # of the time, every second of which arms are fitted to; they are judged on the others
 _SEEMS, _PAYS = 0.98, 0.9  # of the squares: what a bend may leave anywhere, and of both halves where it was not fitted
@@ -64,7 +60,7 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
     search = _Search(plain, given, free)
     if min(half.count for half in search.halves) < _FEWEST:
         return None
-    chosen: list[Bend] = []
+    chosen: list[str] = []
     squares: list[FloatArray] = []  # that are left without a bend, with one, with both
     while kinds := _kinds(search, chosen, free):
         squares = squares or [search.off([])]
@@ -80,7 +76,7 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
     return Bent(search.fitted(search.measured, chosen), bent, linear)
 
 
-def _kinds(search: _Search, chosen: Sequence[Bend], free: Collection[str]) -> list[Bend]:
+def _kinds(search: _Search, chosen: Sequence[str], free: Collection[str]) -> list[str]:
     """The bends that are worth a trial beside those that are chosen."""
     allowed = filter(free.__contains__, BENDS)
     return [kind for kind in allowed if kind not in chosen and search.seems(kind, chosen)]
@@ -91,19 +87,19 @@ class _Search:
 
     def __init__(self, plain: PlainArm, given: Arm, free: Collection[str]) -> None:
         self.measured, self._names = plain.measured, [name for name in _ANY if name in free]
-        self._limits, self._rest = Limits({**_ANY, **BOUNDS}, {}), self.measured.white(plain.arm)
+        self._limits, self._rest = Limits({**_ANY, **BENDS}, {}), self.measured.white(plain.arm)
         self._start = given._replace(delay=plain.arm.delay, lag=plain.arm.lag, play=0.0, max_speed=0.0)
         if "gain" in free:
             self._start = self._start._replace(gain=plain.arm.gain, recovery=0.0, slope=0.0)
-        self._starts: dict[Bend, float] = {}
+        self._starts: dict[str, float] = {}
         self.halves = _halves(self.measured)
 
-    def seems(self, kind: Bend, beside: Sequence[Bend]) -> bool:
+    def seems(self, kind: str, beside: Sequence[str]) -> bool:
         """Whether one bend more leaves less of all of the motion; fits begin from the best of a rough grid."""
         arm = self.fitted(self.measured, beside)
         sd, fastest = float(np.std(self.measured.left(arm))), _fastest(self.measured, arm)
         sizes = [sd * one for one in _WIDTHS] if kind == "play" else [fastest * one for one in _SPEEDS]
-        if min(sizes) <= BOUNDS[kind][0]:
+        if min(sizes) <= BENDS[kind][0]:
             return False
         shares = product((arm.delay * _SOONER).tolist(), (arm.lag * _SOONER[1:]).tolist(), sizes)
         arms = [arm._replace(delay=delay, lag=lag, **{kind: size}) for delay, lag, size in shares]
@@ -112,15 +108,15 @@ class _Search:
         bent = self.fitted(self.measured, [*beside, kind])
         return _square(self.measured, bent) < _SEEMS * _square(self.measured, arm)
 
-    def off(self, kinds: Sequence[Bend]) -> FloatArray:
+    def off(self, kinds: Sequence[str]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
         first, second = self.halves
         pairs = (first, second), (second, first)
         return np.array([_square(there, self.fitted(here, kinds)) for here, there in pairs])
 
-    def fitted(self, measured: Measured, kinds: Sequence[Bend]) -> Arm:
+    def fitted(self, measured: Measured, kinds: Sequence[str]) -> Arm:
         """The arm of least squares with these bends, of first or second order."""
-        start = self._start._replace(**{str(kind): self._starts[kind] for kind in kinds})
+        start = self._start._replace(**{kind: self._starts[kind] for kind in kinds})
         names: list[str] = [*(name for name in self._names if name != "damping"), *kinds]
         found = [measured.fitted(start._replace(damping=0.0), names, self._rest, self._limits)]
         first = found[0].arm

@@ -29,8 +29,7 @@ from ..model.plants import FirstOrder
 from ..toml import Interval
 from ..units import MS, SCREEN, Kind
 from .arm_search import ArmSearch, Chosen, Freedom, chosen_arms
-from .arms import Arm
-from .bends import BENDS
+from .arms import BENDS, Arm
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
 from .parameters import (
@@ -221,7 +220,7 @@ class Latency:
                 if hasattr(arm.axes[axis].plant, name):
                     arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(one, f"{name}_ci95"))
             arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), one.gain_ci95)
-            for name in ("gain_recovery", "play", "max_speed", "lag"):
+            for name in ("gain_recovery", *BENDS, "lag"):
                 arm = changed(arm, ("axes", axis, f"{name}_ci95"), getattr(one, f"{name}_ci95"))
             own = arm.axes[axis].delay is not None
             arm = changed(arm, ("axes", axis, "delay_ci95") if own else ("delay_ci95",), one.delay_ci95)

@@ -17,7 +17,7 @@ from ..errors import ConfigError, suggestion
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor
 from ..model.plants import FirstOrder, SecondOrder
 from ..units import ending, of_kind, si
-from .arms import BELIEF, Arm, Rest, longest_delay
+from .arms import BELIEF, BENDS, Arm, Rest, longest_delay
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale", "bias"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -30,6 +30,8 @@ LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured on
 RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
 RECOVERY_PRIOR = (0.5 * math.log(RECOVERY[0] * RECOVERY[1]), math.log(RECOVERY[1] / RECOVERY[0]) / (2.0 * 1.96))
 QUICKEST = 2.0  # update periods, of a disturbance
+PLANT_NOISE = ("input_noise", "maneuver_noise")  # what shakes the plant, and is filtered by it
+_RINGS = 0.4  # damping below which a step overshoots by a quarter, and no drive that is sold is tuned so
 _INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
 _TICK = 0.028  # s; a large change of a time, on any arm
 _DIGITS = 6  # of a number that is written
@@ -205,8 +207,8 @@ _TABLE = (
     _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
     _line("plant", "axes.{axis}.natural_frequency_rad_s", "arm.axes.{axis}.plant.natural_frequency", 0.5, 5e3),
     _line("plant", "axes.{axis}.damping", "arm.axes.{axis}.plant.damping", 0.05, 20.0),
-    _line("plant", "axes.{axis}.max_speed_mm_s", "arm.axes.{axis}.max_speed", 1e-3, 100.0),
-    _line("plant", "axes.{axis}.play_mm", "arm.axes.{axis}.play", 1e-6, 1.0),
+    _line("plant", "axes.{axis}.max_speed_mm_s", "arm.axes.{axis}.max_speed", *BENDS["max_speed"]),
+    _line("plant", "axes.{axis}.play_mm", "arm.axes.{axis}.play", *BENDS["play"]),
     _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.5, 0.5, **_INTERCEPT),
     _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *RECOVERY, prior=RECOVERY_PRIOR),
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
@@ -260,9 +262,15 @@ def _noise(
 
 
 def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
-    """Whether a configuration has it: a plant's order, play, an own delay, a recovery, a disturbance, a drift."""
+    """Whether a configuration has it: a plant's order, play, an own delay, a recovery, a disturbance, a drift.
+
+    An axis that rings has no plant noise unless it is given some. Friction and loads hold a tool off, and noise that
+    shakes such a plant brings it back within half a period: then the estimate of a slower motion is pulled off.
+    """
     if one.axis is not None and one.path[-1].startswith("disturbance"):
         return config.process[one.axis].disturbance_sd > 0.0
+    if one.axis is not None and one.path[-1] in PLANT_NOISE and rings(config, one.axis):
+        return one.at_bound(config) != "lower"
     if one.fit == "bias" and one.sensor is not None:
         drift = config.sensors[one.sensor].bias_drift_sd
         if isinstance(drift, dict):  # one for each axis
@@ -301,7 +309,7 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
     for order in (1, 2):
         for axis in sensors:
             config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
-            for bend in ("play", "max_speed"):
+            for bend in BENDS:
                 config = changed(config, ("arm", "axes", axis, bend), 1.0)
         config = with_drifts(with_own_delays(config, sensors))
         keys |= {one.key for one in parameters(config, config, sensors, FITS)}
@@ -372,6 +380,12 @@ def with_order(config: FusionConfig, axis: str, order: int) -> FusionConfig:
     return changed(config, ("arm", "axes", axis, "plant"), plant)
 
 
+def rings(config: FusionConfig, axis: str) -> bool:
+    """Whether the plant of an axis is lightly damped."""
+    plant = config.arm.axes[axis].plant
+    return isinstance(plant, SecondOrder) and plant.damping < _RINGS
+
+
 def with_own_delays(config: FusionConfig, axes: Iterable[str]) -> FusionConfig:
     """The configuration with a delay of its own for each of these axes, the same as before."""
     for axis in axes:
@@ -412,7 +426,7 @@ def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> Fusion
 def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     """The configuration with another arm of an axis, and a delay of its own."""
     model = arm.model
-    for name in ("plant", "gain", "gain_recovery", "max_speed", "play"):
+    for name in ("plant", "gain", "gain_recovery", *BENDS):
         config = changed(config, ("arm", "axes", axis, name), getattr(model, name))
     return changed(config, ("arm", "axes", axis, "delay"), arm.delay)
 

@@ -17,12 +17,11 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from ..arrays import FloatArray
-from .arms import Arm
+from .arms import BENDS, Arm
 
-Quantity: TypeAlias = Literal[
-    "lag", "delay", "gain", "gain_recovery", "time_constant", "natural_frequency", "damping", "play", "max_speed"
-]  # s, but for the gain, ω [rad/s], ζ, play [m] and the fastest speed [m/s]
-QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+# s, but for the gain, ω [rad/s], ζ, play [m] and the fastest speed [m/s]
+QUANTITIES = ("lag", "delay", "gain", "gain_recovery", "time_constant", "natural_frequency", "damping", *BENDS)
+Quantity: TypeAlias = str  # one of these
 GainKind: TypeAlias = Literal["given", "static", "recovering"]
 GAINS: tuple[GainKind, ...] = get_args(GainKind)
 

@@ -16,8 +16,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
 from .arm_search import SMOOTHER, WANDERS, ArmSearch, Freedom, chosen_arms
-from .arms import Arm
-from .bends import BENDS
+from .arms import BENDS, Arm
 from .identifiability import covariance
 from .likelihood import Likelihood, in_threads
 from .maximise import Notify, Point, derivatives, maximise, maximise_by_axis, maximise_with_gates, point
@@ -25,6 +24,7 @@ from .parameters import (
     LATENCIES,
     Parameter,
     quickest,
+    rings,
     with_arm,
     with_axis_of,
     with_disturbance,
@@ -95,6 +95,9 @@ def search(
     best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
     best = _without_needless(likelihood, best, free, notify)
     best = _under_gates(likelihood, best, config, free, notify)
+    for axis, why in reasons.items():
+        if rings(best.config, axis):
+            why.append("its plant rings: what holds the tool off is a disturbance, not noise that shakes the plant")
     return best, {axis: "; ".join(why) for axis, why in reasons.items() if why}
 
 
@@ -215,7 +218,8 @@ def _with_free_noise(config: FusionConfig, model: FusionConfig, free: FreeOf, ax
         config = with_disturbance(config, str(axis), new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
     for one in free(config):
         if one.fit == "noise" and (one.sensor or one.path[-1] in _WALKING):
-            config = one.put(config, one.clipped(one.get(model)))
+            none = one.vanishes and one.at_bound(model) == "lower"
+            config = one.put(config, 0.0 if none else one.clipped(one.get(model)))
     return config
 
 
