@@ -65,6 +65,33 @@ def test_a_linear_arm_gets_neither_by_chance(seed: int) -> None:
     assert plain is not None and bent_arm(plain, Arm(0.0, 0.1), FREE) is None
 
 
+def wandering(seed: int, comes_back: float, smooth: int) -> Measured:
+    """Sixteen seconds of three slow sines at 30 Hz, and an arm that is off by what is so often filtered white noise."""
+    rng, period = np.random.default_rng(seed), 1.0 / 30.0
+    t = period * np.arange(480)
+    given = np.rint(t * 1e9).astype(np.int64)
+    often, size = rng.uniform(0.1, 0.5, 3), rng.uniform(-0.01, 0.01, 3)
+    command = size @ np.sin(2.0 * math.pi * np.outer(often, t))
+    time = given[1:] + 5_000_000
+    off, back = rng.standard_normal(len(time)), math.exp(-period / comes_back)
+    for _ in range(smooth):
+        for n in range(1, len(off)):
+            off[n] += back * off[n - 1]
+    zeros = np.zeros(len(time))
+    one = Recording(given, command, float(command[0]), time, zeros, zeros.astype(np.int64), zeros + 1.0)
+    (moved,) = Measured([one], period, ["encoder"]).responses(Arm(0.08, 0.06))
+    value = moved + 0.01 * np.ptp(command) * off / off.std()
+    return Measured([one._replace(value=value)], period, ["encoder"])
+
+
+@pytest.mark.parametrize(("seed", "comes_back", "smooth"), [(0, 0.3, 3), (6, 0.3, 3), (16, 1.0, 2)])
+def test_an_arm_that_wanders_smoothly_gets_neither(seed: int, comes_back: float, smooth: int) -> None:
+    """An error that goes on for long is alike in both halves, so that play seems to predict it."""
+    recorded = wandering(seed, comes_back, smooth)
+    plain = plain_arm(recorded)
+    assert plain is not None and bent_arm(plain, Arm(0.0, 0.1), FREE) is None
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_play_is_found(seed: int) -> None:
     """A tenth of the range, within 15 % by least squares alone; and less is left where it was not fitted."""

@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..units import Screen
 from .arms import BENDS, Arm, Limits, Measured, Recording
-from .plain import PlainArm
+from .plain import FOLLOWS, PlainArm, independent
 
 _ANY = {"delay": (0.0, 10.0), "lag": (1e-4, 4.0), "damping": (0.2, 8.0), "gain": (0.3, 3.0)}
 _PARTS = 24  # of the time, every second of which arms are fitted to; they are judged on the others
@@ -68,6 +68,9 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
         best = min(kinds, key=lambda kind: float(tried[kind].sum()))
         if tried[best].sum() > _PAYS * squares[-1].sum() or np.any(tried[best] > _SEEMS * squares[-1]):
             break
+        left = search.measured.left(search.fitted(search.measured, [*chosen, best]))
+        if squares[-1].sum() - tried[best].sum() < FOLLOWS / independent(left) * tried[best].sum():
+            break  # an error that goes on for long is alike in both halves, and by chance like play
         chosen.append(best)
         squares.append(tried[best])
     if not chosen:

@@ -27,7 +27,7 @@ _AROUND = np.linspace(-1.5, 1.5, 7)  # logarithm of τ about the best one,
 _BESIDE = np.linspace(-0.03, 0.03, 13)  # s, and lags about its lag: which of them are allowed
 _OUTLIER = 8.0  # times the median distance from the best arm: what is farther does not count
 _FEWEST = 4.0  # independent measurements, at least: however alike their errors are
-_FOLLOWS = 40.0  # of χ² that an arm must explain: of some hundred arms with noise beside them none does by chance
+FOLLOWS = 40.0  # of χ² that an arm must explain: of some hundred arms with noise beside them none does by chance
 _ANYHOW = 1.0  # times what it leaves, from which it follows whatever chance would make of it
 _CHANCE = 3.84  # of χ² with one degree of freedom, 95 %
 _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
@@ -66,6 +66,12 @@ def off(measured: Measured, arm: Arm) -> float:
     return float(np.quantile(np.abs(apart - np.median(apart)), _MOST)) if len(apart) else 0.0
 
 
+def independent(left: FloatArray) -> float:
+    """How many independent measurements as many with these errors are, where an error goes on from one to the next."""
+    alike = min(max(float(left[1:] @ left[:-1]) / max(float(left @ left), 1e-300), 0.0), 1.0)
+    return max(len(left) * (1.0 - alike) / (1.0 + alike), _FEWEST)
+
+
 def plain_arm(measured: Measured) -> PlainArm | None:
     """The arm that leaves the least squares, without outliers; None where nothing follows the commands."""
     measured = measured.excerpt(COMMANDS, ROWS)
@@ -88,11 +94,10 @@ def plain_arm(measured: Measured) -> PlainArm | None:
         return None
     left, sd = measured.left(arm), float(rest.sd[0])
     power = float(left @ left)
-    alike = min(max(float(left[1:] @ left[:-1]) / max(power, 1e-300), 0.0), 1.0)
-    independent = max(measured.count * (1.0 - alike) / (1.0 + alike), _FEWEST)
-    if measured.power - power < min(_FOLLOWS / independent, _ANYHOW) * power:
+    number = independent(left)
+    if measured.power - power < min(FOLLOWS / number, _ANYHOW) * power:
         return None
-    most = 0.5 * (power * _CHANCE / independent + _ROUNDING * measured.power) / sd**2
+    most = 0.5 * (power * _CHANCE / number + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
     commands = [Arm(delay, float(LAGS[0])) for delay in late]
     delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
