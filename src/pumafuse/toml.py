@@ -14,9 +14,13 @@ import msgspec
 import tomli_w
 
 from .errors import ConfigError, PumafuseError, suggestion
+from .folders import ENDLESS, is_endless
 from .units import AN, KINDS, Kind, as_length, ending, from_si, in_unit, of_kind, to_si
 
 MOST_TEXT = 16 << 20  # characters; what is longer, a device perhaps, is no configuration
+_DEEP = re.compile(
+    r"^[ \t\[]*(?:[^\n.=,#\[\]{}]*\.){100}", re.MULTILINE
+)  # a key of so many parts: seconds and GB for tomllib
 _BOUND = re.compile(r"Expected `(?:float|int)` (>=|<=|>|<) (\S+)")
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -51,8 +55,10 @@ def text_of(path: Path) -> str:
     """The text of a file that describes something, one character more than it may have at most.
 
     Raises:
-        ConfigError: The file is absent, or is not text.
+        ConfigError: The file is absent, has no end, or is not text.
     """
+    if is_endless(path):
+        raise ConfigError(f"{path}: {ENDLESS}")
     try:
         with path.open(encoding="utf-8") as file:
             return file.read(MOST_TEXT + 1)
@@ -81,6 +87,8 @@ def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
             return to_si(_plain(source, ""))
         if len(source) > MOST_TEXT:
             raise ConfigError(f"more than {MOST_TEXT >> 20} MB: no configuration")
+        if _DEEP.search(source):
+            raise ConfigError("a key of more than 100 parts: no configuration")
         return to_si(tomllib.loads(source, parse_float=Decimal))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{where}: not valid TOML: {error}") from None

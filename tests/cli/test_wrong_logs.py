@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from executable import pumafuse, refused
+from executable import EXECUTABLE, pumafuse, refused
 from pumafuse.arrays import FloatArray
 
 MY_RUN = Path(__file__).parents[2] / "examples/my-run"
@@ -152,3 +154,29 @@ def test_an_exception_that_nobody_foresaw_is_a_line_for_a_report(
     assert f"reading {tmp_path / 'command.csv'}." in line
     assert "please report it with this line and the log" in line and "discovery/contents.py:" in line
     assert done.stdout == "" and not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
+@pytest.mark.parametrize("name", ["log.csv", "log.mcap", "run.toml"])
+@pytest.mark.parametrize("command", ["fuse", "latency"])
+def test_a_pipe_that_nobody_writes_into_is_refused_at_once(name: str, command: str, tmp_path: Path) -> None:
+    """Reading it would wait for ever."""
+    os.mkfifo(pipe := tmp_path / name)
+    words = [str(EXECUTABLE), command, str(pipe), *(["-o", str(tmp_path / "out")] if command == "fuse" else [])]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == [
+        f"pumafuse: {pipe}: a pipe or a device, which may never end; write it into a file first"
+    ]
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="there are no such devices here")
+def test_a_device_is_no_configuration(log: Path) -> None:
+    """Nor is a key of thousands of parts, which the parser takes seconds and gigabytes for; one of a number is none."""
+    command = ("fuse", log, "-o", log / "result", "-c")
+    assert "/dev/zero: a pipe or a device" in refused(*command, "/dev/zero")
+    (deep := log / "deep.toml").write_text("a" + ".a" * 20_000 + " = 1")
+    assert "deep.toml: a key of more than 100 parts: no configuration" in refused(*command, deep)
+    numbers = ", ".join(["0.5"] * 200)
+    deep.write_text(f"x = [{numbers}]\ny = [\n{numbers}\n]")
+    assert "of more than 100 parts" not in refused(*command, deep)

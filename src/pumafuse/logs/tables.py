@@ -25,6 +25,7 @@ import pyarrow.parquet as papq
 
 from ..arrays import BoolArray
 from ..errors import RunError, UnknownNameError, counted, shortened
+from ..folders import ENDLESS, is_endless
 from . import formats
 from .columns import BLANK, NUMBER, Table, find, longest, prefixes
 
@@ -84,6 +85,8 @@ def read(
         RunError: The file is absent, empty, or not inside what its ending says; or ``where`` leaves no row.
     """
     where, listed = where or {}, None if callable(fields) else fields
+    if is_endless(path):
+        raise RunError(f"{path}: {ENDLESS}")
     if is_recording(path):
         return _recording(path, topic, entity, listed, where)
     of_several = path.name.endswith(formats.ENDINGS)
