@@ -478,8 +478,8 @@ def test_a_text_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.M
     bomb = gzip.compress(bytes(33 << 20))
     path = tmp_path / "log.csv.gz"
     path.write_bytes(bomb)
-    for one in (path, Path("/dev/zero")):
-        assert " of text; as Parquet" in one_line(RunError, partial(tables.read, one))
+    assert " of text; as Parquet" in one_line(RunError, partial(tables.read, path))
+    assert "a pipe or a device" in one_line(RunError, partial(tables.read, Path("/dev/zero")))
 
 
 @pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.parquet"])
