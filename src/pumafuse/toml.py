@@ -18,9 +18,8 @@ from .folders import ENDLESS, is_endless
 from .units import AN, KINDS, Kind, as_length, ending, from_si, in_unit, of_kind, to_si
 
 MOST_TEXT = 16 << 20  # characters; what is longer is no configuration
-_DEEP = re.compile(
-    r"^[ \t\[]*(?:[^\n.=,#\[\]{}]*\.){100}", re.MULTILINE
-)  # a key of so many parts: seconds and GB for tomllib
+# A key of so many parts takes tomllib seconds and gigabytes.
+_DEEP = re.compile(r"^[ \t\[]*(?:[^\n.=,#\[\]{}]*\.){100}", re.MULTILINE)
 _BOUND = re.compile(r"Expected `(?:float|int)` (>=|<=|>|<) (\S+)")
 S = TypeVar("S", bound=msgspec.Struct)
 

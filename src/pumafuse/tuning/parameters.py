@@ -30,7 +30,7 @@ LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured on
 RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
 RECOVERY_PRIOR = (0.5 * math.log(RECOVERY[0] * RECOVERY[1]), math.log(RECOVERY[1] / RECOVERY[0]) / (2.0 * 1.96))
 QUICKEST = 2.0  # update periods, of a disturbance
-PLANT_NOISE = ("input_noise", "maneuver_noise")  # what shakes the plant, and is filtered by it
+_PLANT_NOISE = ("input_noise", "maneuver_noise")  # what shakes the plant, and is filtered by it
 _RINGS = 0.4  # damping below which a step overshoots by a quarter, and no drive that is sold is tuned so
 _INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
 _TICK = 0.028  # s; a large change of a time, on any arm
@@ -264,12 +264,12 @@ def _noise(
 def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
     """Whether a configuration has it: a plant's order, play, an own delay, a recovery, a disturbance, a drift.
 
-    An axis that rings has no plant noise unless it is given some. Friction and loads hold a tool off, and noise that
+    An axis that rings, and has no plant noise yet, gets none. Friction and loads hold a tool off, and noise that
     shakes such a plant brings it back within half a period: then the estimate of a slower motion is pulled off.
     """
     if one.axis is not None and one.path[-1].startswith("disturbance"):
         return config.process[one.axis].disturbance_sd > 0.0
-    if one.axis is not None and one.path[-1] in PLANT_NOISE and rings(config, one.axis):
+    if one.axis is not None and one.path[-1] in _PLANT_NOISE and rings(config, one.axis):
         return one.at_bound(config) != "lower"
     if one.fit == "bias" and one.sensor is not None:
         drift = config.sensors[one.sensor].bias_drift_sd
