@@ -22,7 +22,8 @@ from typer.main import get_command
 from pumafuse.cli.main import app
 
 ROOT = Path(__file__).parent.parent
-PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+PAGES = {f"{name}.md": f"{name.lower()}.md" for name in ("CONTRIBUTING", "SECURITY", "CHANGELOG")}
+PAGES["README.md"] = "index.md"
 FIRST_NOTEBOOK = "notebooks/1-step-trials-to-arm-model.ipynb"
 _LINK = re.compile(r"(?<=\]\()([^)#:\s]+)(?=[)#])")  # of Markdown, to a file
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
