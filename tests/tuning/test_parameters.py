@@ -16,6 +16,7 @@ from pumafuse.tuning.arms import Arm
 from pumafuse.tuning.parameters import (
     FITS,
     Parameter,
+    changed,
     check_fixed,
     is_fixed,
     kinds_of,
@@ -27,7 +28,7 @@ from pumafuse.tuning.parameters import (
     with_order,
     with_own_delays,
 )
-from tuning_runs import replaced
+from tuning_runs import replaced, with_process
 
 ARM = pf.ArmModel.load("puma560-internal")  # tangential is second order, radial and vertical are first
 TRACKER, CAMERA = pf.Sensor(sd=5e-5, latency=0.008), pf.Sensor(sd={"radial": 4e-4, "vertical": 3e-4}, latency=0.045)
@@ -69,6 +70,22 @@ def test_what_can_be_fitted() -> None:
     for kind, numbers in {"latency": ["latency_ms"], "bias": ["bias_drift_sd_mm", "bias_time_s"]}.items():
         assert keys[kind] == {f"sensors.{name}.{key}" for name in ("tracker", "camera") for key in numbers}
     assert parameters(SHARED, SHARED, SENSORS, ["bias"]) == []  # no bias drifts
+
+
+@pytest.mark.parametrize("damping", [0.39, 0.41])
+@pytest.mark.parametrize("noise", ["input_noise", "maneuver_noise"])
+def test_a_plant_that_rings_is_given_no_noise(noise: str, damping: float) -> None:
+    """What it has stays free; what an axis drifts is not meant; nor is a plant that is damped well."""
+    config = with_process(CONFIG, input_noise=0.0, maneuver_noise=0.0, drift=0.0)
+    plant = pf.SecondOrder(natural_frequency=20.0, damping=damping)
+    ringing = changed(config, ("arm", "axes", "radial", "plant"), plant)
+
+    def free(config: pf.FusionConfig) -> set[str]:
+        return {one.path[-1] for one in everything(config=config) if one.axis == "radial"}
+
+    assert "drift" in free(ringing)
+    assert (noise in free(ringing)) == (damping > 0.4)
+    assert noise in free(changed(ringing, ("process", "radial", noise), 1e-3))
 
 
 def test_a_noise_is_believed_within_a_factor_and_not_below_what_is_resolved() -> None:

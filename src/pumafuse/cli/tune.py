@@ -15,6 +15,7 @@ from .. import folders
 from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, ROBOT_FILE, FusionConfig
 from ..logs.run import Run
+from ..tuning.arms import BENDS
 from ..tuning.parameters import kinds_of
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Progress, tune
@@ -26,7 +27,6 @@ SUMMARY = "tuning.json"
 PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", ARM_FILE, ROBOT_FILE})
 _HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
-_BENDS = ("play_", "max_speed_")  # keys of an axis begin so
 _PAIRS = 3  # of correlated parameters that are shown
 _WORSE, _INTERRUPTED = 3, 130
 
@@ -111,7 +111,7 @@ def fitting() -> Generator[Progress]:
 
 def show_lags(summary: TuningSummary, period: float) -> None:
     """Print the lags, and play and fastest speeds where there are any; period [s]."""
-    bends = [_row(one) for one in summary.parameters if one.key.rpartition(".")[2].startswith(_BENDS)]
+    bends = [_row(one) for one in summary.parameters if one.key.rpartition(".")[2].startswith(tuple(BENDS))]
     print_tables([table(_HEADINGS, [*_lags(summary), *bends])])
     typer.echo(formatting.lag(period))
 
