@@ -1,11 +1,10 @@
-"""Files that can be read to their end; output folders: complete or not there, and never over other people's files."""
+"""Output folders: written complete or not at all, and never over other people's files."""
 
 from __future__ import annotations
 
 import glob
 import os
 import shutil
-import stat
 import tempfile
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
@@ -13,21 +12,11 @@ from pathlib import Path
 
 from .errors import PumafuseError
 
-ENDLESS = "a pipe or a device, which may never end; write it into a file first"
 _MEANWHILE = "another process has written it meanwhile, and that stays; choose another name"
 
 
 class FolderError(PumafuseError):
     """An output folder cannot be written or read."""
-
-
-def is_endless(path: Path) -> bool:
-    """Whether a path is a pipe, a socket or a device: reading it may wait for ever."""
-    try:
-        mode = path.stat().st_mode
-    except (OSError, ValueError):  # what is not there is for others to say
-        return False
-    return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
 
 
 def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Callable[[str], bool]) -> None:

@@ -14,10 +14,9 @@ import msgspec
 import tomli_w
 
 from .errors import ConfigError, PumafuseError, suggestion
-from .folders import ENDLESS, is_endless
 from .units import AN, KINDS, Kind, as_length, ending, from_si, in_unit, of_kind, to_si
 
-MOST_TEXT = 16 << 20  # characters; what is longer is no configuration
+MOST_TEXT = 16 << 20  # characters; what is longer, a device perhaps, is no configuration
 # A key of so many parts takes tomllib seconds and gigabytes.
 _DEEP = re.compile(r"^[ \t\[]*(?:[^\n.=,#\[\]{}]*\.){100}", re.MULTILINE)
 _BOUND = re.compile(r"Expected `(?:float|int)` (>=|<=|>|<) (\S+)")
@@ -54,10 +53,8 @@ def text_of(path: Path) -> str:
     """The text of a file that describes something, one character more than it may have at most.
 
     Raises:
-        ConfigError: The file is absent, has no end, or is not text.
+        ConfigError: The file is absent, or is not text.
     """
-    if is_endless(path):
-        raise ConfigError(f"{path}: {ENDLESS}")
     try:
         with path.open(encoding="utf-8") as file:
             return file.read(MOST_TEXT + 1)

@@ -157,7 +157,7 @@ def test_an_exception_that_nobody_foresaw_is_a_line_for_a_report(
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
-@pytest.mark.parametrize("name", ["log.csv", "log.mcap", "run.toml"])
+@pytest.mark.parametrize("name", ["log.csv", "log.mcap", "log.parquet"])
 @pytest.mark.parametrize("command", ["fuse", "latency"])
 def test_a_pipe_that_nobody_writes_into_is_refused_at_once(name: str, command: str, tmp_path: Path) -> None:
     """Reading it would wait for ever."""
@@ -174,7 +174,7 @@ def test_a_pipe_that_nobody_writes_into_is_refused_at_once(name: str, command: s
 def test_a_device_is_no_configuration(log: Path) -> None:
     """Nor is a key of thousands of parts, which the parser takes seconds and gigabytes for; one of a number is none."""
     command = ("fuse", log, "-o", log / "result", "-c")
-    assert "/dev/zero: a pipe or a device" in refused(*command, "/dev/zero")
+    assert "/dev/zero: more than 16 MB: no configuration" in refused(*command, "/dev/zero")
     (deep := log / "deep.toml").write_text("a" + ".a" * 20_000 + " = 1")
     assert "deep.toml: a key of more than 100 parts: no configuration" in refused(*command, deep)
     numbers = ", ".join(["0.5"] * 200)

@@ -22,7 +22,6 @@ from msgspec import structs
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, counted, printable
-from ..folders import ENDLESS, is_endless
 from ..logs import formats, recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, without_sentinels
 from ..logs.frames import CARTESIAN
@@ -221,8 +220,7 @@ def _files(log: Path) -> list[Path]:
     """The tables and recordings in a folder, or the log itself."""
     if not os.path.exists(log):  # noqa: PTH110 - Path.exists raises on a name that is too long
         raise RunError(f"{log}: no such file or folder")
-    if is_endless(log):
-        raise RunError(f"{log}: {ENDLESS}")
+    tables.refuse_endless(log)
     if not log.is_dir():
         if not (log.name.endswith(_TABLES + _TEXTS + formats.ENDINGS) or tables.is_recording(log)):
             raise RunError(f"{log}: no log that can be read; {_CONVERTED.get(log.suffix, _ACCEPTED)}")

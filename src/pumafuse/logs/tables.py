@@ -8,6 +8,7 @@ from __future__ import annotations
 import codecs
 import os
 import re
+import stat
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -25,7 +26,6 @@ import pyarrow.parquet as papq
 
 from ..arrays import BoolArray
 from ..errors import RunError, UnknownNameError, counted, shortened
-from ..folders import ENDLESS, is_endless
 from . import formats
 from .columns import BLANK, NUMBER, Table, find, longest, prefixes
 
@@ -85,8 +85,7 @@ def read(
         RunError: The file is absent, empty, or not inside what its ending says; or ``where`` leaves no row.
     """
     where, listed = where or {}, None if callable(fields) else fields
-    if is_endless(path):
-        raise RunError(f"{path}: {ENDLESS}")
+    refuse_endless(path)
     if is_recording(path):
         return _recording(path, topic, entity, listed, where)
     of_several = path.name.endswith(formats.ENDINGS)
@@ -161,6 +160,20 @@ def row_count(path: Path) -> int:
         return papq.read_metadata(str(path)).num_rows if path.suffix == ".parquet" else 0
     except (OSError, ValueError):
         return 0
+
+
+def refuse_endless(path: Path) -> None:
+    """Refuse a pipe, a socket or a device, which a reader may wait for for ever and cannot go back in.
+
+    Raises:
+        RunError: It is one.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):  # what is not there is for others to say
+        return
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise RunError(f"{path}: a pipe or a device, which may never end; write it into a file first")
 
 
 def is_recording(path: Path) -> bool:
