@@ -29,6 +29,7 @@ from ..live.address import LISTENERS, NETWORK, Address
 from ..live.estimator import LiveEstimator
 from ..live.network import UdpSender
 from ..live.record import Recorder
+from ..live.results import LiveEstimate
 from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
 from ..live.wire import Event
@@ -224,12 +225,17 @@ def status(stream: Stream, summaries: Sequence[Callable[[], str]] = (), now: int
     arm, tables = stream.live.config.arm, list[Table]()
     for kind in arm.kinds:
         rows = [
-            [name, *cells(axis, _AXIS, kind), "stale" if name in estimate.stale else ""]
+            [name, *cells(axis, _AXIS, kind), _doubts(estimate, name)]
             for name, axis in estimate.axes.items()
             if arm.axes[name].kind == kind
         ]
         tables.append(table(["axis", *headings(_AXIS, kind), ""], rows))
     return Group(Text(time), *tables, _sensor_table(stream.live, now), *map(Text, _sentences(stream, summaries)))
+
+
+def _doubts(estimate: LiveEstimate, axis: str) -> str:
+    """What is to be known of an axis beside its numbers."""
+    return ", ".join(word for word in ("stale", "doubtful") if axis in getattr(estimate, word))
 
 
 def _sensor_table(live: LiveEstimator, now: int | None) -> Table:
@@ -253,4 +259,4 @@ def _sentences(stream: Stream, summaries: Sequence[Callable[[], str]]) -> list[s
     counts += [f"commands: {', '.join(commands) or 'none'}", f"{stream.estimates} estimates"]
     counts += [f"{health.unknown} rows of unknown sensors"] if health.unknown else []
     counts += [f"{health.segments} segments"] if health.segments > 1 else []
-    return ["; ".join(counts), *filter(None, (summary() for summary in summaries))]
+    return ["; ".join(counts), *health.faults, *filter(None, (summary() for summary in summaries))]

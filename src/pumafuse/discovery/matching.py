@@ -310,6 +310,12 @@ class Tracking:
         return float(measured @ led) / power if power > 0.0 else 0.0
 
     @property
+    def slope(self) -> float:
+        """Measured over commanded motion; 0 where the commands rest."""
+        measured, led, _ = self._moved
+        return float(measured @ led) / power if (power := float(led @ led)) > 0.0 else 0.0
+
+    @property
     def follows(self) -> bool:
         """Whether there is nothing to ask: it moves about as far as commanded, about then, or is off by its noise."""
         measured, led, before = self._moved
@@ -317,8 +323,8 @@ class Tracking:
             return True
         if self.correlation < FOLLOWS:
             return False
-        slope = float(measured @ led) / float(led @ led)
-        left, step = measured - slope * led, led - before
+        slope, step = self.slope, led - before
+        left = measured - slope * led
         along, power = float(left @ step), max(float(step @ step), 1e-30)
         is_late = abs(along) > 0.5 * slope * power and along**2 > 0.5 * power * float(left @ left)
         return 1.0 / GAIN < slope < GAIN and not is_late

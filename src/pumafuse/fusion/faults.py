@@ -48,7 +48,7 @@ _HARDLY = 1e-3  # of the motion along its main direction, below which other dire
 _MOVE = 1e9  # ns, of the moves that are compared: less is noise, over more noise wanders
 _PARTS = 8  # of a run, each of which is left out once: as the angle scatters then, so uncertain it is
 
-_Cause: TypeAlias = Literal["unit", "columns", "sign", "clock", "frame", "nothing"]
+_Cause: TypeAlias = Literal["turns", "unit", "columns", "sign", "clock", "frame", "nothing", "motion", "zero"]
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,11 @@ class Fault:
     """Why a sensor, or all, are not where the commands lead.
 
     Attributes:
-        sensors: Which; all that measure these axes if it is the commands that are wrong.
+        sensors: Which; all that measure these axes if it is the commands that are wrong, none of their turns.
         axes: On which they are not.
         cause: What is wrong.
-        size: How late they are [s], by how much they are turned [rad], or how many times as far they move.
+        size: How late they are [s], by how much they are turned [rad] or off [m or rad], how many times as far they
+            move, or how often they turn.
         sentence: What shows it, and what to write instead.
         refused: Whether estimates would be wrong by construction.
         lost: Whether they follow the commands so little that nothing can be fitted to them.
@@ -70,8 +71,8 @@ class Fault:
     cause: _Cause
     size: float
     sentence: str
-    refused: bool
-    lost: bool
+    refused: bool = False
+    lost: bool = False
 
     def is_like(self, other: Fault) -> bool:
         """Whether the other fault, also of another sensor, may come from the same commands."""
@@ -80,19 +81,25 @@ class Fault:
 
 
 def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
-    """A sentence on each configured sensor that does not follow, or is off by a constant.
+    """A sentence on each fault of a configured sensor, or of the commands.
 
     Raises:
         RunError: A sensor, or the commands, are in another unit than their name says.
     """
+    faults = faults_of(segment, config)
+    if refused := [one.sentence for one in faults if one.refused]:
+        raise RunError(refused[0])
+    return [one.sentence for one in faults]
+
+
+def faults_of(segment: Segment, config: FusionConfig) -> list[Fault]:
+    """What is wrong with angles within a turn, and with sensors that do not follow or are off by a constant."""
     given = _given(segment, config)
     trackings = _trackings(segment, config, given)
     faults = _not_following(segment, config, given, trackings)
-    if refused := [one.sentence for one in faults if one.refused]:
-        raise RunError(refused[0])
-    found, named = [one.sentence for one in faults], {name for one in faults for name in one.sensors}
+    named = {name for one in faults for name in one.sensors}
     quiet = {name: mine for name, mine in trackings.items() if name not in named}
-    return [*within_a_turn(segment, config), *found, *_moving_alone(config, quiet), *_off(config, quiet)]
+    return [*within_a_turn(segment, config), *faults, *_moving_alone(config, quiet), *_off(segment, config, quiet)]
 
 
 def not_following(segment: Segment, config: FusionConfig) -> list[Fault]:
@@ -118,7 +125,7 @@ def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
     return [
         f"the run begins in motion ({speeds[most] * screen.scale:.3g} {screen.unit}/s on {most}), the model at rest:"
         f" estimates are wrong by up to {off[most] * screen.scale:.2g} {screen.unit} at first; record from rest, or use"
-        f" --from {max(_settled(config, axis) for axis in speeds):.2g} or later"
+        f" --from {max(settled(config, axis) for axis in speeds):.2g} or later"
     ]
 
 
@@ -139,22 +146,24 @@ _Given: TypeAlias = Mapping[str, Mapping[str, tuple[TimeArray, FloatArray]]]  # 
 _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
 
 
-def within_a_turn(segment: Segment, config: FusionConfig) -> list[str]:
-    """A sentence on each angle of the commands or of a sensor that begins anew after each turn."""
-    found, angles = list[str](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
+def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
+    """A fault for each angle of the commands or of a sensor that begins anew after each turn."""
+    found, angles = list[Fault](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
     given: _Given = _given(segment, config) if angles else {}
     for axis in angles:
         if times := len(wraps(segment.given(axis)[1])):
-            found.append(
+            words = (
                 f"the commands: an angle that begins anew on {axis} after each turn, {times} times: the model goes back"
                 " by a turn then; turn_deg = 360 beside their column in run.toml makes them go on"
             )
+            found.append(Fault((), (axis,), "turns", times, words))
         for name, axes in given.items():
             if axis in axes and (times := len(wraps(axes[axis][1]))):
-                found.append(
+                words = (
                     f"sensor '{name}': an angle that begins anew on {axis} after each turn, {times} times: turn_deg ="
                     " 360 in its table makes it go on"
                 )
+                found.append(Fault((name,), (axis,), "turns", times, words))
     return found
 
 
@@ -233,35 +242,61 @@ def _led(segment: Segment, config: FusionConfig, axis: str, time: TimeArray) -> 
     return response(model, period, delay, *segment.given(axis), segment.start[axis], time)
 
 
-def _off(config: FusionConfig, trackings: _Trackings) -> list[str]:
-    """A sentence on each sensor that is off by a constant; of all sensors of an axis one, on the commands."""
+def _off(segment: Segment, config: FusionConfig, trackings: _Trackings) -> list[Fault]:
+    """A fault for each sensor that is off by a constant; of all sensors of an axis one, on the commands."""
     off = {name: {axis: one.zero for axis, one in mine.items() if one.zero} for name, mine in trackings.items()}
-    found: list[str] = []
+    found = list[Fault]()
     for name, mine in off.items():
         alone: dict[str, float] = {}
         for axis, zero in mine.items():
             measuring = [other for other, axes in trackings.items() if axis in axes and axes[axis].excludes(zero)]
             alike = [one for one in measuring if math.isclose(off[one].get(axis, 0.0), zero, rel_tol=_ALIKE_SIZE)]
-            if len(alike) == len(measuring) > 1:
-                names = ", ".join(f"'{one}'" for one in alike)
-                where = f"sensors {names} are {_length(config, axis, zero)} from where the commands lead {axis}"
-                width = _width(config, "offset_sd", {axis: zero})
-                ask = f"is the zero of the commands another? Then give [start] {width}"
-                found += [f"{where}, all the time: {ask}"] if name == alike[0] else []
-            else:
+            if len(alike) < len(measuring) or len(alike) == 1:
                 alone[axis] = zero
-        if alone:
-            offsets = ", ".join(
-                f"{_length(config, axis, zero)} on {axis} (noise and priors:"
-                f" {_length(config, axis, trackings[name][axis].zero_sd, '.2g')})"
-                for axis, zero in alone.items()
-            )
-            widths = _width(config, "bias_sd", alone), _width(config, "offset_sd", alone)
-            found.append(
-                f"sensor '{name}' is off from where the commands lead, all the time: by {offsets}; has it another zero?"
-                f" Then give it {widths[0]}. Or have the commands? Then give [start] {widths[1]}"
-            )
+            elif name == alike[0]:
+                found.append(Fault(tuple(alike), (axis,), "zero", zero, _zero_of_commands(config, axis, zero, alike)))
+        if scaled := [axis for axis in alone if _is_scaled(trackings[name][axis], segment.start[axis])]:
+            scale = median(np.array([trackings[name][axis].slope for axis in scaled]))
+            found.append(Fault((name,), tuple(scaled), "unit", scale, _scaled(config, name, scaled, scale)))
+        if rest := {axis: zero for axis, zero in alone.items() if axis not in scaled}:
+            largest = max(rest.values(), key=abs)
+            found.append(Fault((name,), tuple(rest), "zero", largest, _zero(config, name, rest, trackings[name])))
     return found
+
+
+def _is_scaled(tracking: Tracking, start: float) -> bool:
+    """Whether motion and zero are larger by one factor: that of positions, as by a wrong scale."""
+    more = tracking.slope - 1.0
+    return abs(more) > _ALIKE_SIZE / 2.0 and math.isclose(tracking.zero, more * start, rel_tol=_ALIKE_SIZE)
+
+
+def _scaled(config: FusionConfig, name: str, axes: Sequence[str], factor: float) -> str:
+    scale = _digits(config.sensors[name].scale * factor, 3)
+    return (
+        f"sensor '{name}' measures {_digits(factor, 3)} times the position of {', '.join(axes)}: is the unit of its"
+        f" columns another one, or its scale? scale = {scale} makes up for it"
+    )
+
+
+def _zero_of_commands(config: FusionConfig, axis: str, zero: float, sensors: Sequence[str]) -> str:
+    names, width = ", ".join(f"'{one}'" for one in sensors), _width(config, "offset_sd", {axis: zero})
+    return (
+        f"sensors {names} are {_length(config, axis, zero)} from where the commands lead {axis}, all the time: is the"
+        f" zero of the commands another? Then give [start] {width}"
+    )
+
+
+def _zero(config: FusionConfig, name: str, zeros: Mapping[str, float], trackings: Mapping[str, Tracking]) -> str:
+    offsets = ", ".join(
+        f"{_length(config, axis, zero)} on {axis} (noise and priors:"
+        f" {_length(config, axis, trackings[axis].zero_sd, '.2g')})"
+        for axis, zero in zeros.items()
+    )
+    widths = _width(config, "bias_sd", zeros), _width(config, "offset_sd", zeros)
+    return (
+        f"sensor '{name}' is off from where the commands lead, all the time: by {offsets}; has it another zero?"
+        f" Then give it {widths[0]}. Or have the commands? Then give [start] {widths[1]}"
+    )
 
 
 def _length(config: FusionConfig, axis: str, size: float, digits: str = "+.4g") -> str:
@@ -280,11 +315,17 @@ def _width(config: FusionConfig, key: str, zeros: Mapping[str, float]) -> str:
     return ", ".join(f"{one} = {{ {', '.join(widths)} }}" for one, widths in found.items())
 
 
-def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[str]:
-    """A sentence on each sensor that moves while the commands of its axis rest."""
+def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
+    """A fault for each sensor that moves while the commands of its axis rest."""
     return [
-        f"sensor '{name}' moves over {_length(config, axis, one.own_motion, '.3g')} on {axis}, whose commands rest: is"
-        " it the right column of the commands?"
+        Fault(
+            (name,),
+            (axis,),
+            "motion",
+            one.own_motion,
+            f"sensor '{name}' moves over {_length(config, axis, one.own_motion, '.3g')} on {axis}, whose commands rest:"
+            " is it the right column of the commands?",
+        )
         for name, mine in trackings.items()
         for axis, one in mine.items()
         if one.own_motion
@@ -562,7 +603,7 @@ def _first_speed(segment: Segment, axis: str) -> float:
     return float(command[-1] - command[0]) / (int(given[-1] - given[0]) / 1e9)
 
 
-def _settled(config: FusionConfig, axis: str) -> float:
+def settled(config: FusionConfig, axis: str) -> float:
     """How long the model of an axis remembers where it began [s]."""
     return config.arm.delay_of(axis) + _SETTLED * config.arm.axes[axis].plant.lag
 
@@ -574,16 +615,16 @@ def _evidence(segment: Segment, config: FusionConfig, axis: str, speed: float) -
     constant of each sensor. Score over information is the share, 1/√information its standard deviation.
     """
     model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
-    settled, column, score, information = _settled(config, axis), segment.axes.index(axis), 0.0, 0.0
+    until, column, score, information = settled(config, axis), segment.axes.index(axis), 0.0, 0.0
     (given, command), start = segment.given(axis), segment.start[axis]
-    before = np.arange(-min(int(settled / period) + 1, _MOST), 0.0)
+    before = np.arange(-min(int(until / period) + 1, _MOST), 0.0)
     earlier = np.concatenate([given[0] + np.rint(before * (period * 1e9)).astype(np.int64), given])
     moving = np.concatenate([start + before * (period * speed), command])
     for name, rows in segment.rows_by_sensor().items():
         if (sensor := config.sensors.get(name)) is None:
             continue
         valid = rows.stamp - round(sensor.latency * 1e9)
-        early = (rows.known[:, column] == int(Outcome.FUSED)) & (valid <= given[0] + round(settled * 1e9))
+        early = (rows.known[:, column] == int(Outcome.FUSED)) & (valid <= given[0] + round(until * 1e9))
         if np.count_nonzero(early) < _FEWEST:
             continue
         valid, value = valid[early], rows.value[early, column] / sensor.scale

@@ -23,6 +23,7 @@ from ..space.rotations import TURNING
 from ..units import Kind
 from .clock import Clock, Time, Verdict, nanoseconds
 from .commands import Commands, CommandWatch, number
+from .diagnosis import Diagnosis
 from .frame_start import FrameStart
 from .health import Counts, Health, by_word
 from .joints import Joints
@@ -129,6 +130,7 @@ class LiveEstimator:
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
         self._watch = CommandWatch(config.arm, config.frame, self._log)
+        self._diagnosis = Diagnosis(config, self._log)
         self._screen, self._holds = CommandScreen(config.arm.update_period), HoldWatch(self._clock.window // 2)
         self._follows = [[latest_follow(config, name, axis) for axis in self.axes] for name in config.sensors]
         self._start = dict(start or {})
@@ -197,7 +199,7 @@ class LiveEstimator:
         orientation = None
         if self._tool is not None:
             orientation = self._tool.orientation([axes[axis].position for axis in TURNING if axis in axes])
-        return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason, orientation)
+        return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason, orientation, self._diagnosis.doubtful)
 
     @property
     def joints(self) -> Mapping[str, Kind]:
@@ -266,7 +268,7 @@ class LiveEstimator:
             for name, sensor in self._sensors.items()
         }
         commands = by_word(counts.outcomes[COMMAND] + self._refused[COMMAND])
-        return Health(newest, self.segment + 1, commands, sensors, self._strangers)
+        return Health(newest, self.segment + 1, commands, sensors, self._strangers, self._diagnosis.shown)
 
     def _begin(self, counts: Counts) -> None:
         """An empty window; ``counts`` go on."""
@@ -278,6 +280,7 @@ class LiveEstimator:
         self._watch.restart()
         self._screen.restart()
         self._holds.restart()
+        self._diagnosis.restart()
         counts.restart()
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
         # what came is fed again then, and counted anew.
@@ -423,6 +426,7 @@ class LiveEstimator:
         self._counts.forget(self._window, after)
         self._window.forget(after)
         self._commands.forget(after)
+        self._diagnosis.recent.forget(after)
         if self._tool is not None:
             self._place_again(self._tool.forget(after))
         if self._joints is not None:
@@ -515,8 +519,9 @@ class LiveEstimator:
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
             outcome = Outcome.BEFORE_START if missing else _UNKNOWN
             return self._refuse(sensor, values, outcome, why, counts.outcomes)
-        rows = window.port.end
+        rows, diagnosis = window.port.end, self._diagnosis
         source = COMMAND if sensor is None else self._sensors[sensor]
+        diagnosis.recent.keep(stamp, source, given, new)
         taken = window.add(stamp, source, given, oldest)
         if self._spreads:
             window.spread[:] = self._no_spread
@@ -526,6 +531,9 @@ class LiveEstimator:
         result = self._answers.get(codes) if not stranger else None
         result = result or self._answer(codes, stranger)
         counts.read(window)
+        is_due = self._clock.sure >= diagnosis.due or Outcome.REACQUIRED in codes
+        if is_due and self._screen.until == NEVER:  # a command that waits may explain it all
+            diagnosis.look(window, self._clock.sure)
         if sensor is None:
             if not judged:
                 self._count_command(stamp, values, result.outcome)

@@ -63,6 +63,7 @@ class Health:
         commands: Number of commands by the outcome's word.
         sensors: In the order of the configuration.
         unknown: Rows of sensors that the configuration does not know.
+        faults: A sentence on each fault of a sensor, or of the commands, that shows now.
     """
 
     newest: int | None
@@ -70,6 +71,7 @@ class Health:
     commands: Mapping[str, int]
     sensors: Mapping[str, SensorHealth]
     unknown: int
+    faults: tuple[str, ...] = ()
 
 
 def by_word(outcomes: IntArray) -> dict[str, int]:

@@ -90,6 +90,8 @@ class LiveEstimate:
             that far ahead.
         reason: In words.
         orientation: Of a tool that turns, a quaternion x, y, z, w; else None.
+        doubtful: Axes on which a fused sensor tells nonsense, or innovations are far larger than expected: their
+            standard deviations are not to be believed.
     """
 
     stamp: int
@@ -99,6 +101,7 @@ class LiveEstimate:
     outcome: Outcome
     reason: str
     orientation: tuple[float, float, float, float] | None = None
+    doubtful: tuple[str, ...] = ()
 
     @property
     def time(self) -> float:

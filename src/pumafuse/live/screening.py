@@ -148,8 +148,9 @@ class HoldWatch:
             commands: As far as they have come.
             lag: How late the axis may follow them [ns].
         """
-        one, axis = self._seen.setdefault(key, _Repeated()), key[1]
-        waited = one.waiting
+        if (one := self._seen.get(key)) is None:
+            one = self._seen[key] = _Repeated()
+        axis, waited = key[1], one.waiting
         if stamp <= one.stamp:
             one.forget()
             return Judged(False, False, waited)

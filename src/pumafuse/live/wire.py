@@ -165,7 +165,7 @@ class LineDecoder:
 
 
 def encode(estimate: LiveEstimate, kinds: Mapping[str, Kind], with_ns: bool) -> bytes:
-    """The line of an estimate: each axis's position, sd and velocity, x, y, z with a frame, q of a tool, stale axes.
+    """The line of an estimate: position, sd, velocity of each axis, x, y, z with a frame, q, stale and doubtful axes.
 
     Args:
         estimate: The estimate.
@@ -184,4 +184,6 @@ def encode(estimate: LiveEstimate, kinds: Mapping[str, Kind], with_ns: bool) -> 
         line[_QUATERNION] = estimate.orientation
     if estimate.stale:
         line["stale"] = estimate.stale
+    if estimate.doubtful:
+        line["doubtful"] = estimate.doubtful
     return msgspec.json.encode(line) + b"\n"

@@ -180,8 +180,8 @@ class Likelihood:
             asked = [one for one in chosen if one in part.sensors]
             clocks = clock_faults(part, config.arm.update_period, asked)
             built.append(build(part, config, chosen))
-            faults = (*within_a_turn(built[-1], config), *starts_in_motion(built[-1], config))
-            notes = (*clocks, *built[-1].notes, *faults)
+            turns = [one.sentence for one in within_a_turn(built[-1], config)]
+            notes = (*clocks, *built[-1].notes, *turns, *starts_in_motion(built[-1], config))
             self.notes += [f"run '{name}': {note}" for note in notes]
             counted.setdefault(name, []).append(built[-1])
         self.commands = {name: added(one.command_counts for one in parts) for name, parts in counted.items()}

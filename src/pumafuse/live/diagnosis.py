@@ -1,0 +1,309 @@
+"""Says while a stream runs that a sensor tells nonsense: as `fuse` does before it filters, by the last seconds."""
+
+from __future__ import annotations
+
+from array import array
+from collections import deque
+from collections.abc import Mapping, Sequence
+from ctypes import Array, c_double
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from ..arrays import ALWAYS, FloatArray, IndexArray, IntArray, TimeArray
+from ..errors import PumafuseError
+from ..filter.events import COMMAND, Results
+from ..filter.outcome import Outcome
+from ..filter.window import Window
+from ..fusion.chi_square import quantile
+from ..fusion.config import FusionConfig
+from ..fusion.faults import Fault, faults_of, settled
+from ..fusion.segments import Segment, build
+from ..logs.run import Run, Source
+from .rate_limit import RateLimitedLog
+
+_SPAN_NS = 20_000_000_000  # of the past in which faults are looked for: within 5 s causes are mistaken for each other
+_SHORTEST_NS = 5_000_000_000  # of the past below which nothing is looked for
+_APART_NS = 2_500_000_000, 5_000_000_000  # between two looks for faults, of 5 to 10 ms each: at first, and later
+_FINEST_NS = 8_000_000  # between two rows of a sensor that are kept: faults are looked for by 500 of a span
+_TWICE = 2  # looks in a row that find a fault, or do not, until that is said
+_MOVED = 0.5  # of the commanded motion that showed a fault, without which nothing shows that it is over
+
+_SECOND_NS, _QUARTER_NS = 1_000_000_000, 250_000_000  # over which innovations are judged, and how often
+_QUARTERS = _SECOND_NS // _QUARTER_NS
+_LARGE, _HUGE = 4.0, 100.0  # NIS in each quarter of a second, and over all of it: 2 sd; one value of 100 by 100 sd
+_CHANCE = 1e-12  # that a second of good measurements has so large a NIS: one in 10⁵ years at 10 axes
+_CALM_NS = 5_000_000_000  # of usual innovations, after which it is over
+_MOST_ROWS = 4096  # of a second that are judged
+_SHOWS = {
+    "turns": "an angle that begins anew after each turn",
+    "unit": "motion of another size",
+    "columns": "exchanged columns",
+    "sign": "motion against the commands",
+    "clock": "another clock",
+    "frame": "a frame that is turned",
+    "nothing": "a motion that follows nothing",
+    "motion": "motion while the commands rest",
+    "zero": "another zero",
+}
+
+_Key: TypeAlias = tuple[tuple[str, ...], str]  # sensors, and the cause of their fault
+
+
+class Recent:
+    """What came of commands and measurements in the last seconds, in the arm's axes."""
+
+    def __init__(self, config: FusionConfig) -> None:
+        """Nothing yet."""
+        self._config, self._axes, self._sensors = config, tuple(config.arm.axes), tuple(config.sensors)
+        self._settled = round(max(settled(config, axis) for axis in self._axes) * 1e9)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew."""
+        self._stamp, self._source, self._given, self._value = array("q"), array("q"), array("q"), array("d")
+        self._latest, self._start = [ALWAYS] * len(self._sensors), dict[str, float]()
+
+    def keep(self, stamp: int, source: int, given: int, values: Array[c_double]) -> None:
+        """Keep an event; of a dense sensor some.
+
+        Args:
+            stamp: Int ns.
+            source: ``COMMAND``, or which sensor.
+            given: Its axes, as bits.
+            values: [m or rad], (A,).
+        """
+        if source == COMMAND:
+            if len(self._start) < len(self._axes):
+                begun = [(name, values[axis]) for axis, name in enumerate(self._axes) if given >> axis & 1]
+                self._start = dict(begun) | self._start
+        elif abs(stamp - self._latest[source]) < _FINEST_NS:
+            return
+        else:
+            self._latest[source] = stamp
+        self._stamp.append(stamp)
+        self._source.append(source)
+        self._given.append(given)
+        self._value.frombytes(bytes(values))
+
+    def forget(self, after: int) -> None:
+        """Take back what is stamped after ``after`` [ns]."""
+        self._cut(ALWAYS, after)
+        self._latest = [min(stamp, after) for stamp in self._latest]
+
+    def segment(self, now: int) -> Segment | None:
+        """What came in the span before ``now`` [ns]; None where that is too little. What is older is forgotten."""
+        stamp, source, given, value = self._cut(now - _SPAN_NS, now)
+        order = np.argsort(stamp, kind="stable")
+        stamp, source, given, value = stamp[order], source[order], given[order], value[order]
+        commands = source == COMMAND
+        if not commands.any() or stamp[-1] - stamp[commands][0] < _SHORTEST_NS:
+            return None
+        bits = given[:, None] >> np.arange(len(self._axes)) & 1
+        value[bits == 0] = np.nan
+        commanded = [axis for axis in range(len(self._axes)) if bits[commands, axis].any()]
+        known = commands | (stamp >= stamp[commands][0] + self._settled)  # where the arm was before is not
+
+        def rows(chosen: IntArray, label: str) -> Source:
+            values = {self._axes[axis]: value[chosen, axis] for axis in commanded if bits[chosen, axis].any()}
+            return Source(stamp[chosen], values, label, apart=True)
+
+        every = {name: np.flatnonzero(known & (source == number)) for number, name in enumerate(self._sensors)}
+        sensors = {name: rows(chosen, name) for name, chosen in every.items() if len(chosen)}
+        start = {self._axes[axis]: self._start[self._axes[axis]] for axis in commanded}
+        kinds = self._config.arm.kind_of
+        run = Run("stream", rows(np.flatnonzero(commands), "commands"), sensors, start=start, kinds=kinds)
+        try:
+            return build(run, self._config)
+        except PumafuseError:  # of what is there nothing can be made
+            return None
+
+    def _cut(self, after: int, until: int) -> tuple[TimeArray, IntArray, IntArray, FloatArray]:
+        """Keep what is stamped after one time and until another [ns]; that, in the order in which it came."""
+        stamp, source, given = (np.array(one, dtype=np.int64) for one in (self._stamp, self._source, self._given))
+        value = np.array(self._value).reshape(-1, len(self._axes))
+        kept = (stamp > after) & (stamp <= until)
+        stamp, source, given, value = stamp[kept], source[kept], given[kept], value[kept]
+        self._stamp, self._source, self._given = (array("q", one.tobytes()) for one in (stamp, source, given))
+        self._value = array("d", value.tobytes())
+        return stamp, source, given, value
+
+
+@dataclass
+class _Trouble:
+    """A fault that a look has found.
+
+    Attributes:
+        fault: As the last look has found it.
+        travel: How far apart the commands of its axes were then [m or rad].
+        found: In how many looks in a row it was found.
+        missed: In how many looks in a row it was not, though they would have shown it.
+    """
+
+    fault: Fault
+    travel: float = 0.0
+    found: int = 0
+    missed: int = 0
+
+    @property
+    def is_said(self) -> bool:
+        """Whether it was found often enough."""
+        return self.found >= _TWICE
+
+
+class Diagnosis:
+    """Says once what is wrong with a stream, and once that it is over.
+
+    Attributes:
+        recent: What came in the last seconds.
+        due: When to look again [ns].
+        doubtful: Axes of which the estimate is not to be believed as far as its standard deviation says.
+    """
+
+    def __init__(self, config: FusionConfig, log: RateLimitedLog) -> None:
+        """Diagnose streams of a configuration; ``log`` gets the sentences."""
+        self._config, self._log = config, log
+        self._axes, self._sensors = tuple(config.arm.axes), tuple(config.sensors)
+        self.recent = Recent(config)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew by another clock."""
+        self.recent.restart()
+        self.due, self._faults_due, self.doubtful = ALWAYS, ALWAYS, tuple[str, ...]()
+        self._since = ALWAYS  # the first look [ns]
+        self._ends = deque[int](maxlen=_QUARTERS + 2)  # of the window's rows, at the last looks
+        self._troubles = dict[_Key, _Trouble]()
+        self._large = dict[str, dict[str, int]]()  # by sensor and axis, when innovations were last too large [ns]
+        self._reacquired = dict[str, int]()  # when each sensor was taken again [ns]
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """A sentence on each fault that shows now."""
+        large = [f"{_innovations(name, axes)} are far larger than expected" for name, axes in self._large.items()]
+        return (*(one.fault.sentence for one in self._troubles.values() if one.is_said), *large)
+
+    def look(self, window: Window, now: int) -> None:
+        """Look at what has come until ``now`` [ns]."""
+        port = window.port
+        if now >= self.due:
+            self._since = now if self.due == ALWAYS else self._since
+            self.due = now + _QUARTER_NS
+            self._ends.append(port.end)
+        if now >= self._faults_due:
+            self._faults_due = now + _APART_NS[now >= self._since + _SPAN_NS]
+            self._look_for_faults(now)
+        stamp, source, results = window.read(max(port.begin, self._ends[0], port.end - _MOST_ROWS), port.end)
+        recent = (stamp > now - _SECOND_NS) & (stamp <= now) & (source >= 0)
+        stamp, source, results = stamp[recent], source[recent], results.rows(np.flatnonzero(recent))
+        doubtful = self._look_at_reacquired(stamp, source, results)
+        fused = self._look_at_innovations(now, stamp, source, results)
+        doubtful.update(axis for axes in self._large.values() for axis in axes)
+        for one in self._troubles.values():
+            if one.is_said:  # what the gate keeps out harms nothing
+                doubtful.update(axis for name in one.fault.sensors for axis in one.fault.axes if (name, axis) in fused)
+        self.doubtful = tuple(axis for axis in self._axes if axis in doubtful)
+
+    # ---- faults of the log ------------------------------------------------------------------------------------------
+
+    def _look_for_faults(self, now: int) -> None:
+        segment = self.recent.segment(now)
+        if segment is None:
+            return
+        travel = {axis: float(np.ptp(segment.given(axis)[1])) for axis in segment.axes}
+        explained = {name for (names, _), one in self._troubles.items() if one.is_said for name in names}
+        faults = [
+            one
+            for one in faults_of(segment, self._config)
+            if one.cause != "nothing" or explained.isdisjoint(one.sensors)
+        ]
+        for fault in faults:
+            trouble = self._troubles.setdefault((fault.sensors, fault.cause), _Trouble(fault))
+            trouble.fault, trouble.missed, trouble.found = fault, 0, trouble.found + 1
+            trouble.travel = max(travel[axis] for axis in fault.axes)
+            if trouble.found == _TWICE:
+                self._log.write(f"{fault.sensors} {fault.cause}", f"{fault.sentence} (by {now / 1e9:.3f} s)")
+        found, named = {(one.sensors, one.cause) for one in faults}, {name for one in faults for name in one.sensors}
+        for key in self._troubles.keys() - found:
+            self._not_found(key, travel, not named.isdisjoint(key[0]), now)
+
+    def _not_found(self, key: _Key, travel: Mapping[str, float], is_replaced: bool, now: int) -> None:
+        """Count that a fault does not show, and say so where the commands would show it, unless another one does."""
+        (sensors, cause), trouble = key, self._troubles[key]
+        moved = max((travel.get(axis, 0.0) for axis in trouble.fault.axes), default=0.0)
+        trouble.missed += moved >= _MOVED * trouble.travel
+        if trouble.is_said and trouble.missed < _TWICE:
+            return
+        del self._troubles[key]
+        if trouble.is_said and not is_replaced:
+            self._log.write(f"{key} over", f"{_named(sensors)}: {_SHOWS[cause]} shows no more at {now / 1e9:.3f} s")
+
+    # ---- innovations ------------------------------------------------------------------------------------------------
+
+    def _look_at_innovations(
+        self, now: int, stamp: TimeArray, source: IndexArray, results: Results
+    ) -> set[tuple[str, str]]:
+        """Judge what became of the measurements of the last second; of which sensors and axes some were fused."""
+        taken = (results.outcome == Outcome.FUSED) | (results.outcome == Outcome.REACQUIRED)
+        row, axis = np.nonzero(taken)
+        quarter = (now - stamp[row]) // _QUARTER_NS
+        place = (source[row].astype(np.int64) * len(self._axes) + axis) * _QUARTERS + quarter
+        squares, shape = (results.innovation[taken] / results.innovation_sd[taken]) ** 2, (-1, _QUARTERS)
+        size = len(self._sensors) * len(self._axes) * _QUARTERS
+        count = np.bincount(place, minlength=size).reshape(shape)
+        total = np.bincount(place, weights=squares, minlength=size).reshape(shape)
+        number, nis = count.sum(axis=1), total.sum(axis=1) / np.maximum(count.sum(axis=1), 1)
+        everywhere = ((total > _LARGE * count) | (count == 0)).all(axis=1) & (number > 0)
+        large = dict[str, dict[str, float]]()
+        for pair in np.flatnonzero(everywhere | (nis > _HUGE)).tolist():
+            if nis[pair] > _HUGE or nis[pair] * number[pair] > quantile(int(number[pair]), _CHANCE):
+                name, of_axis = self._names(pair)
+                large.setdefault(name, {})[of_axis] = float(nis[pair])
+        self._say_large(large, now)
+        return {self._names(pair) for pair in np.flatnonzero(number).tolist()}
+
+    def _say_large(self, large: Mapping[str, Mapping[str, float]], now: int) -> None:
+        """Say which innovations have become far larger than expected, by their NIS, and which are so no more."""
+        for name, nis in large.items():
+            axes = self._large.setdefault(name, {})
+            if new := [axis for axis in nis if axis not in axes]:
+                worst = max(nis[axis] for axis in new)
+                self._log.write(
+                    f"{name} NIS",
+                    f"{_innovations(name, new)} are far larger than expected at {now / 1e9:.3f} s (NIS {worst:.3g} over"
+                    " the last second): error bars do not hold meanwhile",
+                )
+            axes |= dict.fromkeys(nis, now)
+        for name, axes in list(self._large.items()):
+            if max(axes.values()) < now - _CALM_NS:
+                del self._large[name]
+                self._log.write(f"{name} NIS over", f"{_innovations(name, axes)} are as expected at {now / 1e9:.3f} s")
+
+    def _names(self, pair: int) -> tuple[str, str]:
+        sensor, axis = divmod(pair, len(self._axes))
+        return self._sensors[sensor], self._axes[axis]
+
+    def _look_at_reacquired(self, stamp: TimeArray, source: IndexArray, results: Results) -> set[str]:
+        """The axes on which a sensor was taken again in the last second; what is new of that is said."""
+        again = results.outcome == Outcome.REACQUIRED
+        for row in np.flatnonzero(again.any(axis=1)).tolist():
+            name, at = self._sensors[int(source[row])], int(stamp[row])
+            if at <= self._reacquired.get(name, ALWAYS):
+                continue
+            self._reacquired[name] = at
+            axes = ", ".join(self._axes[axis] for axis in np.flatnonzero(again[row]).tolist())
+            self._log.write(
+                f"{name} reacquired",
+                f"sensor '{name}' was rejected time after time on {axes} and is believed again since {at / 1e9:.3f} s:"
+                " the estimate goes over to where it sees the arm",
+            )
+        return {self._axes[axis] for axis in np.flatnonzero(again.any(axis=0)).tolist()}
+
+
+def _innovations(sensor: str, axes: Mapping[str, int] | Sequence[str]) -> str:
+    return f"sensor '{sensor}': its innovations on {', '.join(axes)}"
+
+
+def _named(sensors: Sequence[str]) -> str:
+    return f"sensor{'s' if len(sensors) > 1 else ''} {', '.join(map(repr, sensors))}" if sensors else "the commands"

@@ -1,0 +1,230 @@
+"""What a stream says by itself of a sensor that tells nonsense: once, as `fuse` does, and when it is over."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.filter.response import response
+from pumafuse.logs.run import Source
+from streams import Both, events_of, feed
+
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+ROOT = Path(__file__).parents[2]
+SCAN = ROOT / "src" / "pumafuse" / "data" / "scan"
+LENGTH = 20.0  # s of the shipped scan
+TURN = np.radians(30.0)
+
+
+@cache
+def scan() -> tuple[pf.Run, pf.FusionConfig]:
+    """The first seconds of the shipped scan, with all its sensors."""
+    run = pf.Run.read(SCAN)
+    until = run.command.stamp[0] + round(LENGTH * 1e9)
+    run = replace(run, command=run.command.rows(run.command.stamp <= until), reference=None)
+    sensors = {name: source.rows(source.stamp <= until) for name, source in run.sensors.items()}
+    return replace(run, sensors=sensors), pf.FusionConfig.load(SCAN / "fusion.toml")
+
+
+def tracked() -> tuple[pf.Run, pf.FusionConfig]:
+    """The same with the tracker alone, so that nothing contradicts it."""
+    run, config = scan()
+    sensors = {"tracker": config.sensors["tracker"]}
+    return replace(run, sensors={"tracker": run.sensors["tracker"]}), msgspec.structs.replace(config, sensors=sensors)
+
+
+def slipped(run: pf.Run, slip: Callable[[Source], Source], sensor: str = "tracker") -> pf.Run:
+    return replace(run, sensors={**run.sensors, sensor: slip(run.sensors[sensor])})
+
+
+def later(seconds: float) -> Callable[[Source], Source]:
+    return lambda one: replace(one, stamp=one.stamp + round(seconds * 1e9))
+
+
+def larger(factor: float) -> Callable[[Source], Source]:
+    return lambda one: replace(one, values={axis: factor * value for axis, value in one.values.items()})
+
+
+def exchanged(one: Source) -> Source:
+    return replace(one, values={**one.values, "x": one.values["y"], "y": one.values["x"]})
+
+
+def turned(one: Source) -> Source:
+    x, y = one.values["x"], one.values["y"]
+    seen = {"x": np.cos(TURN) * x - np.sin(TURN) * y, "y": np.sin(TURN) * x + np.cos(TURN) * y}
+    return replace(one, values={**one.values, **seen})
+
+
+def zero_while_lost(one: Source) -> Source:
+    """Half a second of zeros every four, to the last digit but one."""
+    is_lost = np.arange(len(one.stamp)) // 50 % 8 == 7
+    noise = 1e-6 * np.random.default_rng(1).standard_normal(len(is_lost))
+    return replace(one, values={axis: np.where(is_lost, noise, value) for axis, value in one.values.items()})
+
+
+SLIPS: dict[str, tuple[Callable[[Source], Source], str]] = {
+    "late": (later(0.5), "s late: it follows the commands of"),
+    "early": (later(-1.5), "s early: it follows the commands of"),
+    "exchanged": (exchanged, "follows on x the commands of y"),
+    "inches": (larger(1.0 / 25.4), "are its values inch called mm"),
+    "twice": (larger(2.0), "times the position of x, y, z: is the unit"),
+    "against": (larger(-1.0), "moves against the commands of"),
+    "turned": (turned, "looks turned by"),
+}
+
+
+def said(run: pf.Run, config: pf.FusionConfig) -> tuple[list[str], pf.LiveEstimator]:
+    """What a stream of the run says."""
+    notices = list[str]()
+    live = pf.LiveEstimator(config, on_notice=notices.append)
+    for event in events_of(run):
+        feed(live, event)
+    return notices, live
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_sensor_that_tells_nonsense_is_named_once(slip: str) -> None:
+    """With the words of `fuse`; estimates say on which axes they are not to be believed."""
+    (run, config), (change, words) = tracked(), SLIPS[slip]
+    run = slipped(run, change)
+    notices, live = said(run, config)
+    assert len([one for one in notices if words in one]) == 1
+    assert len([one for one in live.health().faults if words in one]) == 1
+    assert live.estimate().doubtful
+    try:
+        offline = pf.fuse(run, config).notes
+    except pf.PumafuseError as error:  # another unit is refused
+        offline = (str(error),)
+    assert any(words in one for one in offline)
+
+
+def test_a_sensor_of_a_kilohertz_is_named_as_one_of_100_hz() -> None:
+    """Of a dense sensor some rows are looked at."""
+    run, config = tracked()
+    source = run.sensors["tracker"]
+    stamp = np.arange(source.stamp[0], source.stamp[-1], 1_000_000)
+    dense = Source(stamp, {axis: np.interp(stamp, *source.series(axis)) for axis in source.values}, "tracker")
+    notices, _ = said(slipped(replace(run, sensors={"tracker": dense}), exchanged), config)
+    assert len([one for one in notices if SLIPS["exchanged"][1] in one]) == 1
+
+
+def test_what_the_gate_keeps_out_makes_no_estimate_doubtful() -> None:
+    """Two other sensors contradict it: it is named, and harms nothing."""
+    run, config = scan()
+    notices, live = said(slipped(run, exchanged), config)
+    assert len([one for one in notices if SLIPS["exchanged"][1] in one]) == 1
+    assert live.estimate().doubtful == ()
+
+
+def test_it_says_when_a_fault_is_over() -> None:
+    """Columns that are exchanged for the first half, and the length of a history later not any more."""
+    run, config = pf.Run.read(SCAN), tracked()[1]
+    run = replace(run, sensors={"tracker": run.sensors["tracker"]}, reference=None)
+    begin = run.command.stamp[0]
+
+    def at_first(one: Source) -> Source:
+        early, wrong = one.stamp < begin + round(15e9), exchanged(one)
+        return replace(
+            one, values={axis: np.where(early, wrong.values[axis], value) for axis, value in one.values.items()}
+        )
+
+    notices, live = said(slipped(run, at_first), config)
+    assert len([one for one in notices if SLIPS["exchanged"][1] in one]) == 1
+    assert len([one for one in notices if "exchanged columns shows no more" in one]) == 1
+    assert live.health().faults == () and live.estimate().doubtful == ()
+
+
+def test_at_rest_nothing_shows_that_a_fault_is_over() -> None:
+    """The commands stop: the sensor may be as wrong as before."""
+    run, config = tracked()
+    run = slipped(run, exchanged)
+    rest = run.command.stamp[-1] + 28_000_000 * np.arange(1, 1500)
+    values = {axis: np.append(value, np.full(len(rest), value[-1])) for axis, value in run.command.values.items()}
+    tracker = run.sensors["tracker"]
+    seen = tracker.stamp[-1] + 10_000_000 * np.arange(1, 4000)
+    noise = 5e-5 * np.random.default_rng(2).standard_normal(len(seen))
+    measured = {axis: np.append(value, value[-1] + noise) for axis, value in tracker.values.items()}
+    command = replace(run.command, stamp=np.append(run.command.stamp, rest), values=values)
+    sensors = {"tracker": replace(tracker, stamp=np.append(tracker.stamp, seen), values=measured)}
+    notices, live = said(replace(run, command=command, sensors=sensors), config)
+    assert not [one for one in notices if "shows no more" in one]
+    assert len([one for one in live.health().faults if SLIPS["exchanged"][1] in one]) == 1
+
+
+def test_a_sensor_that_is_taken_again_is_said_and_doubted_at_once() -> None:
+    """A tracker that writes zeros while it is lost, 0.5 m off: from the row on that is believed, for a second."""
+    run, config = tracked()
+    notices = list[str]()
+    live = pf.LiveEstimator(config, on_notice=notices.append)
+    far, doubted = list[bool](), list[bool]()
+    for event in events_of(slipped(run, zero_while_lost)):
+        result = feed(live, event)
+        if pf.Outcome.REACQUIRED in result.axes.values():
+            assert {axis for axis, one in result.axes.items() if one is pf.Outcome.REACQUIRED} <= {
+                *live.estimate().doubtful
+            }
+        if not event.sensor:
+            far.append(abs(live.estimate()["y"].position - event.values["y"]) > 0.1)
+            doubted.append("y" in live.estimate().doubtful)
+    assert any("is believed again since" in one for one in notices)
+    assert sum(far) > 10 and np.array(doubted)[far].all()
+    assert not all(doubted)
+
+
+def test_the_wire_says_which_axes_are_doubtful() -> None:
+    """Beside the stale ones; a good stream has no such word."""
+    run, config = tracked()
+    for slip, expected in ((larger(1.0), set[str]()), (exchanged, {"x", "y"})):
+        both = Both(config)
+        for event in events_of(slipped(run, slip)):
+            values = {axis: 1e3 * value for axis, value in event.values.items()}
+            body = {"sensor": event.sensor, **values} if event.sensor else {"command": values}
+            both.feed(json.dumps({"t_ns": event.stamp, **body}).encode() + b"\n")
+        told = [one.get("doubtful") for one in both.estimates]
+        assert set(told[-1] or ()) >= expected
+        assert expected or told == [None] * len(told)
+
+
+GOOD = ("fast-arm", "panel-tracker-outage", "panel-vision", "saturating-servo", "smooth-disturbance", "tool-with-play")
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("name", GOOD)
+def test_a_good_stream_says_nothing(name: str, seed: int) -> None:
+    """With outliers, outages, play and limits that the model has."""
+    sim = pf.simulate(pf.Scenario.load(ROOT / "scenarios" / f"{name}.toml"), seed)
+    notices, live = said(sim.run, sim.config)
+    assert notices == [] and live.health().faults == ()
+
+
+@pytest.mark.long
+def test_hours_of_a_good_stream_say_nothing() -> None:
+    """Three hours of stamps: a tracker of 10 Hz, a camera of 4, a lag that the model has, noise as configured."""
+    period, hours, rng = 0.112, 3.0, np.random.default_rng(3)
+    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))
+    arm = pf.ArmModel(name="an arm", update_period=period, delay=0.06, axes={"x": axis})
+    config = pf.FusionConfig(
+        arm=arm,
+        process={"x": pf.Process(drift=1e-4)},
+        sensors={"tracker": pf.Sensor(sd=2e-4), "camera": pf.Sensor(sd=5e-4, latency=0.045)},
+    )
+    given = np.arange(0.0, 3600.0 * hours, period)
+    u = 0.05 * np.sin(0.7 * given) + 0.02 * np.sin(0.05 * given)
+    u[(given // 60.0) % 5 == 4] = 0.01  # rests
+    stamp = np.rint(given * 1e9).astype(np.int64)
+    sensors = dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]()
+    for name, interval in {"tracker": 0.1, "camera": 0.25}.items():
+        seen = np.arange(0.5, given[-1], interval)
+        valid = np.rint((seen - config.sensors[name].latency) * 1e9).astype(np.int64)
+        led = response(axis, period, arm.delay, stamp, u, float(u[0]), valid)
+        sensors[name] = seen, {"x": led + config.sensors[name].sd * rng.standard_normal(len(seen))}
+    notices, live = said(pf.Run.from_arrays(given, {"x": u}, sensors), config)
+    assert notices == [] and live.health().faults == ()
