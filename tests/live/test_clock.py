@@ -1,8 +1,10 @@
 """Late, ahead, of another clock, of a clock that was reset: what stamps alone tell."""
 
+import numpy as np
 import pytest
 
 import pumafuse as pf
+from pumafuse.filter.response import response
 from pumafuse.live.clock import Clock, Verdict
 
 SECOND = 1_000_000_000
@@ -165,3 +167,105 @@ def test_one_sensor_ahead_or_behind_never_restarts_the_filter(window: float, off
     bad = {name: health.sensors["camera"].outcomes[name] for name in ("too_late", "invalid")}
     assert off > 1.0 or not any(bad.values())
     assert sum(health.sensors["tracker"].outcomes[name] for name in bad) == 0
+
+
+# ---- clocks that are set back by less than the window ---------------------------------------------------------------
+
+
+def streamed(
+    back: dict[str, float], seconds: float = 10.0, at: float = 5.0, rate: float = 100.0
+) -> tuple[pf.LiveEstimator, list[str], float]:
+    """A moving arm whose clocks are set ``back`` [s] at an instant, by source; notices, and the largest error then.
+
+    Commands have no name, and each source that has none there goes on.
+    """
+    notices, worst = list[str](), 0.0
+    live = pf.LiveEstimator(CONFIG, on_notice=notices.append)
+    arm = CONFIG.arm
+    given = np.arange(0.0, seconds, 0.028)
+    u = 0.55 + 0.05 * np.sin(2.0 * given)
+    stamp = np.rint(given * 1e9).astype(np.int64)
+    seen = np.arange(0.1, seconds, 1.0 / rate)
+    led, truths = (
+        response(
+            arm.axes["radial"],
+            arm.update_period,
+            arm.delay_of("radial"),
+            stamp,
+            u,
+            float(u[0]),
+            np.rint(time * 1e9).astype(np.int64),
+        )
+        for time in (seen, given)
+    )
+    noise = 1e-4 * np.random.default_rng(4).standard_normal(len(seen))
+    events = [(t, "", value, truth) for t, value, truth in zip(given, u, truths, strict=True)]
+    events += [(t, "tracker", value, 0.0) for t, value in zip(seen, led + noise, strict=True)]
+    for t, sensor, value, truth in sorted(events, key=lambda event: (event[0], event[1] == "")):
+        stamped = t - (back.get(sensor, 0.0) if t >= at else 0.0)
+        if sensor:
+            live.measurement(stamped, sensor, radial=value)
+        else:
+            live.command(stamped, radial=value)
+            if t >= at + 1.0:
+                worst = max(worst, abs(live.estimate(stamped)["radial"].position - truth))
+    return live, notices, worst
+
+
+@pytest.mark.parametrize("rate", [10.0, 100.0, 1000.0])
+@pytest.mark.parametrize("by", [0.12, 0.3, 0.5, 0.9, 1.8])
+def test_all_clocks_that_are_set_back_begin_a_segment(by: float, rate: float) -> None:
+    """As by NTP or a leap second: said with its size, nothing is lost nor counted twice, and estimates go on."""
+    live, notices, worst = streamed({"": by, "tracker": by}, rate=rate)
+    (told,) = [one for one in notices if "clock" in one]
+    assert "all clocks were set back by" in told
+    assert float(told.split(" by ")[1].split(" s at")[0]) == pytest.approx(by, abs=0.002)
+    assert live.segment == 1 and worst < 5e-4
+    _, _, undisturbed = streamed({}, rate=rate)
+    assert undisturbed < 5e-4
+    health = live.health()
+    assert health.commands["fused"] == sum(health.commands.values()) == 358
+    tracker = health.sensors["tracker"]
+    assert tracker.rows == sum(tracker.outcomes.values()) == round(9.9 * rate)
+
+
+def test_without_a_sensor_more_commands_show_that_the_clock_is_set_back() -> None:
+    """Eight in a row; none is lost."""
+    live = pf.LiveEstimator(CONFIG)
+    for step in range(200):
+        live.command(0.028 * step - (0.4 if step >= 100 else 0.0), radial=0.5 + 1e-4 * step)
+        assert live.segment == (step >= 107)
+    assert live.health().commands["fused"] == 200
+
+
+@pytest.mark.parametrize("by", [0.06, 0.3, 0.9])
+def test_the_clock_of_one_sensor_that_is_set_back_is_said_once(by: float) -> None:
+    """The others go on, in the same segment."""
+    live, notices, _ = streamed({"tracker": by})
+    (told,) = [one for one in notices if "step back" in one]
+    assert told.startswith("sensor 'tracker': its stamps step back by")
+    assert float(told.split(" by ")[1].split(" s at")[0]) == pytest.approx(by, abs=0.002)
+    assert live.segment == 0
+
+
+@pytest.mark.parametrize("late", [slice(100, 104), slice(100, 112), slice(100, 130)])
+def test_commands_that_come_late_together_are_no_clock(late: slice) -> None:
+    """They fill a hole: what was missing is there, and the estimate is that of a stream in order."""
+    order = [*range(late.start), *range(late.stop, 170), *range(late.start, late.stop), *range(170, 300)]
+    notices = list[str]()
+    live, clean = pf.LiveEstimator(CONFIG, on_notice=notices.append), pf.LiveEstimator(CONFIG)
+    for one, steps in ((live, order), (clean, range(300))):
+        for step in steps:
+            one.command(0.028 * step, radial=0.5 + 1e-4 * step)
+            one.measurement(0.028 * step + 0.01, "tracker", radial=0.5 + 1e-4 * step)
+    assert live.segment == 0 and not [one for one in notices if "clock" in one]
+    assert live.estimate().axes == clean.estimate().axes
+
+
+def test_two_controllers_of_other_clocks_are_no_clock_that_is_set_back() -> None:
+    """One 0.3 s behind the other, their commands one after the other."""
+    live = pf.LiveEstimator(CONFIG)
+    for step in range(300):
+        live.command(0.028 * step, radial=0.5)
+        live.command(0.028 * step - 0.3, radial=0.5)
+    assert live.segment == 0

@@ -30,6 +30,7 @@ from .joints import Joints
 from .rate_limit import RateLimitedLog
 from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
 from .screening import CommandScreen, HoldWatch, Screened
+from .set_back import SetBack
 from .tool import NO_TOOL, ORIENTATION, Row, axes_of, check_tool, tool_of
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
@@ -127,10 +128,11 @@ class LiveEstimator:
         self._doubtful = 0  # commands that may have to be taken back
         self._answers: dict[bytes, UpdateResult] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
+        self._behind: list[tuple[_Event, UpdateResult]] = []  # what came since the commands' clock may be set back
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
         self._watch = CommandWatch(config.arm, config.frame, self._log)
-        self._diagnosis = Diagnosis(config, self._log)
+        self._diagnosis, self._set_back = Diagnosis(config, self._log), SetBack(len(self._sensors))
         self._screen, self._holds = CommandScreen(config.arm.update_period), HoldWatch(self._clock.window // 2)
         self._follows = [[latest_follow(config, name, axis) for axis in self.axes] for name in config.sensors]
         self._start = dict(start or {})
@@ -281,6 +283,7 @@ class LiveEstimator:
         self._screen.restart()
         self._holds.restart()
         self._diagnosis.restart()
+        self._set_back.restart()
         counts.restart()
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
         # what came is fed again then, and counted anew.
@@ -313,11 +316,47 @@ class LiveEstimator:
             self._aside = []
         if self._event_log is not None:
             self._event_log.append(stamp, sensor, values)
+        result = self._take_in_time(stamp, sensor, values, parsed)
+        if self._set_back.take(COMMAND if sensor is None else self._sensors[sensor], stamp):
+            return self._watch_clocks(_Event(stamp, sensor, values), result)
+        return result
+
+    def _take_in_time(
+        self, stamp: int, sensor: str | None, values: Mapping[str, Any], parsed: Mapping[str, Any]
+    ) -> UpdateResult:
+        """Take an event whose stamp is right, as it came and as it is used."""
         if sensor is None:  # of joints these are screened: a pose is of all of them
             return self._take_screened(stamp, values if not self.joints.keys().isdisjoint(values) else parsed)
         if stamp > self._screen.until:
             self._settle(self._screen.believed())
         return self._enter(stamp, sensor, parsed)
+
+    def _watch_clocks(self, event: _Event, result: UpdateResult) -> UpdateResult:
+        """Say that a sensor's clock was set back within the window, and start anew where all clocks were."""
+        stamp, sensor, values = event
+        if sensor is not None and (back := self._set_back.of_sensor(self._sensors[sensor])):
+            self._log.write(
+                f"{sensor} set back",
+                f"sensor '{sensor}': its stamps step back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s and go on there:"
+                " was its clock set? If it was right before, its measurements are stamped too early by that now",
+            )
+        if sensor is None and self._set_back.commands == 1:
+            self._behind = []
+        if not self._set_back.commands:
+            return result
+        self._behind.append((event._replace(values=dict(values)), result))
+        if not (back := self._set_back.of_all()):
+            return result
+        for (_, name, _), one in self._behind:  # they are counted anew
+            if name is None:
+                self._counts.outcomes[COMMAND, one.outcome] -= 1
+                continue
+            self._counts.rows[self._sensors[name]] -= 1
+            for outcome in one.axes.values():
+                self._counts.outcomes[self._sensors[name], outcome] -= 1
+        told = f"all clocks were set back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s: new segment, filter restarted"
+        self._log.write("clock", told)
+        return self._begin_segment([one for one, _ in self._behind])
 
     def _parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """An event's values with a pose in the place of joints, and a commanded orientation as axes.
@@ -446,20 +485,22 @@ class LiveEstimator:
             self._count(sensor, values, outcome, self._refused, -1)
             if sensor is not None and outcome == _TOO_LATE:
                 self._counts.rows[self._sensors[sensor]] -= 1
-        self.segment += 1
         way = "back" if first < newest else "ahead"
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
         self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
+        return self._begin_segment([*(other for other, _ in aside), event])
+
+    def _begin_segment(self, events: Sequence[_Event]) -> UpdateResult:
+        """Begin a segment with events of the new clock; what becomes of the last."""
+        self.segment += 1
         self._start = {}
         if self._joints is not None:
             self._joints.restart()
         self._begin(self._counts.counted(self._window))
         if self._event_log is not None:
             self._event_log.begin_segment()
-        self._clock.start(first)
-        for other, _ in aside:
-            self._take(*other)
-        return self._take(*event)
+        self._clock.start(next(one.stamp for one in events if one.sensor is None))
+        return [self._take(*one) for one in events][-1]
 
     def _take_early(self, event: _Event, again: bool) -> UpdateResult:
         """Take an event while the frame's place may still change; a command before all others moves it."""
