@@ -41,7 +41,7 @@ def test_the_demo_leaves_everything_it_promises(demo: Path) -> None:
     """Tables, the configuration as used, pictures and a recording that rerun accepts."""
     tables = {"estimates.parquet", "measurements.parquet", "reference.parquet"}
     figures = {"fused.png", "error.png", "validation.png"}
-    assert names(demo) == tables | figures | {"summary.json", "fusion.toml", "arm.toml", "fused.rrd"}
+    assert names(demo) == tables | figures | {"summary.json", "log.json", "fusion.toml", "arm.toml", "fused.rrd"}
     assert all((demo / name).read_bytes().startswith(b"\x89PNG") for name in figures)
     rerun = Path(sys.executable).parent / "rerun"
     assert subprocess.run([str(rerun), "rrd", "verify", str(demo / "fused.rrd")], check=False).returncode == 0

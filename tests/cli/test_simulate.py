@@ -32,7 +32,10 @@ trajectory = { kind = "white-noise", axes = ["radial", "vertical"], amplitude_mm
 sensors.eye = { rate_hz = 30.0, sd_mm = 0.5 }
 """
 FILES = {"scenario.toml", "run.toml", "fusion.toml", "arm.toml", "commands.csv", "eye.csv", "truth.csv"}
-RESULT = {"estimates.parquet", "measurements.parquet", "reference.parquet", "summary.json", "fusion.toml", "arm.toml"}
+RESULT = {
+    *("estimates.parquet", "measurements.parquet", "reference.parquet", "summary.json"),
+    *("log.json", "fusion.toml", "arm.toml"),
+}
 
 
 @pytest.fixture
@@ -130,12 +133,18 @@ def test_many_runs_are_resumed(scenario: Path, tmp_path: Path) -> None:
     ):
         assert what in refused("fuse", *given, *same, "-o", out, "--resume", *option)
     recorded = next((runs / "seed-4").glob("*.csv*"))
-    before = recorded.stat().st_mtime
-    os.utime(recorded, (time.time() + 1.0,) * 2)  # as if it had been recorded anew
-    assert f"{out / 'seed-4'}: an earlier result, with the run as it was before;" in refused(
-        "fuse", *given, *same, "-o", out, "--resume"
-    )
-    os.utime(recorded, (before, before))
+    before = recorded.stat().st_mtime_ns
+    for years in (1, -1):  # recorded anew, or an older file in its place
+        os.utime(recorded, ns=(before, before + years * 31_536_000_000_000_000))
+        assert f"{out / 'seed-4'}: an earlier result, with other files of the run;" in refused(
+            "fuse", *given, *same, "-o", out, "--resume"
+        )
+    text = recorded.read_bytes()
+    recorded.write_bytes(text + text.splitlines(keepends=True)[-1])
+    os.utime(recorded, ns=(before, before))
+    assert "with other files of the run;" in refused("fuse", *given, *same, "-o", out, "--resume")
+    recorded.write_bytes(text)
+    os.utime(recorded, ns=(before, before))
     edited = runs / "seed-3" / "fusion.toml"
     edited.write_text(edited.read_text().replace("[start]", "[start]\n# as before\n"))
     pumafuse("fuse", *given, *same, "-o", out, "--resume")

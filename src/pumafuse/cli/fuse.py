@@ -17,6 +17,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates, Mode
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary, beaten
+from ..logs.manifest import stamps_of
 from ..logs.run import Run
 from ..pieces.fusing import fuse_to
 from ..pieces.reading import needs_whole, rows_of
@@ -128,19 +129,25 @@ def _fuse(
     A long run goes through piece by piece, where nothing, such as an option, needs it ``in_memory``.
     """
     results.check_writable(folder, force)
-    if (rows := rows_of(path)) > SHORT:
+    stamps, rows = stamps_of(path), rows_of(path)
+    if rows > SHORT:
         in_memory = in_memory or needs_whole(path, config)
-        if not in_memory:
-            return long(path, folder, progress=progress)
+    if rows <= SHORT or in_memory:
         if rows > MOST_IN_MEMORY:
             raise RunError(
                 f"{path}: {in_memory} needs the whole run in memory, and {rows / 1e6:.0f} million rows are too many: do"
                 " without, or cut the log into shorter runs"
             )
-    recorded = Run.read(path).between(*part)
-    est = whole(recorded, progress=progress)
-    results.check_fused(est.counts, est.config)
-    return results.write(est, folder, force, lambda new: draw(new, est, recorded, rrd, figures))
+        recorded = Run.read(path).between(*part)
+        est = whole(recorded, progress=progress)
+        results.check_fused(est.counts, est.config)
+
+        def more(new: Path) -> None:
+            results.note_log(new, stamps)
+            draw(new, est, recorded, rrd, figures)
+
+        return results.write(est, folder, force, more)
+    return long(path, folder, progress=progress)
 
 
 def draw(folder: Path, est: Estimates, recorded: Run, rrd: bool, figures: bool) -> None:

@@ -33,8 +33,8 @@ from .score import OrientationScore, ReferenceTrack, reference_track, score_orie
 from .summary import ScoreSummary, Summary, decode, encode, score_axis, summarise
 
 ESTIMATES, MEASUREMENTS, REFERENCE = "estimates.parquet", "measurements.parquet", "reference.parquet"
-SUMMARY = "summary.json"
-_FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", ARM_FILE, ROBOT_FILE} | {
+SUMMARY, _LOG = "summary.json", "log.json"
+_FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, _LOG, "fusion.toml", ARM_FILE, ROBOT_FILE} | {
     "fused.rrd",
     "fused.png",
     "error.png",
@@ -151,7 +151,7 @@ class Making:
             "other --sensors": summary.sensors != asked,
             "another --from or --to": (summary.from_s, summary.to_s) != self.part,
             **{f"no {name}": not (folder / name).exists() for name in self.extras},
-            "the run as it was before": (folder / SUMMARY).stat().st_mtime < manifest.last_written(log),
+            "other files of the run": not (now := manifest.stamps_of(log)) or _stamps(folder) != now,
         }
         if how := next((how for how, holds in differs.items() if holds), None):
             raise FolderError(
@@ -159,6 +159,18 @@ class Making:
                 " folder, or use --force, which makes all anew"
             )
         return summary
+
+
+def note_log(folder: Path, stamps: Mapping[str, tuple[int, int]]) -> None:
+    """Note in a result folder of which files it was made, for :meth:`Making.made`; ``stamps`` are of before."""
+    (folder / _LOG).write_bytes(msgspec.json.format(msgspec.json.encode(stamps)) + b"\n")
+
+
+def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
+    try:
+        return msgspec.json.decode((folder / _LOG).read_bytes(), type=dict[str, tuple[int, int]])
+    except (OSError, msgspec.MsgspecError):
+        return {}
 
 
 def check_fused(counts: Mapping[str, Mapping[str, int]], config: FusionConfig) -> None:

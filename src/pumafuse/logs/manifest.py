@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import os
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
@@ -307,8 +307,8 @@ def of_tables(tree: dict[str, Any], where: str = "run.toml") -> Manifest:
     return listed
 
 
-def last_written(run: Path) -> float:
-    """When a run was written last, in s since 1970; infinite where that cannot be told.
+def stamps_of(run: Path) -> dict[str, tuple[int, int]]:
+    """Size [bytes] and time of the last change [ns since 1970] of each file of a run; none where they cannot be told.
 
     Args:
         run: As :meth:`Run.read` takes it.
@@ -318,9 +318,10 @@ def last_written(run: Path) -> float:
         if listed.suffix == ".toml":
             files = [listed, *(listed.parent / entry.file for entry in load(listed).entries.values())]
         parts = [part for file in files for part in (file.iterdir() if file.is_dir() else [file])]
-        return max(part.stat().st_mtime for part in parts)
+        told = {os.path.relpath(part, listed.parent): part.stat() for part in parts}
     except (PumafuseError, OSError, ValueError):
-        return math.inf
+        return {}
+    return {name: (one.st_size, one.st_mtime_ns) for name, one in told.items()}
 
 
 def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry:

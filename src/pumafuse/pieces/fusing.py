@@ -33,6 +33,7 @@ from ..fusion.setup import filter_model
 from ..fusion.summary import Summary, encode
 from ..logs import tables
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, clock_faults
+from ..logs.manifest import stamps_of
 from ..logs.run import Run
 from .merging import Digest, digest, merged
 from .reading import Log
@@ -78,7 +79,9 @@ def fuse_to(
         PumafuseError: The run cannot be fused, or the folder cannot be written.
     """
     results.check_writable(folder, force)
+    stamps = stamps_of(path)
     with folders.replacing(folder) as new:
+        results.note_log(new, stamps)
         digests = list[Digest]()
         with ExitStack() as files:
             names = results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE
