@@ -191,6 +191,27 @@ def refused(path: Path, out: Path, what: str, **how: Any) -> None:
     assert "\n" not in str(error.value) and set(out.parent.iterdir()) == {path.parent if path.is_file() else path}
 
 
+@pytest.mark.parametrize("statistics", [True, False])
+@pytest.mark.parametrize("none", [9999.0, -32768.0])
+def test_what_stands_for_none_is_told_by_the_whole_file(tmp_path: Path, none: float, statistics: bool) -> None:
+    """Of ten seconds in which a tracker is lost some pieces have nothing else, and the first rows none of it."""
+
+    def is_lost(given: dict[str, tuple[Rows, np.ndarray]]) -> None:
+        tracker = given["tracker"][0]
+        tracker["x"] = np.where((tracker["t"] > 41.0) & (tracker["t"] < 51.0), none, tracker["x"])
+
+    path = written(tmp_path / "log", single=False, damage=is_lost)
+    if not statistics:
+        for file in path.glob("*.parquet"):
+            pq.write_table(pq.read_table(file), file, write_statistics=False)
+    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
+    expected, found = in_memory(path, whole), fusing.fuse_to(path, pieces, CONFIG)
+    estimates = pq.read_table(pieces / results.ESTIMATES)
+    assert estimates == pq.read_table(whole / results.ESTIMATES)
+    assert np.abs(estimates["x.position_mm"].to_numpy()).max() < 1e3
+    assert found.rows["tracker"] == expected.rows["tracker"]
+
+
 @pytest.mark.parametrize("single", [True, False])
 def test_rows_that_come_too_late(tmp_path: Path, single: bool) -> None:
     """One stray row is left out, with its number; many, or a clock that was set back, are refused."""

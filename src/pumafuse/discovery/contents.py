@@ -23,7 +23,7 @@ from msgspec import structs
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, counted, printable
 from ..logs import formats, recordings, tables
-from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, without_sentinels
+from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, sentinel, without
 from ..logs.frames import CARTESIAN
 from ..logs.manifest import Time
 from ..logs.recordings import PATH, PATH_TIME
@@ -362,7 +362,8 @@ def _signal(
 ) -> Signal | str:
     """A column as positions, or why it is none; empty for text."""
     try:
-        values, _ = without_sentinels(table.plain(path)[0])
+        values, _ = table.plain(path)
+        values = values if (none := sentinel(values)) is None else without(values, none)
         values = np.where(tables.meets(table, where), values, np.nan) if where else values
     except RunError as error:
         return printable(str(error).removeprefix(f"{table.path}: "))

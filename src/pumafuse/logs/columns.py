@@ -59,7 +59,7 @@ _NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types
 _LISTS = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
 _TEXTS = (pa.types.is_string, pa.types.is_large_string)
 # Numbers that stand for "none": nines, and the ends of whole numbers of 16 and 32 bits.
-_SENTINELS = {
+SENTINELS = {
     *(10.0**digits - 1.0 for digits in range(3, 10)),
     *(2.0**bits - one for bits in (15, 16, 31, 32) for one in (0, 1)),
 }
@@ -78,6 +78,7 @@ class Table:
         rows: Number of rows.
         notes: What was wrong with the file as a whole, a sentence each.
         names: Names and field paths of all that the file has, also where ``columns`` are only some of it.
+        sentinel_of: Which size in a column stands for "none", where the file has more rows; None: these tell.
     """
 
     path: Path
@@ -85,6 +86,7 @@ class Table:
     rows: int
     notes: tuple[str, ...]
     names: tuple[str, ...] = ()
+    sentinel_of: Callable[[str], float | None] | None = None
 
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
         """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels.
@@ -100,12 +102,13 @@ class Table:
         self._plain_column(name)
         unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
         given, note = self.plain(name)
-        values, none = without_sentinels(given)
-        if none is not None:
-            gone = np.isnan(values) & ~np.isnan(given)
+        size = sentinel(given) if self.sentinel_of is None else self.sentinel_of(name)
+        values = given if size is None else without(given, size)
+        if (gone := np.isnan(values) & ~np.isnan(given)).any():
             what = (
-                f"{self.path.name}: {counted(int(gone.sum()), 'cell')} of column '{shortened(name)}' with {none:.15g},"
-                f" ten times as far as all others, first in row {gone.argmax() + 1}: taken as missing"
+                f"{self.path.name}: {counted(int(gone.sum()), 'cell')} of column '{shortened(name)}' with"
+                f" {given[gone][0]:.15g}, ten times as far as all others, first in row {gone.argmax() + 1}: taken as"
+                " missing"
             )
             note = what if note is None else f"{note}; {what}"
         return units.si_of(values, unit), note
@@ -397,19 +400,30 @@ def leaf(path: str) -> str:
     return re.sub(r"(\[[^\]]*\]|(?<=.)\.\d+)+$", "", path)
 
 
-def without_sentinels(values: FloatArray) -> tuple[FloatArray, float | None]:
-    """Numbers with NaN for one that stands for "none" (−9999, 32767), and that one; None without any.
+def sentinel(values: FloatArray) -> float | None:
+    """The size of the number that stands for "none" (−9999, 32767) in a column; None without any."""
+    sizes = np.abs(values[np.isfinite(values)])
+    return sentinel_among(largest(sizes)) if len(sizes) and sizes.max() in SENTINELS else None
+
+
+def largest(sizes: FloatArray) -> FloatArray:
+    """The largest of some sizes, different ones, ascending: as many as tell a sentinel."""
+    return np.unique(sizes)[-_OTHERS - 1 :]
+
+
+def sentinel_among(sizes: FloatArray) -> float | None:
+    """The sentinel of a column with these :func:`largest` sizes.
 
     It is told by its digits, and must be ten times as far as all others, of which there must be some.
     """
-    size = np.abs(values, where=np.isfinite(values), out=np.zeros(len(values)))
-    top = float(size.max(initial=0.0))
-    if top not in _SENTINELS:
-        return values, None
-    others = np.unique(size[size < top])
-    if len(others) < _OTHERS or top <= _FAR * others[-1]:
-        return values, None
-    return np.where(size < top, values, np.nan), float(values[size.argmax()])
+    if len(sizes) <= _OTHERS or sizes[-1] not in SENTINELS or sizes[-1] <= _FAR * sizes[-2]:
+        return None
+    return float(sizes[-1])
+
+
+def without(values: FloatArray, size: float) -> FloatArray:
+    """Numbers with NaN for those of a size."""
+    return np.where(np.abs(values) == size, np.nan, values)
 
 
 def _rewritten(column: pa.ChunkedArray) -> pa.ChunkedArray:

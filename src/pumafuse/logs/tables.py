@@ -6,6 +6,7 @@ A line of text that does not fit the header is left out, and noted in a sentence
 from __future__ import annotations
 
 import codecs
+import math
 import os
 import re
 import stat
@@ -27,7 +28,7 @@ import pyarrow.parquet as papq
 from ..arrays import BoolArray
 from ..errors import RunError, UnknownNameError, counted, shortened
 from . import formats
-from .columns import BLANK, NUMBER, Table, find, longest, prefixes
+from .columns import BLANK, NUMBER, SENTINELS, Table, find, largest, longest, prefixes, sentinel_among
 
 Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
 Choice: TypeAlias = Callable[[Sequence[str]], Sequence[str]]  # of some among all names of columns
@@ -152,6 +153,40 @@ def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
         wanted, empty = _wanted(path, file, fields, {})
         for part in _parts(file, wanted, None) if file.metadata.num_rows else [empty]:
             yield Table(path, _named(part), part.num_rows, (), names)
+
+
+def sentinel_of(path: Path, name: str) -> float | None:
+    """The size of the number that stands for "none" in all of a column of a Parquet table; None without any.
+
+    Where the file's own statistics show that there is none, no row is read.
+
+    Args:
+        path: The table.
+        name: The column, or a field path.
+
+    Raises:
+        RunError: The file cannot be read.
+    """
+    if (most := _largest_by_statistics(path, name)) is not None and most not in SENTINELS:
+        return None
+    sizes = np.empty(0)
+    for part in in_parts(path, [name]):
+        values, _ = part.plain(name)
+        sizes = largest(np.concatenate([sizes, np.abs(values[np.isfinite(values)])]))
+    return sentinel_among(sizes)
+
+
+def _largest_by_statistics(path: Path, name: str) -> float | None:
+    """The largest size in a column by the file's statistics; None where they do not tell, or where it is infinite."""
+    with one_line(path):
+        found, most = papq.read_metadata(str(path)), 0.0
+    for group in map(found.row_group, range(found.num_row_groups)):
+        columns = {one.path_in_schema: one for one in map(group.column, range(group.num_columns))}
+        told = columns[name].statistics if name in columns else None
+        if told is None or not told.has_min_max or not isinstance(told.max, int | float):
+            return None
+        most = max(most, abs(told.min), abs(told.max))
+    return most if math.isfinite(most) else None
 
 
 def row_count(path: Path) -> int:

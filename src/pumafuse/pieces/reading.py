@@ -7,6 +7,7 @@ long as later ones have to be compared with them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache, partial
 from itertools import chain
 from pathlib import Path
 
@@ -176,6 +177,7 @@ class _Rows:
             )
         self._held, self._stamp = list[pa.Table](), np.empty(0, dtype=np.int64)
         self._late, self._left_out, self._read = 0, 0, 0
+        self._sentinel_of = cache(partial(tables.sentinel_of, path))
 
     def read_on(self, cut: int) -> int:
         """Read on; rows stamped before the ``cut`` [int ns] come too late. Returns how many were read."""
@@ -250,7 +252,7 @@ class _Rows:
 
     def _table(self, rows: pa.Table, notes: Sequence[str] = ()) -> Table:
         columns = dict(zip(rows.column_names, rows.columns, strict=True))
-        return Table(self.path, columns, rows.num_rows, tuple(notes), self._first.names)
+        return Table(self.path, columns, rows.num_rows, tuple(notes), self._first.names, self._sentinel_of)
 
     def _choose(self, rows: BoolArray) -> None:
         self._held = [self._at_hand().filter(_bits(rows))]
