@@ -17,6 +17,7 @@ from ..errors import RunError
 from ..units import TIMES, mistaken
 from .run import REFERENCE, Run, Source, note_rows
 from .screening import without_stray_values
+from .set_back import going_on
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 _OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
@@ -109,6 +110,8 @@ def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
 def without_strays(run: Run) -> Run:
     """The run without stray stamps (see :func:`stray_offsets`) and commands, and a note on each source that has any.
 
+    Clocks that were set back by up to 1 s go on before that (:func:`.set_back.going_on`).
+
     Their rows stay and count as rows without a stamp: commands are not used, measurements are invalid, and all other
     rows are processed as if these were absent. Rows of sensors and of the reference that are far behind keep their
     stamps, since they disturb no other: they become too late. This is done once, because what is left of nonsense
@@ -116,7 +119,8 @@ def without_strays(run: Run) -> Run:
     """
     if run.without_strays:
         return run
-    notes = list(run.notes)
+    run, steps = going_on(run)
+    notes = [*run.notes, *steps]
 
     def mended(label: str, source: Source) -> Source:
         if _ascends(source.stamp):

@@ -35,6 +35,7 @@ from ..logs import tables
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, clock_faults
 from ..logs.manifest import stamps_of
 from ..logs.run import Run
+from ..logs.set_back import going_on
 from .merging import Digest, digest, merged
 from .reading import Log
 
@@ -166,6 +167,9 @@ def _piece(
     own: tuple[int, int],
 ) -> Estimates:
     """The estimates of the rows after and until the instants ``own`` [int ns], with notes."""
+    moved, steps = going_on(run)
+    if moved is not run:
+        raise RunError(f"{steps[0]}; so long a run is fused piece by piece, in the order of time: cut the log there")
     in_place, placed, config = in_base(run, config, whole=False)
     lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:

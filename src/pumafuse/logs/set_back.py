@@ -1,0 +1,172 @@
+"""Clocks that were set back by up to 1 s within a recorded run, as by NTP or a leap second.
+
+Rows that only came late fill a hole. Where a clock was set back, rows go on at their interval where there were rows
+before. If all sources show it at once, by the same amount, one clock was set back: their stamps are made to go on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import NO_STAMP, IntArray, TimeArray
+from .run import Run, Source
+
+FARTHEST_NS = 1_000_000_000  # by which rows are out of order; beyond it there is another segment
+_IN_ORDER = 20  # rows in order before a step
+_LEAST, _OF_ALL, _OF_ONE = 2, 3, 5  # rows behind: of each source; of one at least, if all step back; if one does alone
+_MANY = 100  # intervals of which the usual one is the median
+_HOLE, _HOLE_OF_STEP = 1.5, 0.25  # of the usual interval, or of the step: a longer interval is a hole
+_REGULAR = 0.8  # of the rows that are expected where it was covered before, and is again
+_AGREE = 0.75  # intervals of both sources by which their steps may differ: they sample at other instants
+_MOST = 100  # steps
+
+
+class Step(NamedTuple):
+    """A step back of one source's stamps.
+
+    Attributes:
+        row: The first row after it, of those with a stamp.
+        newest: The stamp before it [ns].
+        back: By how much it steps back [ns].
+        usual: The usual interval of the rows [ns].
+        behind: How many rows are behind ``newest``.
+    """
+
+    row: int
+    newest: int
+    back: float
+    usual: float
+    behind: int
+
+
+def going_on(run: Run) -> tuple[Run, list[str]]:
+    """A run whose stamps go on where all clocks were set back, and a sentence on each step, also of a source alone."""
+    notes = list[str]()
+    for _ in range(_MOST):
+        steps = {name: steps_back(source.stamp) for name, source in _sources(run).items()}
+        common = next(filter(None, (_common(run, one, steps) for one in _candidates(steps))), None)
+        if common is None:
+            return run, [*notes, *_alone(run, steps)]
+        back, newest = common
+        later = _rows_after(run.command, newest, back)
+        row = f" in row {later[0] + 1}" if len(later) else ""
+        notes.append(
+            f"{run.command.label}: all clocks are set back by {back / 1e9:.3f} s{row}: stamps go on from there"
+        )
+        run = run.each(lambda _, source: _moved(source, newest, back))  # noqa: B023 - called at once
+    return run, notes
+
+
+def steps_back(stamp: TimeArray) -> list[Step]:
+    """Where stamps step back by up to 1 s and go on where rows were before, (rows,)."""
+    if (stamp[1:] >= stamp[:-1]).all():
+        return []
+    stamp = stamp[stamp != NO_STAMP]
+    back: IntArray = np.flatnonzero(np.diff(stamp) < 0) + 1
+    apart = np.diff(back, prepend=0, append=len(stamp))
+    begins, ends = back - apart[:-1], back + apart[1:]
+    some = np.flatnonzero((apart[:-1] > _IN_ORDER) & (apart[1:] > _LEAST))
+    steps = [_step(stamp, int(begins[one]), int(back[one]), int(ends[one])) for one in some.tolist()]
+    return [one for one in steps if one is not None]
+
+
+def _step(stamp: TimeArray, begin: int, row: int, end: int) -> Step | None:
+    """The step back at a row, which ends rows in order from ``begin`` and begins some until ``end``; if it is one."""
+    newest, first = int(stamp[row - 1]), int(stamp[row])
+    usual = float(np.median(np.diff(stamp[max(begin, row - _MANY) : row])))
+    if newest - first > FARTHEST_NS or stamp[begin] > first or usual <= 0.0:
+        return None
+    before = stamp[begin + int(np.searchsorted(stamp[begin:row], first, side="right")) - 1 : row]
+    after = stamp[row : row + int(np.searchsorted(stamp[row:end], newest, side="right")) + 1][: end - row]
+    expected = (newest - first) / usual
+    hole = max(_HOLE * usual, _HOLE_OF_STEP * (newest - first))
+    behind = int(np.count_nonzero(after <= newest))
+    few = min(len(before) - 1, behind) < _REGULAR * expected
+    longest = max(int(np.diff(one).max(initial=0)) for one in (before, after))
+    if behind < _LEAST or few or longest > hole:
+        return None
+    return Step(row, newest, newest - first + usual, usual, behind)
+
+
+def _sources(run: Run) -> dict[str, Source]:
+    return {"": run.command, **run.measured}
+
+
+def _candidates(steps: Mapping[str, list[Step]]) -> Iterable[Step]:
+    """The steps of all sources, the first ones first; of one instant those of the densest source."""
+    every = sorted((one for mine in steps.values() for one in mine), key=lambda one: (one.newest - one.back, one.usual))
+    return every[:_MOST]
+
+
+def _common(run: Run, step: Step, steps: Mapping[str, list[Step]]) -> tuple[float, int] | None:
+    """By how much all clocks were set back at a step [ns], and the newest stamp before it; None where not all were."""
+    agreeing = list[Step]()
+    for name, source in _sources(run).items():
+        mine = [one for one in steps[name] if _agree(one, step)]
+        if mine:
+            agreeing += mine[:1]
+        elif _goes_on(source.stamp, step):
+            return None
+    if steps[""] and not any(_agree(one, step) for one in steps[""]):
+        return None
+    several = len(agreeing) > 1 or len(_sources(run)) == 1
+    if not several or max(one.behind for one in agreeing) < _OF_ALL:
+        return None
+    surest = min(agreeing, key=lambda one: one.usual)
+    return surest.back, max(one.newest for one in agreeing)
+
+
+def _agree(one: Step, other: Step) -> bool:
+    apart = _AGREE * (one.usual + other.usual)
+    return abs(one.back - other.back) <= apart and abs(one.newest - other.newest) <= apart
+
+
+def _goes_on(stamp: TimeArray, step: Step) -> bool:
+    """Whether a source goes on over a step as if there was none: it has rows just before and after, and no step."""
+    known = stamp[stamp != NO_STAMP]
+    near = known[np.abs(known - step.newest) <= step.back + FARTHEST_NS]
+    if len(near) < _LEAST or not (near.min() < step.newest - step.back and near.max() > step.newest):
+        return False
+    return bool((np.diff(near) >= 0).all()) and float(np.median(np.diff(near))) < step.back
+
+
+def _rows_after(source: Source, newest: int, back: float) -> IntArray:
+    """The rows of a source that came after a step, of those with a stamp."""
+    known = np.flatnonzero(source.stamp != NO_STAMP)
+    stamp = source.stamp[known]
+    rows = [one.row for one in steps_back(stamp) if abs(one.newest - newest) <= back]
+    rows = rows or (np.flatnonzero((np.diff(stamp) < 0) & (np.abs(stamp[:-1] - newest) <= back)) + 1).tolist()
+    return known[rows[0] if rows else _shortest(stamp, newest, back) :]
+
+
+def _shortest(stamp: TimeArray, newest: int, back: float) -> int:
+    """Where a source whose interval is longer than the step is cut: where its interval is shorter by the step."""
+    interval = np.diff(stamp)
+    near = np.flatnonzero((stamp[1:] > newest - back) & (stamp[:-1] <= newest))
+    if not len(near):
+        return int(np.searchsorted(stamp, newest, side="right"))
+    usual = float(np.median(interval))
+    return int(near[np.argmin(np.abs(interval[near] + back - usual))]) + 1
+
+
+def _moved(source: Source, newest: int, back: float) -> Source:
+    """A source whose rows after a step go on."""
+    stamp = source.stamp.copy()
+    stamp[_rows_after(source, newest, back)] += round(back)
+    return replace(source, stamp=stamp)
+
+
+def _alone(run: Run, steps: Mapping[str, list[Step]]) -> list[str]:
+    """A sentence on each sensor whose clock was set back while the commands' went on."""
+    return [
+        f"{source.label_for(name)}: its clock is set back by {one.back / 1e9:.3f} s in row"
+        f" {int(np.flatnonzero(source.stamp != NO_STAMP)[one.row]) + 1}, and others are not: rows are sorted by their"
+        " stamps; where it was right before, they are stamped too early from there on"
+        for name, source in run.sensors.items()
+        for one in steps[name]
+        if one.behind >= _OF_ONE and _goes_on(run.command.stamp, one)
+    ]
