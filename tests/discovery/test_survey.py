@@ -1181,3 +1181,18 @@ def test_a_sensor_that_lacks_what_a_frame_is_found_by_is_told_so(given: str, tmp
     said = "\n".join(asked(survey(tmp_path)))
     assert ("It gives no z, without which no frame of its own is found" in said) is (given == "xy")
     assert "camera does not follow the commands on x" in said
+
+
+@pytest.mark.parametrize("share", [0.08, 0.3])
+def test_rows_out_of_order_have_a_clock(tmp_path: Path, share: float) -> None:
+    """Written by several threads, up to five rows late: the clock is found; what moves to and fro is none."""
+    t, u, s, z = recorded()
+    rng = np.random.default_rng(1)
+    for name, time, value in (("commands", t, u), ("tracker", s, z)):
+        place = np.arange(len(time)) + np.where(rng.random(len(time)) < share, rng.uniform(1.0, 6.0, len(time)), 0.0)
+        order = np.argsort(place, kind="stable")
+        write(tmp_path / f"{name}.csv", {"t_s": time[order], "x_mm": 1e3 * value[order, 0]})
+    assert survey(tmp_path).relations["tracker", "x"].lag == pytest.approx(LAG, abs=5e-3)
+    write(tmp_path / "commands.csv", {"t_s": 1e3 * u[:, 1], "x_mm": 1e3 * u[:, 0]})
+    with pytest.raises(RunError, match="does not run like a clock"):
+        survey(tmp_path)

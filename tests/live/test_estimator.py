@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
+from pumafuse.logs.clock import clock_faults
 from pumafuse.logs.frames import Cylindrical, Rotated
 
 ARM = pf.ArmModel.load("puma560-internal")
@@ -307,6 +308,25 @@ def test_missing_commands_are_counted(lost: int, said: bool) -> None:
     if said:
         assert f"until {1000.0 + last * PERIOD:.3f} s {gaps} of" in found[0]
         assert f"one is due every {PERIOD * 1e3:g} ms), the longest gap is {2 * PERIOD:.3g} s" in found[0]
+
+
+@pytest.mark.parametrize("later", [0.006, 0.009, 0.02])
+def test_two_senders_are_named_and_no_command_is_called_missing(later: float) -> None:
+    """Two nodes, each at the arm's period, of one path: said once, with both intervals; recorded as live."""
+    notices: list[str] = []
+    live = pf.LiveEstimator(CONFIG, on_notice=notices.append)
+    t = np.sort(np.concatenate([np.arange(1500) * PERIOD, np.arange(1500) * PERIOD + later]))
+    u = 0.57 + 0.01 * np.sin(t)
+    for time, value in zip(t.tolist(), u.tolist(), strict=True):
+        live.command(time, radial=value)
+    words = (
+        f"commands of two senders: each sends every {PERIOD * 1e3:g} ms, one"
+        f" {1e3 * min(later, PERIOD - later):g} ms after the other"
+    )
+    assert len([one for one in notices if words in one]) == 1
+    assert not [one for one in notices if "missing" in one or "commands come every" in one]
+    recorded = clock_faults(pf.Run.from_arrays(t, {"radial": u}), PERIOD, [])
+    assert len(recorded) == 1 and words in recorded[0]
 
 
 def test_a_first_command_that_is_no_position_is_invalid() -> None:

@@ -47,7 +47,8 @@ _MOST_COLUMNS = 200  # of positions in one of them
 _MOST_READ = 2_000  # columns of one of them
 _FEWEST_ROWS = 10
 _GAP = 5.0  # times the typical interval
-_IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
+_IN_ORDER = 0.95  # share of rows, or of blocks, of a clock that are not before the row or block above
+_BLOCK = 20  # rows; who writes from several threads writes some of them out of order
 _OF_TICK = 0.02  # of a tick, by which ticks of a clock differ: stamps of 15.6 ms that are written with 4 decimals
 _MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
 RANGES: dict[Kind, tuple[str, str, float]] = {  # small and large unit, and beyond which number it is the large one
@@ -545,8 +546,18 @@ def _clock_of(table: Table, name: str, stroke: float, span: float = 0.0) -> Cloc
         clock = Clock.of(table, time, basis, doubt and f"is {name} of {table.path.name} in {doubt}")
     except RunError:
         return None
-    steps = np.diff(clock.stamp[clock.stamp != NO_STAMP])
-    return clock if len(steps) and steps.any() and (steps >= 0).mean() >= _IN_ORDER else None
+    return clock if _runs(clock.stamp[clock.stamp != NO_STAMP]) else None
+
+
+def _runs(stamp: TimeArray) -> bool:
+    """Whether stamps go on from row to row, or where many rows are out of order from some rows to the next."""
+    steps = np.diff(stamp)
+    if not len(steps) or not steps.any():
+        return False
+    if (steps >= 0).mean() >= _IN_ORDER:
+        return True
+    blocks = [np.median(block) for block in np.array_split(stamp, len(stamp) // _BLOCK or 1)]
+    return len(blocks) >= _FEWEST_ROWS and bool((np.diff(blocks) > 0).mean() >= _IN_ORDER)
 
 
 def _nameless_clock(table: Table, stroke: float) -> Clock | None:

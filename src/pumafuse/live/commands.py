@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
-from ..logs.clock import missing_commands, other_interval
+from ..logs.clock import missing_commands, other_interval, two_senders
 from ..logs.frames import Cylindrical, Frame
 from ..logs.run import Source
 from ..model.arm import ArmModel, Validity
@@ -90,7 +90,7 @@ class CommandWatch:
         """Watch the commands of an arm; ``log`` gets the sentences."""
         self._arm, self._log = arm, log
         self._cylindrical = isinstance(frame, Cylindrical)
-        self._knows_interval = False
+        self._knows_interval, self._senders = False, False
         self._recent: list[tuple[int, Mapping[str, Any]]] = []
 
     def restart(self) -> None:
@@ -119,13 +119,17 @@ class CommandWatch:
         if len(recent) == _FIRST and not self._knows_interval:
             self._knows_interval = True
             stamps = np.sort(np.array([stamp for stamp, _ in recent]))
-            if (other := other_interval(stamps, self._arm.update_period)) is not None:
+            if (senders := two_senders(stamps, self._arm.update_period)) is not None:
+                self._senders = True
+                self._log.write("interval of commands", senders)
+            elif (other := other_interval(stamps, self._arm.update_period)) is not None:
                 sentence, kind = other
                 where = " A stream has t in s, or t_ns in ns" if kind == "unit" else ""
                 self._log.write("interval of commands", sentence + where)
         if len(recent) >= _MANY:
             self._recent = []
-            self._look_for_missing(sorted(recent, key=lambda one: one[0]))
+            if not self._senders:
+                self._look_for_missing(sorted(recent, key=lambda one: one[0]))
 
     def _look_for_missing(self, recent: list[tuple[int, Mapping[str, Any]]]) -> None:
         stamps = np.array([stamp for stamp, _ in recent])

@@ -29,6 +29,7 @@ _SCATTERED, _JUMP = 5, 3.0  # periods of a short gap, and steps as large as a us
 _MANY_LOST, _OFF_TICK = 0.03, 0.25  # shares: of commands in motion, above which it is said; of a period
 _CORRECT = "Correct the unit of its time in run.toml"
 _LONG_GAP = 1.0  # s, of commands in motion, from which one gap is said
+_ALTERNATE = 0.9  # share of intervals from which a short one and a long one take turns
 _EVEN = 0.1  # spread of intervals over the usual one, up to which commands are a steady stream
 _HOUR_NS = 3_600_000_000_000
 _LONG_NS = 87_660 * _HOUR_NS  # ten years: no log is as long
@@ -219,14 +220,16 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
     found, label, stamp = list[str](), run.command.label, run.command.stamp
     command = np.sort(stamp[stamp != NO_STAMP], kind="stable")
     first = run.command.series(run.axes[0])[0] if run.command.apart else command
-    if (other := other_interval(first, period)) is not None:
+    if (senders := two_senders(first, period)) is not None:
+        found.append(f"{label}: {senders}")
+    elif (other := other_interval(first, period)) is not None:
         sentence, kind = other
         if kind == "unit":
             raise RunError(f"{label}: {sentence} {_CORRECT}, or update_period_ms in arm.toml")
         if kind == "lost":
             raise RunError(f"{label}: {sentence} Log every command, or correct update_period_ms in arm.toml")
         found.append(f"{label}: {sentence}")
-    if (missing := missing_commands(run.command)) is not None:
+    if senders is None and (missing := missing_commands(run.command)) is not None:
         found.append(f"{label}: {missing}: the model holds the one before; log every command")
     for name in sensors:
         stamp = run.sensors[name].stamp
@@ -272,6 +275,29 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit"
     times = f"{usual * 1e3:.4g} ms, {usual / period:.3g} times the arm's update_period_ms = {period * 1e3:g}"
     is_lost = even and float(every.mean()) / 1e9 > _MOST_LOST * period
     return f"commands come every {times}: {lost}", "lost" if is_lost else "other"
+
+
+def two_senders(stamp: TimeArray, period: float) -> str | None:
+    """A sentence if commands of two senders lie between each other: each sends every update period.
+
+    Args:
+        stamp: Of the commands, ascending, int64 ns, (n,).
+        period: The arm's update period T [s].
+    """
+    intervals = np.diff(stamp[:_MANY])
+    if len(intervals) < _FEW or intervals.min() <= 0:
+        return None
+    both = intervals[1:] + intervals[:-1]
+    usual = median(both / 1e9)
+    short, long = (float(one) / 1e9 for one in np.quantile(intervals, [0.25, 0.75]))
+    near = np.minimum(np.abs(intervals / 1e9 - short), np.abs(intervals / 1e9 - long)) < _EVEN * usual
+    even = float(np.mean(np.abs(both / 1e9 - usual) < _EVEN * usual)), float(np.mean(near))
+    if min(even) < _ALTERNATE or long - short < _EVEN * usual or not 1.0 / _OTHER_BEAT < usual / period < _OTHER_BEAT:
+        return None
+    return (
+        f"commands of two senders: each sends every {usual * 1e3:.4g} ms, one {short * 1e3:.4g} ms after the other:"
+        " is one of them too many? The model follows whichever came last"
+    )
 
 
 def missing_commands(command: Source, origin: int | None = None) -> str | None:
