@@ -52,6 +52,37 @@ class TestUdpListener:
             for datagram in datagrams:
                 ours.sendto(datagram, place_of(self.notices))
 
+    def test_where_it_falls_behind_measurements_are_shed_and_commands_are_not(self) -> None:
+        """A reader that takes too long: what waits for longer and longer goes, oldest first, is counted and said."""
+        self.start()
+        sent = [b'{"command": %d}' % number if number % 10 == 0 else b"%d" % number for number in range(4000)]
+        self.send(sent)
+        lines = list[bytes]()
+        for _ in range(40):
+            lines += self.source.get()
+            time.sleep(0.1)
+        lines += self.source.stop()
+        shed = len(sent) - len(lines)
+        assert shed > 1000
+        assert [one for one in lines if b"command" in one] == sent[::10]
+        assert lines == [one for one in sent if one in {*lines}]
+        assert any("datagrams wait for 0." in one for one in self.notices)
+        assert any(f"{shed} of measurements shed so far" in one for one in self.notices)
+        assert f"{len(lines)} datagrams taken in, 0 lost, {shed} shed" in self.source.summary()
+
+    def test_what_waited_in_a_pause_is_not_shed(self) -> None:
+        """The reader stands still for a second and catches up: it is said, and nothing is missing."""
+        self.start()
+        sent = [b"%d" % number for number in range(3000)]
+        self.send(sent)
+        lines = self.source.get()
+        time.sleep(1.0)
+        lines += until(self.source, lambda found: len(lines) + len(found) == len(sent))
+        assert lines == sent
+        assert any("datagrams wait for" in one for one in self.notices)
+        self.source.stop()
+        assert "shed" not in self.source.summary()
+
     def test_datagrams_are_lines(self) -> None:
         """One line or several a datagram, in their order; silence is no lines; what waits at the end comes, too."""
         self.start()

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ..views.live import LiveView
 
 _REDRAWN = 0.25  # s between two pictures of the status
+_LAST, _AT_ONCE = 1.0, 256  # s in which what has come is taken in at the end; lines between two looks at the clock
 _AXIS: Columns = {
     "position, {unit}": ("position", ".3f", None),
     "± sd, {unit}": ("position_sd", ".3f", None),
@@ -113,7 +114,8 @@ def run(
         summaries = [part.summary for part in (remote, recorder, sender) if part is not None]
         feeder = _Feeder(stream, summaries, address.speed, recorder, view, screen)
         if remote is not None:
-            _listen(remote, feeder, signals)
+            if left := _listen(remote, feeder, signals):
+                notify(f"{left} lines had come and were not taken in any more: the end was asked for")
         else:
             for items in standard_input() if recorded is None else replayed(recorded, known, address.speed):
                 feeder.take(items)
@@ -146,15 +148,24 @@ def _to_standard_output(lines: list[bytes]) -> None:
         raise RunError(f"standard output: cannot be written: {error.strerror}") from None
 
 
-def _listen(remote: network.Source, feeder: _Feeder, signals: list[int]) -> None:
-    """Feed what comes from the network until a signal ends it, and what has come until then."""
+def _listen(remote: network.Source, feeder: _Feeder, signals: list[int]) -> int:
+    """Feed what comes from the network until a signal ends it, and then for at most 1 s what has come until then.
+
+    Returns:
+        How many lines had come and were not taken in.
+    """
     remote.start()
     try:
         while not signals:
             feeder.take(remote.get())
     finally:
         left = remote.stop()
-    feeder.take(left)
+    until = time.monotonic() + _LAST
+    for begin in range(0, len(left), _AT_ONCE):
+        if time.monotonic() > until:
+            return len(left) - begin
+        feeder.take(left[begin : begin + _AT_ONCE])
+    return 0
 
 
 @dataclass

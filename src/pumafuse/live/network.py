@@ -1,7 +1,8 @@
 """Sources of lines on the network, over UDP and TCP, and estimates sent as datagrams.
 
 What waits is bounded. Of too many datagrams the oldest are dropped and counted, together with those that the system
-dropped before. A TCP sender that is too fast is slowed down: its connection is not read any more.
+dropped before. Where those that wait get older and older, measurements are shed, oldest first; commands are not. A TCP
+sender that is too fast is slowed down: its connection is not read any more.
 """
 
 from __future__ import annotations
@@ -30,6 +31,10 @@ _MOST_DATAGRAMS = 65_536  # that wait
 _MOST_BYTES = 16 << 20  # of waiting datagrams
 _MOST_RECEIVED = 1024  # datagrams that are read from the socket at once
 _MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
+_OLD, _FRESH = 0.2, 0.05  # s for which a datagram waits until that is said, and to which what waits is shed
+_BEHIND = 2.0  # s for which some wait for longer, and do not catch up by half, until they are shed
+_AGAIN = 10.0  # s after that in which they are shed at once
+_COMMAND = b'"command"'  # in a datagram that is not shed
 _RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
 _MOST_CONNECTIONS = 256
@@ -67,8 +72,10 @@ class UdpListener:
         """Prepare; :meth:`start` opens the socket."""
         self._place, self._allowed = place, allowed
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._waiting, self._bytes = deque[bytes](), 0
+        self._waiting, self._bytes = deque[tuple[float, bytes]](), 0  # when each came [s], and what
         self._received = self._dropped_here = self._dropped_before = self._refused = self._reported = 0
+        self._since, self._oldest = 0.0, 0.0  # since when they are old, how old they were at most [s]
+        self._shed, self._shed_at = 0, -_AGAIN  # how many, and when last [s]
 
     def start(self) -> None:
         """Open the socket.
@@ -90,6 +97,7 @@ class UdpListener:
         if (lost := self._lost()) > self._reported:
             self._reported = lost
             self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
+        self._keep_up(time.monotonic())
         return self._lines(_MOST_AT_ONCE)
 
     def stop(self) -> list[bytes]:
@@ -101,20 +109,46 @@ class UdpListener:
 
     def summary(self) -> str:
         """How many came, and how many were lost or refused."""
-        text = f"{self._name}: {self._received - self._dropped_here} datagrams taken in, {self._lost()} lost"
+        taken = self._received - self._dropped_here - self._shed
+        text = f"{self._name}: {taken} datagrams taken in, {self._lost()} lost"
+        text += f", {self._shed} shed" if self._shed else ""
         return f"{text}, {self._refused} refused" if self._refused else text
 
     def _lines(self, most: int) -> list[bytes]:
         """The lines of at most so many datagrams."""
         lines: list[bytes] = []
         for _ in range(min(len(self._waiting), most)):
-            datagram = self._waiting.popleft()
+            _, datagram = self._waiting.popleft()
             self._bytes -= len(datagram)
             lines += datagram.split(b"\n")
         return lines
 
+    def _keep_up(self, now: float) -> None:
+        """Say that datagrams wait for long, and shed measurements where that goes on."""
+        age = now - self._waiting[0][0] if self._waiting else 0.0
+        if age < _OLD:
+            self._since = 0.0
+            return
+        if not self._since:
+            self._since, self._oldest = now, age
+            self._log.write("behind", f"{self._name}: datagrams wait for {age:.2f} s: estimates are as late")
+        self._oldest = max(self._oldest, age)
+        patience = 0.0 if now - self._shed_at < _AGAIN else _BEHIND
+        if now - self._since < patience or age < 0.5 * self._oldest:
+            return
+        kept = [one for one in self._waiting if one[0] > now - _FRESH or _COMMAND in one[1]]
+        self._shed += len(self._waiting) - len(kept)
+        self._waiting, self._bytes = deque(kept), sum(len(datagram) for _, datagram in kept)
+        self._since, self._oldest, self._shed_at = 0.0, 0.0, now
+        self._log.write(
+            "shed",
+            f"{self._name}: datagrams waited for {age:.2f} s, longer and longer: {self._shed} of measurements shed so"
+            " far, the oldest first; a smaller --window takes less time for rows that come late",
+        )
+
     def _receive(self, most: int) -> None:
         """Read at most so many datagrams from the socket, which is to be empty soon: the system keeps few."""
+        now = time.monotonic()
         for _ in range(most):
             try:
                 datagram, sender = self._socket.recvfrom(_LARGEST)
@@ -125,10 +159,10 @@ class UdpListener:
                 self._log.write("refused", f"a datagram from {sender[0]}, which --allow does not name: refused")
                 continue
             self._received += 1
-            self._waiting.append(datagram)
+            self._waiting.append((now, datagram))
             self._bytes += len(datagram)
             while len(self._waiting) > _MOST_DATAGRAMS or self._bytes > _MOST_BYTES:
-                self._bytes -= len(self._waiting.popleft())
+                self._bytes -= len(self._waiting.popleft()[1])
                 self._dropped_here += 1
 
     def _lost(self) -> int:
