@@ -595,3 +595,16 @@ def test_a_header_that_lacks_one_name_names_the_columns_that_it_can(tmp_path: Pa
     assert "the table has no rows" in refusal(
         lambda: csv(tmp_path, "a,b\n" + "".join(f"{n},1,2,3\n" for n in range(9)))
     )
+
+
+@pytest.mark.parametrize("levels", [150, 3000, 100_000])
+@pytest.mark.parametrize(("begin", "end"), [(b'{"a":', b"}"), (b"[", b"]"), (b"[[],", b"]")])
+def test_lines_that_are_nested_without_end_are_refused(tmp_path: Path, levels: int, begin: bytes, end: bytes) -> None:
+    """Of 100,000 levels pyarrow ends the process. A line that is only long, and brackets in a text, are none."""
+    path = tmp_path / "log.jsonl"
+    good = b'{"t_s": 0.1, "x_mm": 1.0, "note": "[[[[[", "more": [' + b"[1], " * 5000 + b"[2]]}\n"
+    path.write_bytes(good * 30)
+    assert tables.read(path).rows == 30
+    path.write_bytes(good + b'{"t_s": 0.2, "x": ' + levels * begin + b"1" + levels * end + b"}\n")
+    with pytest.raises(RunError, match="nested more than 100 deep: no log|changed from array"):
+        tables.read(path)

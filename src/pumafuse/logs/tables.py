@@ -41,6 +41,9 @@ _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _COMPRESSION = "zstd"
 _SOME = 8  # values in an error
 _HEAD = 1 << 16  # bytes of a text, among which its header is
+_DEEPEST, _LONG_LINE = 100, 4096  # levels of a line of JSON; bytes below which no line ends a process
+_STEPS = np.zeros(256, dtype=np.int8)  # of the depth, by character
+_STEPS[list(b"[{")], _STEPS[list(b"]}")] = 1, -1
 _WIDE = 2_000  # columns of a text, beyond which only those asked for are read: pyarrow needs 10 to 20 kB for each
 _BESIDE = 3  # rows of numbers that make the line above them a header
 _COMMENT = re.compile(r"\s*(#|%|//)\s*")
@@ -294,13 +297,42 @@ def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
         torn = "the last line has no end and may be torn: left out (if it is whole, end it with a line break)"
         notes = [f"{path.name}: {torn}"]
     if path.name.endswith(JSON_LINES):
+        _refuse_deep_lines(path, text)
         block = len(text) if text.find(b"\n") > _HEAD else None  # no row may be longer than a block
         table = pajson.read_json(pa.BufferReader(text), pajson.ReadOptions(use_threads=False, block_size=block))
+        _refuse_deep_columns(path, table)
         names = table.column_names
         used = None if choice is None or len(names) <= _WIDE else set(choice(names))
         return table if used is None else table.select([one for one in names if one in used]), names, notes
     table, names, more = _of_csv(path, text, choice)
     return table, names, [*more, *notes]
+
+
+def _refuse_deep_lines(path: Path, text: bytes) -> None:
+    """Refuse lines that would end the process: pyarrow goes into each level with a call of its own.
+
+    Raises:
+        RunError: A line is nested as no log is.
+    """
+    codes = np.frombuffer(text, dtype=np.uint8)
+    ends = np.concatenate([[-1], np.flatnonzero(codes == ord("\n")), [len(codes)]])
+    for line in np.flatnonzero(np.diff(ends) > _LONG_LINE).tolist():
+        if np.cumsum(_STEPS[codes[ends[line] + 1 : ends[line + 1]]], dtype=np.int64).max() > _DEEPEST:
+            raise RunError(f"{path}: line {line + 1} is nested more than {_DEEPEST} deep: no log")
+
+
+def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
+    """Refuse columns in which nobody can look for numbers.
+
+    Raises:
+        RunError: One is nested as none of a log is.
+    """
+    level = [column.type for column in table.columns]
+    for _ in range(_DEEPEST):
+        level = [kind.field(place).type for kind in level for place in range(kind.num_fields)]
+        if not level:
+            return
+    raise RunError(f"{path}: nested more than {_DEEPEST} deep: no log")
 
 
 def _of_csv(path: Path, text: bytes, choice: Choice | None) -> _Text:
