@@ -20,6 +20,7 @@ import typer
 import pumafuse as pf
 from executable import DATA, names, pumafuse, refused
 from pumafuse.cli import from_log
+from pumafuse.filter.response import response
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -158,6 +159,30 @@ def test_one_command_says_that_the_fit_is_worse_as_tune_does(tmp_path: Path, mon
     monkeypatch.setattr(from_log, "tune", worse)
     assert exit_code_here(tmp_path) == 3
     assert {"run.toml", "summary.json"} < names(tmp_path)
+
+
+def smoothed(z: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """By a low-pass of 50 ms."""
+    found = z.copy()
+    for row in range(1, len(z)):
+        found[row] += (found[row - 1] - found[row]) * np.exp(-(s[row] - s[row - 1]) / 0.05)
+    return found
+
+
+@pytest.mark.parametrize("filters", [False, True])
+def test_one_command_says_what_one_sensor_alone_does_not_show(tmp_path: Path, filters: bool) -> None:
+    """Where it filters its values the arm seems to stray, and error bars are too small; white noise has no line."""
+    t, s = np.arange(0.0, 30.0, 0.028), np.arange(0.2, 30.0, 0.01)
+    u = 0.05 * np.sin(1.3 * t) + 0.02 * np.sin(3.1 * t)
+    plant = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05))
+    given, valid = (np.rint(one * 1e9).astype(np.int64) for one in (t, s))
+    led = response(plant, 0.028, 0.06, given, u, 0.0, valid)
+    seen = led + np.random.default_rng(0).normal(0.0, 2e-4, len(s))
+    for name, time, value in (("commands", t, u), ("tracker", s, smoothed(seen, s) if filters else seen)):
+        rows = "\n".join(f"{a:.6f},{1e3 * b:.6f}" for a, b in zip(time.tolist(), value.tolist(), strict=True))
+        (tmp_path / f"{name}.csv").write_text(f"t_s,x_mm\n{rows}\n")
+    said = pumafuse("fuse", tmp_path, "-o", tmp_path / "out").stdout
+    assert ("tracker alone measures x: what strays there is taken for the arm" in said) is filters
 
 
 @pytest.mark.parametrize("more", [[EXAMPLES / "trunk-servo" / "0g"], ["--resume"]])

@@ -606,5 +606,5 @@ def test_lines_that_are_nested_without_end_are_refused(tmp_path: Path, levels: i
     path.write_bytes(good * 30)
     assert tables.read(path).rows == 30
     path.write_bytes(good + b'{"t_s": 0.2, "x": ' + levels * begin + b"1" + levels * end + b"}\n")
-    with pytest.raises(RunError, match="nested more than 100 deep: no log|changed from array"):
+    with pytest.raises(RunError, match=r"nested more than 100 deep: no log|changed from array"):
         tables.read(path)

@@ -17,6 +17,7 @@ from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Mode
 from ..fusion.offline import Engine, fuse
+from ..fusion.summary import Summary
 from ..logs.run import described
 from ..model.arm import ArmModel
 from ..tuning.parameters import Fit
@@ -26,6 +27,7 @@ from .fuse import draw, show
 from .register import taken
 from .tune import end, fitting, show_lags
 
+_STRAYS = 1.5  # times its sd, by which a sensor errs from what is predicted where the arm strays, too
 _FITTED: Sequence[Fit] = ("noise", "delay", "plant", "gain")
 
 
@@ -70,7 +72,23 @@ def run(
     summary = results.write(est, output, force, extras, texts["run.toml"])
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
+    for line in _told_by_one(summary, est.config):
+        typer.echo(line)
     for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
         typer.echo(taken(name, 0.0))
     typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {shlex.quote(str(output))}/fusion.toml -o DIR")
     end(fitted.details)
+
+
+def _told_by_one(summary: Summary, config: FusionConfig) -> list[str]:
+    """A sentence on each sensor that is alone on axes, and errs by less there than the arm strays, as it was fitted."""
+    found = dict[str, list[str]]()
+    for axis, part in summary.axes.items():
+        (name, only), *others = [(name, one) for name, one in part.sensors.items() if one.innovation_sd] or [("", None)]
+        if only and not others and (only.innovation_sd or 0.0) > _STRAYS * (config.sensors[name].sd_of(axis) or 0.0):
+            found.setdefault(name, []).append(axis)
+    return [
+        f"{name} alone measures {', '.join(axes)}: what strays there is taken for the arm. If {name} filters its"
+        " values, or its noise lasts, nothing here shows it, and error bars are too small"
+        for name, axes in found.items()
+    ]
