@@ -29,7 +29,7 @@ from .health import Counts, Health, by_word
 from .joints import Joints
 from .rate_limit import RateLimitedLog
 from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
-from .screening import CommandScreen, HoldWatch, Screened
+from .screening import NEWS, CommandScreen, HoldWatch, Screened
 from .set_back import SetBack
 from .tool import NO_TOOL, ORIENTATION, Row, axes_of, check_tool, tool_of
 
@@ -607,11 +607,13 @@ class LiveEstimator:
     def _held(self, stamp: int, sensor: str, given: int) -> tuple[int, list[tuple[int, str, float, float]]]:
         """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
         held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
+        follows, values, spread = self._follows[number], self._window.value, self._window.spread
         for axis, name in enumerate(self.axes):
             if not given >> axis & 1:
                 continue
-            value, lag = self._window.value[axis], self._follows[number][axis]
-            found = self._holds.judge((number, axis), stamp, value, self._window.spread, self._commands, lag)
+            found = self._holds.judge((number, axis), stamp, values[axis], spread, self._commands, follows[axis])
+            if found is NEWS:
+                continue
             held |= found.held << axis
             self._counts.outcomes[number, _HELD] += found.held - len(found.released)
             released += [(earlier, name, one, factor) for earlier, one, factor in found.released]

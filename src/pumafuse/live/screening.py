@@ -80,7 +80,7 @@ class _Repeated:
         if value == self.value:
             self.count += 1
             return False
-        if math.isfinite(step := abs(value - self.value)):
+        if (step := abs(value - self.value)) < math.inf:
             self.leapt = self.habit is not None and step > FAR * self.habit.usual
             self._steps.append(step)
             self._lengths.append(self.count)
@@ -116,7 +116,7 @@ class Judged(NamedTuple):
     released: Sequence[tuple[int, float, float]] = ()
 
 
-_NEWS = Judged(False, False)
+NEWS = Judged(False, False)
 
 
 class HoldWatch:
@@ -153,11 +153,11 @@ class HoldWatch:
         axis, waited = key[1], one.waiting
         if stamp <= one.stamp:
             one.forget()
-            return Judged(False, False, waited)
+            return Judged(False, False, waited) if waited else NEWS
         if one.is_new(stamp, value):
-            return Judged(False, False, waited)
+            return Judged(False, False, waited) if waited else NEWS
         if (habit := one.habit) is None:
-            return _NEWS
+            return NEWS
         if one.count == 2:
             one.low = one.high = commands.at(axis, one.since) or 0.0
         if stamp - lag >= one.since and (led := commands.at(axis, stamp - lag)) is not None:
@@ -171,7 +171,7 @@ class HoldWatch:
         led, before = (commands.at(axis, instant) or 0.0 for instant in (stamp, one.since - lag))
         odd = led != before and (one.leapt or one.repeats ** (one.count - 1) < _ODD)
         if one.believed or not (odd or habit.is_clear(max(led - one.low, one.high - led))):
-            return _NEWS
+            return NEWS
         waited.append((stamp, value, spreads[axis]))
         if stamp - waited[0][0] <= self._patience:
             return Judged(True, False)
