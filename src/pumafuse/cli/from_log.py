@@ -84,9 +84,10 @@ def _told_by_one(summary: Summary, config: FusionConfig) -> list[str]:
     """A sentence on each sensor that is alone on axes, and errs by less there than the arm strays, as it was fitted."""
     found = dict[str, list[str]]()
     for axis, part in summary.axes.items():
-        (name, only), *others = [(name, one) for name, one in part.sensors.items() if one.innovation_sd] or [("", None)]
-        if only and not others and (only.innovation_sd or 0.0) > _STRAYS * (config.sensors[name].sd_of(axis) or 0.0):
-            found.setdefault(name, []).append(axis)
+        measuring = {name: one.innovation_sd for name, one in part.sensors.items() if one.innovation_sd}
+        for name, expected in measuring.items():
+            if len(measuring) == 1 and expected > _STRAYS * (config.sensors[name].sd_of(axis) or 0.0):
+                found.setdefault(name, []).append(axis)
     return [
         f"{name} alone measures {', '.join(axes)}: what strays there is taken for the arm. If {name} filters its"
         " values, or its noise lasts, nothing here shows it, and error bars are too small"

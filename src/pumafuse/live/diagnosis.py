@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -76,8 +77,8 @@ class Recent:
         """
         if source == COMMAND:
             if len(self._start) < len(self._axes):
-                begun = [(name, values[axis]) for axis, name in enumerate(self._axes) if given >> axis & 1]
-                self._start = dict(begun) | self._start
+                begun = {name: values[axis] for axis, name in enumerate(self._axes) if given >> axis & 1}
+                self._start = {name: value for name, value in begun.items() if math.isfinite(value)} | self._start
         elif abs(stamp - self._latest[source]) < _FINEST_NS:
             return
         else:
@@ -111,10 +112,10 @@ class Recent:
 
         every = {name: np.flatnonzero(known & (source == number)) for number, name in enumerate(self._sensors)}
         sensors = {name: rows(chosen, name) for name, chosen in every.items() if len(chosen)}
-        start = {self._axes[axis]: self._start[self._axes[axis]] for axis in commanded}
-        kinds = self._config.arm.kind_of
-        run = Run("stream", rows(np.flatnonzero(commands), "commands"), sensors, start=start, kinds=kinds)
+        names, kinds = {self._axes[axis] for axis in commanded}, self._config.arm.kind_of
+        start = {name: level for name, level in self._start.items() if name in names}
         try:
+            run = Run("stream", rows(np.flatnonzero(commands), "commands"), sensors, start=start, kinds=kinds)
             return build(run, self._config)
         except PumafuseError:  # of what is there nothing can be made
             return None
@@ -225,7 +226,7 @@ class Diagnosis:
             if trouble.found == _TWICE:
                 self._log.write(f"{fault.sensors} {fault.cause}", f"{fault.sentence} (by {now / 1e9:.3f} s)")
         found, named = {(one.sensors, one.cause) for one in faults}, {name for one in faults for name in one.sensors}
-        for key in self._troubles.keys() - found:
+        for key in [one for one in self._troubles if one not in found]:
             self._not_found(key, travel, not named.isdisjoint(key[0]), now)
 
     def _not_found(self, key: _Key, travel: Mapping[str, float], is_replaced: bool, now: int) -> None:

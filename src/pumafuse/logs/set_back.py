@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import NO_STAMP, IntArray, TimeArray
 from .run import Run, Source
 
-FARTHEST_NS = 1_000_000_000  # by which rows are out of order; beyond it there is another segment
+_FARTHEST_NS = 1_000_000_000  # by which rows are out of order; beyond it there is another segment
 _IN_ORDER = 20  # rows in order before a step
 _LEAST, _OF_ALL, _OF_ONE = 2, 3, 5  # rows behind: of each source; of one at least, if all step back; if one does alone
 _MANY = 100  # intervals of which the usual one is the median
@@ -57,7 +57,7 @@ def going_on(run: Run) -> tuple[Run, list[str]]:
         notes.append(
             f"{run.command.label}: all clocks are set back by {back / 1e9:.3f} s{row}: stamps go on from there"
         )
-        run = run.each(lambda _, source: _moved(source, newest, back))  # noqa: B023 - called at once
+        run = _moved(run, newest, back)
     return run, notes
 
 
@@ -78,7 +78,7 @@ def _step(stamp: TimeArray, begin: int, row: int, end: int) -> Step | None:
     """The step back at a row, which ends rows in order from ``begin`` and begins some until ``end``; if it is one."""
     newest, first = int(stamp[row - 1]), int(stamp[row])
     usual = float(np.median(np.diff(stamp[max(begin, row - _MANY) : row])))
-    if newest - first > FARTHEST_NS or stamp[begin] > first or usual <= 0.0:
+    if newest - first > _FARTHEST_NS or stamp[begin] > first or usual <= 0.0:
         return None
     before = stamp[begin + int(np.searchsorted(stamp[begin:row], first, side="right")) - 1 : row]
     after = stamp[row : row + int(np.searchsorted(stamp[row:end], newest, side="right")) + 1][: end - row]
@@ -128,7 +128,7 @@ def _agree(one: Step, other: Step) -> bool:
 def _goes_on(stamp: TimeArray, step: Step) -> bool:
     """Whether a source goes on over a step as if there was none: it has rows just before and after, and no step."""
     known = stamp[stamp != NO_STAMP]
-    near = known[np.abs(known - step.newest) <= step.back + FARTHEST_NS]
+    near = known[np.abs(known - step.newest) <= step.back + _FARTHEST_NS]
     if len(near) < _LEAST or not (near.min() < step.newest - step.back and near.max() > step.newest):
         return False
     return bool((np.diff(near) >= 0).all()) and float(np.median(np.diff(near))) < step.back
@@ -153,11 +153,15 @@ def _shortest(stamp: TimeArray, newest: int, back: float) -> int:
     return int(near[np.argmin(np.abs(interval[near] + back - usual))]) + 1
 
 
-def _moved(source: Source, newest: int, back: float) -> Source:
-    """A source whose rows after a step go on."""
-    stamp = source.stamp.copy()
-    stamp[_rows_after(source, newest, back)] += round(back)
-    return replace(source, stamp=stamp)
+def _moved(run: Run, newest: int, back: float) -> Run:
+    """A run whose rows after a step go on."""
+
+    def moved(_: str, source: Source) -> Source:
+        stamp = source.stamp.copy()
+        stamp[_rows_after(source, newest, back)] += round(back)
+        return replace(source, stamp=stamp)
+
+    return run.each(moved)
 
 
 def _alone(run: Run, steps: Mapping[str, list[Step]]) -> list[str]:
