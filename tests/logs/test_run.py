@@ -13,6 +13,7 @@ import pytest
 
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import PumafuseError
+from pumafuse.logs import manifest
 from pumafuse.logs.run import Run, Source
 from refusals import one_line
 
@@ -203,6 +204,28 @@ def test_stamps_of_arrays_are_seconds_or_whole_nanoseconds() -> None:
     assert run.command.stamp.tolist() == dates
     run = Run.from_arrays(np.array(["1970-01-02", "NaT"], "M8[D]"), {"radial": np.zeros(2)})
     assert run.command.stamp.tolist() == [86_400_000_000_000, NO_STAMP]
+
+
+def test_what_a_run_is_read_from(folder: Path) -> None:
+    """run.toml, each table once, each part of a recording that is a folder, and the URDF; of one table that alone."""
+    bag = folder.parent / "bags" / "one"
+    bag.mkdir(parents=True)
+    for name in ("metadata.yaml", "one_0.db3"):
+        (bag / name).write_text(name)
+    (folder / "arm.urdf").write_text("<robot/>")
+    robot = '[robot]\nurdf = "arm.urdf"\nbase = "a"\ntip = "b"\n'
+    camera = SENSOR.replace("tracker", "camera", 1).replace("tracker.csv", "../bags/one")
+    (folder / "run.toml").write_text(robot + COMMAND + SENSOR + camera + REFERENCE.replace("truth", "tracker"))
+    parts = ["../bags/one/metadata.yaml", "../bags/one/one_0.db3"]
+    found = manifest.stamps_of(folder)
+    assert sorted(found) == [*parts, "arm.urdf", "host.csv", "run.toml", "tracker.csv"]
+    assert found == manifest.stamps_of(folder / "run.toml")
+    assert found["host.csv"] == (len(HOST), (folder / "host.csv").stat().st_mtime_ns)
+    assert manifest.stamps_of(folder / "host.csv") == {"host.csv": found["host.csv"]}
+    (folder / "arm.urdf").write_text("<robot></robot>")
+    assert {name for name, stamp in manifest.stamps_of(folder).items() if stamp != found[name]} == {"arm.urdf"}
+    (folder / "tracker.csv").unlink()
+    assert manifest.stamps_of(folder) == manifest.stamps_of(folder / "none.csv") == {}
 
 
 TRUTH_ROWS = ([0.0], {"radial": [0.0]})

@@ -310,18 +310,23 @@ def of_tables(tree: dict[str, Any], where: str = "run.toml") -> Manifest:
 def stamps_of(run: Path) -> dict[str, tuple[int, int]]:
     """Size [bytes] and time of the last change [ns since 1970] of each file of a run; none where they cannot be told.
 
+    Its files are ``run.toml``, the tables and recordings that it lists, and the URDF of its robot.
+
     Args:
         run: As :meth:`Run.read` takes it.
     """
     listed, files = run / "run.toml" if run.is_dir() else run, [run]
     try:
         if listed.suffix == ".toml":
-            files = [listed, *(listed.parent / entry.file for entry in load(listed).entries.values())]
+            told = load(listed)
+            names = [listed.name, *(entry.file for entry in told.entries.values())]
+            names += [] if told.robot is None else [told.robot.urdf]
+            files = [listed.parent / name for name in names]
         parts = [part for file in files for part in (file.iterdir() if file.is_dir() else [file])]
-        told = {os.path.relpath(part, listed.parent): part.stat() for part in parts}
+        found = {os.path.relpath(part, listed.parent): part.stat() for part in parts}
     except (PumafuseError, OSError, ValueError):
         return {}
-    return {name: (one.st_size, one.st_mtime_ns) for name, one in told.items()}
+    return {name: (one.st_size, one.st_mtime_ns) for name, one in found.items()}
 
 
 def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry:
