@@ -597,6 +597,18 @@ def test_a_header_that_lacks_one_name_names_the_columns_that_it_can(tmp_path: Pa
     )
 
 
+@pytest.mark.parametrize("none", [9999.0, None])
+def test_what_stands_for_none_in_an_element_that_only_some_rows_have(tmp_path: Path, none: float | None) -> None:
+    """A joint that is there from some row on: the parts of the file before have none of its name, and tell nothing."""
+    count = 3 * (1 << 16)
+    late = np.arange(count) >= count // 2
+    names = pa.array([["base", "elbow"] if one else ["base"] for one in late])
+    elbow = np.where(np.arange(count) % 1000 == 7, none or 1.5, 1e-5 * np.arange(count))
+    position = pa.array([[0.5, value] if one else [0.5] for one, value in zip(late, elbow.tolist(), strict=True)])
+    written(tmp_path, name=names, position=position)
+    assert tables.sentinel_of(tmp_path / "log.parquet", "position[elbow]") == none
+
+
 @pytest.mark.parametrize("levels", [150, 3000, 100_000])
 @pytest.mark.parametrize(("begin", "end"), [(b'{"a":', b"}"), (b"[", b"]"), (b"[[],", b"]")])
 def test_lines_that_are_nested_without_end_are_refused(tmp_path: Path, levels: int, begin: bytes, end: bytes) -> None:

@@ -213,6 +213,24 @@ def test_what_stands_for_none_is_told_by_the_whole_file(tmp_path: Path, none: fl
 
 
 @pytest.mark.parametrize("single", [True, False])
+def test_what_stands_for_none_in_a_piece_may_be_a_position_in_the_file(tmp_path: Path, single: bool) -> None:
+    """999 m is ten times as far as all else of its piece; but much later once there are 150 m."""
+
+    def is_far(given: dict[str, tuple[Rows, np.ndarray]]) -> None:
+        camera = given["camera"][0]
+        camera["y"] = np.where((camera["t"] > 18.0) & (camera["t"] < 24.0), 999.0, camera["y"])
+        camera["y"][1600] = 150.0
+
+    path = written(tmp_path / "log", single=single, damage=is_far)
+    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
+    expected, found = in_memory(path, whole), fusing.fuse_to(path, pieces, CONFIG)
+    for name in (results.ESTIMATES, results.MEASUREMENTS):
+        assert pq.read_table(pieces / name) == pq.read_table(whole / name), name
+    assert found.rows["camera"] == expected.rows["camera"]
+    assert not [note for note in found.notes if "ten times as far" in note]
+
+
+@pytest.mark.parametrize("single", [True, False])
 def test_rows_that_come_too_late(tmp_path: Path, single: bool) -> None:
     """One stray row is left out, with its number; many, or a clock that was set back, are refused."""
 

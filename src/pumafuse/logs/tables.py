@@ -12,7 +12,7 @@ import re
 import stat
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
@@ -174,8 +174,9 @@ def sentinel_of(path: Path, name: str) -> float | None:
         return None
     sizes = np.empty(0)
     for part in in_parts(path, [name]):
-        values, _ = part.plain(name)
-        sizes = largest(np.concatenate([sizes, np.abs(values[np.isfinite(values)])]))
+        with suppress(RunError):  # no row of this part has the element of a list
+            values, _ = part.plain(name)
+            sizes = largest(np.concatenate([sizes, np.abs(values[np.isfinite(values)])]))
     return sentinel_among(sizes)
 
 
