@@ -327,6 +327,9 @@ def test_two_senders_are_named_and_no_command_is_called_missing(later: float) ->
     assert not [one for one in notices if "missing" in one or "commands come every" in one]
     recorded = clock_faults(pf.Run.from_arrays(t, {"radial": u}), PERIOD, [])
     assert len(recorded) == 1 and words in recorded[0]
+    twice = np.sort(np.concatenate([np.arange(len(t)), np.arange(0, len(t), 50)]))  # some rows are there twice
+    recorded = clock_faults(pf.Run.from_arrays(t[twice], {"radial": u[twice]}), PERIOD, [])
+    assert len(recorded) == 1 and words in recorded[0]
 
 
 def test_a_first_command_that_is_no_position_is_invalid() -> None:

@@ -284,8 +284,9 @@ def two_senders(stamp: TimeArray, period: float) -> str | None:
         stamp: Of the commands, ascending, int64 ns, (n,).
         period: The arm's update period T [s].
     """
-    intervals = np.diff(stamp[:_MANY])
-    if len(intervals) < _FEW or intervals.min() <= 0:
+    every = np.diff(stamp[:_MANY])
+    intervals = every[every > 0]  # rows may share a stamp
+    if len(intervals) < _FEW:
         return None
     both = intervals[1:] + intervals[:-1]
     usual = median(both / 1e9)
