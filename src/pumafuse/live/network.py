@@ -73,6 +73,7 @@ class UdpListener:
         self._place, self._allowed = place, allowed
         self._notify, self._log = notify, RateLimitedLog(notify)
         self._waiting, self._bytes = deque[tuple[float, bytes]](), 0  # when each came [s], and what
+        self._room = memoryview(bytearray(_LARGEST))  # of the next one: to make it each time scatters memory
         self._received = self._dropped_here = self._dropped_before = self._refused = self._reported = 0
         self._since, self._oldest = 0.0, 0.0  # since when they are old, how old they were at most [s]
         self._shed, self._shed_at = 0, -_AGAIN  # how many, and when last [s]
@@ -151,13 +152,14 @@ class UdpListener:
         now = time.monotonic()
         for _ in range(most):
             try:
-                datagram, sender = self._socket.recvfrom(_LARGEST)
+                size, sender = self._socket.recvfrom_into(self._room)
             except OSError:  # there is no more
                 return
             if not self._allowed(sender[0]):
                 self._refused += 1
                 self._log.write("refused", f"a datagram from {sender[0]}, which --allow does not name: refused")
                 continue
+            datagram = bytes(self._room[:size])
             self._received += 1
             self._waiting.append((now, datagram))
             self._bytes += len(datagram)

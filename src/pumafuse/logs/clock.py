@@ -290,7 +290,8 @@ def two_senders(stamp: TimeArray, period: float) -> str | None:
         return None
     both = intervals[1:] + intervals[:-1]
     usual = median(both / 1e9)
-    short, long = (float(one) / 1e9 for one in np.quantile(intervals, [0.25, 0.75]))
+    quarters = len(intervals) * np.array([1, 3]) // 4  # numpy's quantile takes ten times as long
+    short, long = (float(one) / 1e9 for one in np.partition(intervals, quarters)[quarters])
     near = np.minimum(np.abs(intervals / 1e9 - short), np.abs(intervals / 1e9 - long)) < _EVEN * usual
     even = float(np.mean(np.abs(both / 1e9 - usual) < _EVEN * usual)), float(np.mean(near))
     if min(even) < _ALTERNATE or long - short < _EVEN * usual or not 1.0 / _OTHER_BEAT < usual / period < _OTHER_BEAT:
