@@ -299,8 +299,8 @@ class Filter {
         const Sensor<Real>& sensor = sensors[event.source];
         const Gate& before = state.gates[a].sensor[event.source];
         const Residual<N, Real>& xi = state.axes[a].residual;
+        if (before.in_a_row == 0) return Agreement::no;  // rejected_at is no instant then
         const Time between = event.time - before.rejected_at;
-        if (before.in_a_row == 0) return Agreement::no;
         if (double(between) < axis.arm.period * 1e9) return Agreement::too_soon;
         Residual<N, Real> moved;  // from what is known, by noise alone
         moved.q = xi.q, moved.drift = xi.drift;
