@@ -26,7 +26,7 @@ from ..logs.manifest import chain_of
 from ..logs.save import check_axis, check_name
 from ..space.rotations import TURNING
 from ..toml import text_of
-from ..units import SCREEN
+from ..units import SI, Kind
 from .commands import number
 from .rate_limit import RateLimitedLog
 from .tool import ORIENTATION, takes_orientation
@@ -84,11 +84,9 @@ class Recorder:
             check_axis(axis)
         self._robot = config.robot
         self._joints = {} if config.robot is None else chain_of(config.robot).kinds
-        framed = CARTESIAN if config.frame is not None else ()
-        screens = {**{axis: config.arm.screen_of(axis) for axis in axes}, **dict.fromkeys(framed, SCREEN["length"])}
-        screens |= {joint: SCREEN[kind] for joint, kind in self._joints.items()}
-        self._columns = {axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}
-        self._scales = {axis: screen.scale for axis, screen in screens.items()}
+        kinds: dict[str, Kind] = dict.fromkeys(CARTESIAN if config.frame is not None else (), "length")
+        kinds = {**{axis: config.arm.axes[axis].kind for axis in axes}, **kinds, **self._joints}
+        self._columns = {axis: f"{axis}_{SI[kind].unit}" for axis, kind in kinds.items()}
         self._frame, self._start, self._notify = config.frame, dict(start), notify
         self._first = self._folder = folder = folder.absolute()
         self.late = self.lost = self._given = 0
@@ -125,7 +123,7 @@ class Recorder:
             sensor: None for a command.
             values: By axis [m or rad], and an orientation.
         """
-        cells = {axis: _cell(values[axis], scale) for axis, scale in self._scales.items() if axis in values}
+        cells = {axis: _cell(values[axis]) for axis in self._columns if axis in values}
         turned = [repr(number(one)) for one in values[ORIENTATION]] if ORIENTATION in values else []
         if not cells and not turned:
             return
@@ -371,13 +369,9 @@ def _file(sensor: str | None) -> str:
     return _COMMANDS if sensor is None else f"{sensor}.csv"
 
 
-def _cell(value: object, scale: float) -> str:
-    """A position [m or rad] in the unit of its column, with the digits that bring the same float back.
+def _cell(value: object) -> str:
+    """A position [m or rad] with the digits that bring the same float back; empty for what is no finite number.
 
-    Empty for what is no finite number.
+    It stays in SI: of the floats of a decade not every one is that of a number of mm.
     """
-    if not isinstance(value, float | int) or not math.isfinite(value):
-        return ""
-    shown = value * scale
-    around = (float(f"{shown:.12g}"), shown, math.nextafter(shown, -math.inf), math.nextafter(shown, math.inf))
-    return repr(next((one for one in around if one / scale == value), shown))
+    return repr(float(value)) if isinstance(value, float | int) and math.isfinite(value) else ""
