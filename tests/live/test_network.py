@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 
 import pumafuse as pf
-from pumafuse.live import network
+from pumafuse.live import backlog, network
 from pumafuse.live.address import Address
 from pumafuse.live.network import Source, TcpClient, TcpListener, UdpListener, UdpSender
 
@@ -92,10 +92,10 @@ class TestUdpListener:
         assert [float(line) for line in lines if line] == [half / 2 for half in range(200)]
         assert "100 datagrams taken in, 0 lost" in self.source.summary()
 
-    @pytest.mark.parametrize(("bound", "most"), [("_MOST_DATAGRAMS", 10), ("_MOST_BYTES", 20)])
+    @pytest.mark.parametrize(("bound", "most"), [("MOST", 10), ("_MOST_BYTES", 20)])
     def test_the_oldest_are_dropped_and_counted(self, monkeypatch: pytest.MonkeyPatch, bound: str, most: int) -> None:
         """When too many wait, or too many bytes, what remains is the newest."""
-        monkeypatch.setattr(network, bound, most)
+        monkeypatch.setattr(backlog, bound, most)
         self.start()
         self.send([b"%02d" % number for number in range(50)])
         assert [int(line) for line in until(self.source, lambda found: b"49" in found)] == list(range(40, 50))
@@ -110,7 +110,7 @@ class TestUdpListener:
         came = len(until(self.source, lambda _: self.source.get() == []))
         self.source.stop()
         assert self.source._lost() > 0
-        assert self.source._received + self.source._lost() == 60_000 > came
+        assert self.source._backlog.received + self.source._lost() == 60_000 > came
         assert any("lost" in text for text in self.notices)
 
     def test_only_allowed_senders_are_accepted(self) -> None:

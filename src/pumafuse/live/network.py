@@ -1,8 +1,7 @@
 """Sources of lines on the network, over UDP and TCP, and estimates sent as datagrams.
 
-What waits is bounded. Of too many datagrams the oldest are dropped and counted, together with those that the system
-dropped before. Where those that wait get older and older, measurements are shed, oldest first; commands are not. A TCP
-sender that is too fast is slowed down: its connection is not read any more.
+Datagrams wait in a :mod:`.backlog`; those that the system dropped before are counted, too. A TCP sender that is too
+fast is slowed down: its connection is not read any more.
 """
 
 from __future__ import annotations
@@ -16,25 +15,20 @@ import struct
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import TypeAlias
 
 from ..errors import RunError
 from .address import Address, Allowed, SocketAddress, host_port, listener, receiver
+from .backlog import MOST, Backlog
 from .rate_limit import RateLimitedLog
 from .sources import QUIET
 from .wire import Lines
 
 _LARGEST = 65_536  # bytes of a datagram, or of a piece of a connection
-_MOST_DATAGRAMS = 65_536  # that wait
-_MOST_BYTES = 16 << 20  # of waiting datagrams
 _MOST_RECEIVED = 1024  # datagrams that are read from the socket at once
 _MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
-_OLD, _FRESH = 0.2, 0.05  # s for which a datagram waits until that is said, and to which what waits is shed
-_BEHIND = 2.0  # s for which some wait for longer, and do not catch up by half, until they are shed
-_AGAIN = 10.0  # s after that in which they are shed at once
-_COMMAND = b'"command"'  # in a datagram that is not shed
+_COMMAND = b'"command"'  # in a datagram with a command
 _RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
 _MOST_CONNECTIONS = 256
@@ -72,11 +66,9 @@ class UdpListener:
         """Prepare; :meth:`start` opens the socket."""
         self._place, self._allowed = place, allowed
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._waiting, self._bytes = deque[tuple[float, bytes]](), 0  # when each came [s], and what
+        self._backlog = Backlog[bytes]("datagrams", self._log, lambda datagram: _COMMAND in datagram, len)
         self._room = memoryview(bytearray(_LARGEST))  # of the next one: to make it each time scatters memory
-        self._received = self._dropped_here = self._dropped_before = self._refused = self._reported = 0
-        self._since, self._oldest = 0.0, 0.0  # since when they are old, how old they were at most [s]
-        self._shed, self._shed_at = 0, -_AGAIN  # how many, and when last [s]
+        self._dropped_before = self._refused = self._reported = 0
 
     def start(self) -> None:
         """Open the socket.
@@ -87,65 +79,38 @@ class UdpListener:
         self._socket = socket.socket(self._place[0], socket.SOCK_DGRAM)
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-        self._name = _listen(self._socket, "udp", self._place[1], self._notify)
+        self._name = self._backlog.name = _listen(self._socket, "udp", self._place[1], self._notify)
         self._socket.setblocking(False)
 
     def get(self) -> list[bytes]:
         """The lines of some datagrams; none after a tenth of a second without any."""
-        if not self._waiting:
+        if not self._backlog:
             select.select([self._socket], [], [], QUIET)
         self._receive(_MOST_RECEIVED)
         if (lost := self._lost()) > self._reported:
             self._reported = lost
             self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
-        self._keep_up(time.monotonic())
+        self._backlog.keep_up(time.monotonic())
         return self._lines(_MOST_AT_ONCE)
 
     def stop(self) -> list[bytes]:
         """Close the socket, and return the lines that have come and were not given yet."""
-        self._receive(_MOST_DATAGRAMS)
+        self._receive(MOST)
         self._lost()  # for the last time
         self._socket.close()
-        return self._lines(_MOST_DATAGRAMS)
+        return self._lines(MOST)
 
     def summary(self) -> str:
         """How many came, and how many were lost or refused."""
-        taken = self._received - self._dropped_here - self._shed
+        waited = self._backlog
+        taken = waited.received - waited.dropped - waited.shed
         text = f"{self._name}: {taken} datagrams taken in, {self._lost()} lost"
-        text += f", {self._shed} shed" if self._shed else ""
+        text += f", {waited.shed} shed" if waited.shed else ""
         return f"{text}, {self._refused} refused" if self._refused else text
 
     def _lines(self, most: int) -> list[bytes]:
         """The lines of at most so many datagrams."""
-        lines: list[bytes] = []
-        for _ in range(min(len(self._waiting), most)):
-            _, datagram = self._waiting.popleft()
-            self._bytes -= len(datagram)
-            lines += datagram.split(b"\n")
-        return lines
-
-    def _keep_up(self, now: float) -> None:
-        """Say that datagrams wait for long, and shed measurements where that goes on."""
-        age = now - self._waiting[0][0] if self._waiting else 0.0
-        if age < _OLD:
-            self._since = 0.0
-            return
-        if not self._since:
-            self._since, self._oldest = now, age
-            self._log.write("behind", f"{self._name}: datagrams wait for {age:.2f} s: estimates are as late")
-        self._oldest = max(self._oldest, age)
-        patience = 0.0 if now - self._shed_at < _AGAIN else _BEHIND
-        if now - self._since < patience or age < 0.5 * self._oldest:
-            return
-        kept = [one for one in self._waiting if one[0] > now - _FRESH or _COMMAND in one[1]]
-        self._shed += len(self._waiting) - len(kept)
-        self._waiting, self._bytes = deque(kept), sum(len(datagram) for _, datagram in kept)
-        self._since, self._oldest, self._shed_at = 0.0, 0.0, now
-        self._log.write(
-            "shed",
-            f"{self._name}: datagrams waited for {age:.2f} s, longer and longer: {self._shed} of measurements shed so"
-            " far, the oldest first; a smaller --window takes less time for rows that come late",
-        )
+        return [line for datagram in self._backlog.take(most) for line in datagram.split(b"\n")]
 
     def _receive(self, most: int) -> None:
         """Read at most so many datagrams from the socket, which is to be empty soon: the system keeps few."""
@@ -159,13 +124,7 @@ class UdpListener:
                 self._refused += 1
                 self._log.write("refused", f"a datagram from {sender[0]}, which --allow does not name: refused")
                 continue
-            datagram = bytes(self._room[:size])
-            self._received += 1
-            self._waiting.append((now, datagram))
-            self._bytes += len(datagram)
-            while len(self._waiting) > _MOST_DATAGRAMS or self._bytes > _MOST_BYTES:
-                self._bytes -= len(self._waiting.popleft()[1])
-                self._dropped_here += 1
+            self._backlog.append(now, bytes(self._room[:size]))
 
     def _lost(self) -> int:
         """How many datagrams were dropped, here or by the system."""
@@ -173,7 +132,7 @@ class UdpListener:
             with contextlib.suppress(OSError):
                 counters = struct.unpack("=9I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
                 self._dropped_before = counters[_DROPS]
-        return self._dropped_here + self._dropped_before
+        return self._backlog.dropped + self._dropped_before
 
 
 class _Tcp:

@@ -1,0 +1,90 @@
+"""What has come and waits to be taken in: bounded, and shed where it gets older and older.
+
+Of too many the oldest are dropped and counted. Where those that wait get older and older, measurements are shed, oldest
+first; commands are not.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from .rate_limit import RateLimitedLog
+
+MOST = 65_536  # items that wait
+_MOST_BYTES = 16 << 20  # of waiting items
+_OLD, _FRESH = 0.2, 0.05  # s for which an item waits until that is said, and to which what waits is shed
+_BEHIND = 2.0  # s for which some wait for longer, and do not catch up by half, until they are shed
+_AGAIN = 10.0  # s after that in which they are shed at once
+
+T = TypeVar("T")
+
+
+class Backlog(Generic[T]):
+    """Items that wait.
+
+    Attributes:
+        received: How many have come.
+        dropped: How many were dropped, as too many waited.
+        shed: How many were shed, as they waited for too long.
+    """
+
+    def __init__(
+        self, what: str, log: RateLimitedLog, is_command: Callable[[T], bool], size: Callable[[T], int]
+    ) -> None:
+        """Nothing waits.
+
+        Args:
+            what: What items are called in sentences, in the plural.
+            log: Takes the sentences.
+            is_command: Whether an item has a command, and is not shed.
+            size: Of an item [bytes].
+        """
+        self.what, self.name = what, ""
+        self.received = self.dropped = self.shed = 0
+        self._log, self._is_command, self._size = log, is_command, size
+        self._waiting, self._bytes = deque[tuple[float, T]](), 0  # when each came [s], and what
+        self._since, self._oldest = 0.0, 0.0  # since when they are old, how old they were at most [s]
+        self._shed_at = -_AGAIN  # when last [s]
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def append(self, now: float, item: T) -> None:
+        """Let an item wait that has come at ``now`` [s]."""
+        self.received += 1
+        self._waiting.append((now, item))
+        self._bytes += self._size(item)
+        while len(self._waiting) > MOST or self._bytes > _MOST_BYTES:
+            self._bytes -= self._size(self._waiting.popleft()[1])
+            self.dropped += 1
+
+    def take(self, most: int) -> list[T]:
+        """The oldest ones, at most so many."""
+        taken = [self._waiting.popleft()[1] for _ in range(min(len(self._waiting), most))]
+        self._bytes -= sum(map(self._size, taken))
+        return taken
+
+    def keep_up(self, now: float) -> None:
+        """Say that items wait for long, and shed measurements where that goes on; it is ``now`` [s]."""
+        age = now - self._waiting[0][0] if self._waiting else 0.0
+        if age < _OLD:
+            self._since = 0.0
+            return
+        if not self._since:
+            self._since, self._oldest = now, age
+            self._log.write("behind", f"{self.name}: {self.what} wait for {age:.2f} s: estimates are as late")
+        self._oldest = max(self._oldest, age)
+        patience = 0.0 if now - self._shed_at < _AGAIN else _BEHIND
+        if now - self._since < patience or age < 0.5 * self._oldest:
+            return
+        kept = [one for one in self._waiting if one[0] > now - _FRESH or self._is_command(one[1])]
+        self.shed += len(self._waiting) - len(kept)
+        self._waiting, self._bytes = deque(kept), sum(self._size(item) for _, item in kept)
+        self._since, self._oldest, self._shed_at = 0.0, 0.0, now
+        self._log.write(
+            "shed",
+            f"{self.name}: {self.what} waited for {age:.2f} s, longer and longer: {self.shed} of measurements shed so"
+            " far, the oldest first; a smaller --window takes less time for rows that come late",
+        )
