@@ -71,10 +71,12 @@ notebooks: $(READY)
 bench: .venv-bench/.ready
 	.venv-bench/bin/python benchmarks/run.py --write
 
-# Universal: one lock for every platform and Python. No index address goes into it.
+# Universal: one lock for every platform and Python. No index address goes into it. ROS's bootstrapper would start every
+# Python a second time, to set a path of libraries: the tests of ROS set it.
 LOCK := uv pip compile --universal --generate-hashes --no-emit-index-url --no-header --quiet
+EXTRAS := --extra bags --extra formats --extra ros2 --no-emit-package ros-wheels-bootstrapper
 lock:
-	$(LOCK) pyproject.toml --extra bags --extra formats --group dev --output-file requirements.lock
+	$(LOCK) pyproject.toml $(EXTRAS) --group dev --output-file requirements.lock
 	echo ziglang | $(LOCK) - --output-file core/zig.lock
 
 clean:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -164,6 +164,29 @@ def mcap(path: Path, samples: list[Sample], **options: Any) -> None:
             writer.write_message(
                 sample.topic, schemas[sample.topic], _fields(sample), log_time=sample.logged, publish_time=sample.logged
             )
+        writer.finish()
+
+
+Sent = tuple[str, str, int, dict[str, Any]]  # topic, type, when it was recorded [ns], fields
+
+
+def stamp(ns: int) -> dict[str, int]:
+    """A time of ROS 2."""
+    return {"sec": ns // 10**9, "nanosec": ns % 10**9}
+
+
+def header(ns: int, frame: str = "base") -> dict[str, Any]:
+    """A header of ROS 2."""
+    return {"stamp": stamp(ns), "frame_id": frame}
+
+
+def messages(path: Path, sent: Sequence[Sent]) -> None:
+    """An MCAP file of any messages of ROS 2, by mcap-ros2-support."""
+    with path.open("wb") as file:
+        writer = Ros2Writer(file)
+        schemas = {kind: writer.register_msgdef(kind, definition_of(kind)) for _, kind, _, _ in sent}
+        for topic, kind, time, fields in sorted(sent, key=lambda one: one[2]):
+            writer.write_message(topic, schemas[kind], fields, time, time)
         writer.finish()
 
 

@@ -120,10 +120,15 @@ def as_length(name: str) -> str:
     return name if unit not in _AS_LENGTH else stem.removesuffix(unit) + _AS_LENGTH[unit] + name[len(stem) :]
 
 
-def si_of(values: FloatArray, unit: str) -> FloatArray:
-    """An array of numbers in the unit of an ending, in SI; the quotient by a power of ten is rounded once."""
+def divisor(unit: str) -> float:
+    """What a number in the unit of an ending is divided by to be in SI; the quotient is rounded once."""
     exponent = _UNITS[unit]
-    return values / DEG if exponent is None else values / 10.0**-exponent
+    return DEG if exponent is None else 10.0**-exponent
+
+
+def si_of(values: FloatArray, unit: str) -> FloatArray:
+    """An array of numbers in the unit of an ending, in SI."""
+    return values / divisor(unit)
 
 
 def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:

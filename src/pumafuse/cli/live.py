@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import msgspec
 from rich.console import Group
@@ -27,18 +27,17 @@ from ..fusion.placing import with_tool
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, Address
 from ..live.estimator import LiveEstimator
+from ..live.health import Health
 from ..live.network import UdpSender
 from ..live.record import Recorder
 from ..live.results import LiveEstimate
 from ..live.sources import QUIET, replayed, standard_input
-from ..live.stream import Stream
+from ..live.stream import Stream, Watcher
 from ..live.wire import Event
+from ..logs import manifest
 from ..logs.run import Run
 from ..units import MS
 from .tables import Columns, cells, console, headings, print_tables, table
-
-if TYPE_CHECKING:
-    from ..views.live import LiveView
 
 _REDRAWN = 0.25  # s between two pictures of the status
 _LAST, _AT_ONCE = 1.0, 256  # s in which what has come is taken in at the end; lines between two looks at the clock
@@ -70,6 +69,7 @@ def run(
     status: bool,
     listen: str | None,
     allow: list[str],
+    ros_args: list[str],
 ) -> None:
     """Estimate from a stream until it ends, or a signal ends it; the arguments are the options, in s and Hz.
 
@@ -83,6 +83,11 @@ def run(
     if recorded is not None:
         start = dict(recorded.start)
         known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
+    listed = manifest.load(Path(address.path)) if address.kind == "ros2" else None
+    if listed is not None:
+        start = dict(listed.command.start)
+        robot = known.robot if listed.robot is None else listed.robot.beside(Path(address.path).parent)
+        known = msgspec.structs.replace(known, frame=listed.frame or known.frame, robot=robot)
     errors = console(sys.stderr)
 
     def notify(text: str) -> None:
@@ -91,6 +96,11 @@ def run(
 
     remote = network.source(address, listen, allow, notify) if address.kind in NETWORK else None
     with contextlib.ExitStack() as stack:
+        ros = None
+        if listed is not None:
+            from ..live.ros2 import Ros2Source
+
+            remote = ros = stack.enter_context(contextlib.closing(Ros2Source(listed, ros_args, notify)))
         signals = stack.enter_context(_caught_signals())
         sender = stack.enter_context(contextlib.closing(UdpSender(out))) if out else None
         estimator = partial(LiveEstimator, known, window=window, stale_after=stale_after, start=start, on_notice=notify)
@@ -101,18 +111,23 @@ def run(
         live = estimator(event_log=recorder)
         if recorder is not None:
             stack.callback(lambda: recorder.close(live.sure))
-        view = None
+        views = list[_View]()
         if rerun:
             from ..views.live import LiveView
 
-            view = LiveView(rerun, known, notify)
-            stack.callback(view.close)
-        stream = Stream(live, sender or _output(status), notify, rate, [] if view is None else [view])
+            views.append(stack.enter_context(contextlib.closing(LiveView(rerun, known, notify))))
+        if ros is not None:
+            from ..live.ros2_estimates import Ros2Estimates
+
+            views.append(Ros2Estimates(ros, live))
+        write = sender or (_nowhere if ros is not None else _output(status))
+        stream = Stream(live, write, notify, rate, views)
         screen = None
         if status and errors.is_terminal:
             screen = stack.enter_context(Live(console=errors, auto_refresh=False, transient=True))
         summaries = [part.summary for part in (remote, recorder, sender) if part is not None]
-        feeder = _Feeder(stream, summaries, address.speed, recorder, view, screen)
+        speed = math.inf if ros is not None and ros.simulated else address.speed  # a simulation may stand still
+        feeder = _Feeder(stream, summaries, speed, recorder, views, screen)
         if remote is not None:
             if left := _listen(remote, feeder, signals):
                 notify(f"{left} lines had come and were not taken in any more: the end was asked for")
@@ -126,6 +141,10 @@ def run(
         notify(sentence)
     with contextlib.suppress(OSError):
         print_tables([_sensor_table(live, feeder.now)], "stderr")
+
+
+def _nowhere(_: list[bytes]) -> None:
+    """Estimates that are published need no other place."""
 
 
 def _output(status: bool) -> Callable[[list[bytes]], None]:
@@ -148,7 +167,7 @@ def _to_standard_output(lines: list[bytes]) -> None:
         raise RunError(f"standard output: cannot be written: {error.strerror}") from None
 
 
-def _listen(remote: network.Source, feeder: _Feeder, signals: list[int]) -> int:
+def _listen(remote: _Remote, feeder: _Feeder, signals: list[int]) -> int:
     """Feed what comes from the network until a signal ends it, and then for at most 1 s what has come until then.
 
     Returns:
@@ -168,15 +187,41 @@ def _listen(remote: network.Source, feeder: _Feeder, signals: list[int]) -> int:
     return 0
 
 
+class _Remote(Protocol):
+    """A source that is listened to until a signal ends it."""
+
+    def start(self) -> None:
+        """Begin to listen."""
+
+    def get(self) -> Sequence[bytes | Event]:
+        """Some lines or events; none after a tenth of a second without any."""
+        ...
+
+    def stop(self) -> Sequence[bytes | Event]:
+        """Those that have come and were not given yet."""
+        ...
+
+    def summary(self) -> str:
+        """How many came."""
+        ...
+
+
+class _View(Watcher, Protocol):
+    """A watcher that has a turn of its own."""
+
+    def tick(self, health: Callable[[], Health]) -> None:
+        """Do what is due."""
+
+
 @dataclass
 class _Feeder:
-    """Feeds a stream, and gives the recorder, the view and the screen their turn."""
+    """Feeds a stream, and gives the recorder, the views and the screen their turn."""
 
     stream: Stream
     summaries: Sequence[Callable[[], str]]
     speed: float
     recorder: Recorder | None
-    view: LiveView | None
+    views: Sequence[_View]
     screen: Live | None
     sure: int | None = None
     now: int | None = None
@@ -195,8 +240,8 @@ class _Feeder:
             self.stream.idle(self.now)
         if self.recorder is not None:
             self.recorder.tick(sure)
-        if self.view is not None:
-            self.view.tick(lambda: self.stream.live.health(self.now))
+        for view in self.views:
+            view.tick(lambda: self.stream.live.health(self.now))
         if self.screen is not None and now - self.drawn >= _REDRAWN:
             self.screen.update(status(self.stream, self.summaries, self.now), refresh=True)
             self.drawn = now

@@ -28,6 +28,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+ROS_ARGS = "--ros-args"  # what is behind it is for ROS, not for typer
+
 Runs = Annotated[list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")]
 Config = Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")]
 Rate = Annotated[float | None, Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")]
@@ -352,6 +354,7 @@ def tune(
 
 @app.command()
 def live(
+    context: typer.Context,
     source: Annotated[str, Argument(metavar="SOURCE", help="Where events come from, see above.")],
     config: Config,
     rate: Rate = None,
@@ -368,8 +371,9 @@ def live(
 ) -> None:
     """Estimate from a stream of commands and measurements, as they come.
 
-    SOURCE is stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, or a recorded run: replay:RUN?speed=4
-    (speed=max: as fast as it can be).
+    SOURCE is stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, a recorded run: replay:RUN?speed=4
+    (speed=max: as fast as it can be), or topics of a running ROS 2, as a run.toml names them: ros2:run.toml. Then
+    estimates go to topics as well, and --ros-args is as everywhere in ROS.
 
     One JSON object a line, in s and mm (of angles degrees). In: {"t": 12.345, "command": {"x": 570.0}} and {"t": 12.35,
     "sensor": "tracker", "x": 569.7}. Out: {"t": ..., "x": {"position_mm": ..., "sd_mm": ..., "velocity_mm_s": ...}}.
@@ -379,7 +383,10 @@ def live(
     if bool(listen) != bool(allow) or listen == "":
         raise BadParameter("--listen ADDR and --allow CIDR go together", param_hint="--listen")
     _check_positive(rate=rate, window=window, stale_after=stale_after)
-    command.run(source, config, rate, window, stale_after, out, record, rerun, status, listen, allow or [])
+    ros: list[str] = context.obj
+    if ros and not source.startswith("ros2:"):
+        raise BadParameter("goes with a source ros2:run.toml", param_hint=ROS_ARGS)
+    command.run(source, config, rate, window, stale_after, out, record, rerun, status, listen, allow or [], ros)
 
 
 @app.command()
@@ -426,8 +433,10 @@ def main() -> None:
         number = getattr(signal, stop, None)  # Windows has no SIGHUP; nohup ignores it
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:
             signal.signal(number, _end)
+    arguments = sys.argv[1:]
+    end = arguments.index(ROS_ARGS) if "live" in arguments[:1] and ROS_ARGS in arguments else len(arguments)
     try:
-        app()
+        app(arguments[:end], obj=arguments[end:])
     except PumafuseError as error:
         typer.echo(f"pumafuse: {error}", err=True)
         sys.exit(1)

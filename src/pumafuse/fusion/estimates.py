@@ -16,10 +16,10 @@ from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import RunError, UnknownNameError
 from ..filter.outcome import Outcome
 from ..logs.frames import CARTESIAN, Placed, in_space
-from ..model.arm import CANONICAL_AXES, ArmModel
+from ..model.arm import ArmModel
 from ..units import Kind
 from .config import FusionConfig
-from .pose import Pose, orientation, turning_covariance
+from .pose import Pose, covariance_in_log, orientation, turning_covariance
 from .score import ReferenceTrack
 from .segments import Segment
 from .setup import turn_of
@@ -236,18 +236,9 @@ class Estimates:
             )
         sd = {axis: one.position_sd for axis, one in self.axes.items()}
         covariance = np.zeros((len(self.time), 6, 6))
-        covariance[:, :3, :3] = self._covariance_in_log(sd)
+        covariance[:, :3, :3] = covariance_in_log(self.placed, self.positions, sd)
         covariance[:, 3:, 3:] = turning_covariance(self.positions, sd)
         return Pose(position, turned, covariance)
-
-    def _covariance_in_log(self, sd: Mapping[str, FloatArray]) -> FloatArray:
-        """The covariance of x, y and z [m²], (n, 3, 3)."""
-        axes = CARTESIAN if self.placed is None else CANONICAL_AXES
-        scaled = np.eye(3) * np.column_stack([sd[axis] for axis in axes])[:, None]
-        if self.placed is not None:
-            in_plane = self.placed.jacobian(self["tangential"].position, self["radial"].position)
-            scaled[:, :2, :2] = in_plane @ scaled[:, :2, :2]
-        return scaled @ scaled.transpose(0, 2, 1)
 
     def to_arrow(self) -> pa.Table:
         """All estimates as an Arrow table in SI.

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import FloatArray
+from ..logs.frames import CARTESIAN, Placed
+from ..model.arm import CANONICAL_AXES
 from ..space import rotations
 from ..space.rotations import TURNING
 from .config import FusionConfig
@@ -62,6 +64,23 @@ def turning_covariance(position: Mapping[str, FloatArray], sd: Mapping[str, Floa
         sd: Its standard deviation, likewise.
     """
     scaled = rotations.left_jacobian(_columns(position)) * _columns(sd)[:, None]
+    return scaled @ scaled.transpose(0, 2, 1)
+
+
+def covariance_in_log(
+    placed: Placed | None, position: Mapping[str, FloatArray], sd: Mapping[str, FloatArray]
+) -> FloatArray:
+    """The covariance of the log's x, y and z [m²], (n, 3, 3).
+
+    Args:
+        placed: The frame of cylindrical or rotated axes; None where x, y and z are axes.
+        position: By axis [m], (n,).
+        sd: Its standard deviation, likewise.
+    """
+    axes = CARTESIAN if placed is None else CANONICAL_AXES
+    scaled = np.eye(3) * np.column_stack([sd[axis] for axis in axes])[:, None]
+    if placed is not None:
+        scaled[:, :2, :2] = placed.jacobian(position["tangential"], position["radial"]) @ scaled[:, :2, :2]
     return scaled @ scaled.transpose(0, 2, 1)
 
 

@@ -19,7 +19,10 @@ Allowed: TypeAlias = Callable[[str], bool]  # whether a sender's host is accepte
 LISTENERS = ("udp", "tcp-listen")
 NETWORK = (*LISTENERS, "tcp")
 _LOOPBACK = "127.0.0.1"
-_SOURCES = "stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, replay:RUN, replay:RUN?speed=4 (or max)"
+_SOURCES = (
+    "stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, ros2:run.toml, replay:RUN, replay:RUN?speed=4 (or"
+    " max)"
+)
 
 
 @dataclass(frozen=True)
@@ -27,8 +30,8 @@ class Address:
     """A source as the command line names it.
 
     Attributes:
-        kind: ``stdin``, ``replay``, ``udp``, ``tcp-listen`` or ``tcp``.
-        path: Of the run to replay.
+        kind: ``stdin``, ``replay``, ``ros2``, ``udp``, ``tcp-listen`` or ``tcp``.
+        path: Of the run to replay, or of a ``run.toml`` that names topics.
         speed: Seconds of the run in one second; infinite: as fast as it can be.
         host: Of a network source, empty where none is given.
         port: Of a network source.
@@ -52,6 +55,8 @@ class Address:
             return Address("stdin")
         if kind == "replay" and colon:
             return _replay(text, rest)
+        if kind == "ros2" and rest:
+            return Address("ros2", rest)
         if kind in NETWORK and rest.startswith("//"):
             return _network_address(text, f"source '{text}'")
         raise ConfigError(f"no source '{text}'; there are: {_SOURCES}")

@@ -18,7 +18,7 @@ from ..filter.window import MOST_EVENTS, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS, latest_follow
 from ..fusion.setup import live_model
-from ..logs.frames import CARTESIAN
+from ..logs.frames import CARTESIAN, Placed
 from ..space.rotations import TURNING
 from ..units import Kind
 from .clock import Clock, Time, Verdict, nanoseconds
@@ -207,6 +207,11 @@ class LiveEstimator:
     def joints(self) -> Mapping[str, Kind]:
         """What the joints that events may be in move by; empty without a robot."""
         return {} if self._joints is None else self._joints.kinds
+
+    @property
+    def placed(self) -> Placed | None:
+        """The frame at its start; None without one, or before it has started."""
+        return self._frame_start.placed
 
     @property
     def newest(self) -> int | None:

@@ -139,14 +139,17 @@ class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def read(self, table: Table) -> tuple[FloatArray, list[str]]:
         """Quaternions x, y, z, w of the rows of a table, (rows, 4), and notes; NaN in rows that have none."""
-        unit = "" if self.quaternion else f"_{self.unit}" if self.unit else None
-        parts = [table.plain(one) if unit == "" else table.numbers(one, unit or "") for one in self.columns]
-        value, notes = np.column_stack([part for part, _ in parts]), [note for _, note in parts if note]
+        unit = f"_{self.unit}" if self.unit else ""
+        parts = [table.plain(one) if self.quaternion else table.numbers(one, unit) for one in self.columns]
+        return self.quaternions(np.column_stack([part for part, _ in parts])), [note for _, note in parts if note]
+
+    def quaternions(self, value: FloatArray) -> FloatArray:
+        """Quaternions x, y, z, w of the numbers [rad] in its columns, (n, 3 or 4) → (n, 4); NaN for none."""
         if self.quaternion:
-            return rotations.of_quaternions(value, "wxyz" if self.convention == "abb" else self.order), notes
+            return rotations.of_quaternions(value, "wxyz" if self.convention == "abb" else self.order)
         if self.rotation_vector:
-            return rotations.of_vectors(value), notes
-        return rotations.of_angles(value, self.letters), notes
+            return rotations.of_vectors(value)
+        return rotations.of_angles(value, self.letters)
 
 
 class Robot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

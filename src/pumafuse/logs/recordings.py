@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _BATCH_ROWS, _BATCH_BYTES = 4096, 16 << 20  # of messages that are in memory as Python objects
 PATH = "path"  # the column of where a trajectory is at each time
 PATH_TIME = f"{PATH}.time_ns"
-_TRANSFORMS = "transforms"  # the only field of ROS's tf messages
+TRANSFORMS = "transforms"  # the only field of ROS's tf messages
 _STEP = 4_000_000  # ns, of a path; controllers of joints go on in steps of 1 to 10 ms
 _MOST_ROWS = 30_000_000  # of the path of one trajectory: 33 hours
 _AROUND = ("request", "goal", "trajectory", "joint_trajectory")  # what goals of actions have a trajectory in
@@ -104,8 +104,8 @@ def _rows(
     if first is None:
         return []
     found, asked = chain([first], found), holders(fields or ())
-    if fields is not None and list(first[1]) == [_TRANSFORMS] and _TRANSFORMS not in asked:
-        return ((record, bags.fields_of(one) or {}) for record, message in found for one in message[_TRANSFORMS])
+    if fields is not None and list(first[1]) == [TRANSFORMS] and TRANSFORMS not in asked:
+        return ((record, bags.fields_of(one) or {}) for record, message in found for one in message[TRANSFORMS])
     if PATH not in first[1] and PATH in asked:
         return _each_place(found, faults)
     return found
@@ -162,13 +162,13 @@ def _fields_in(record: Record | None) -> tuple[tuple[str, ...], str]:
         message: Any = bags.plain(bags.decoder_of(record.channel)(record.payload)) if record else {}
     except bags.DAMAGE as error:
         return (), reason(error)
-    return (*numeric_paths(message), *([PATH_TIME] if _trajectory_in(message) else [])), ""
+    return (*numeric_paths(message), *([PATH_TIME] if trajectory_in(message) else [])), ""
 
 
 # Messages that are no row each: transforms of many frames, and trajectories of many points.
 
 
-def _trajectory_in(message: Any) -> Mapping[str, Any] | None:
+def trajectory_in(message: Any) -> Mapping[str, Any] | None:
     """The ``JointTrajectory`` that a message is, or the goal of an action has in it; None without one."""
     if isinstance(message, list):
         message = next(iter(cast(list[Any], message)), None)
@@ -177,7 +177,7 @@ def _trajectory_in(message: Any) -> Mapping[str, Any] | None:
     fields = cast(Mapping[str, Any], message)
     if {"joint_names", "points"} <= fields.keys():
         return fields
-    inside = (_trajectory_in(fields[name]) for name in _AROUND if name in fields)
+    inside = (trajectory_in(fields[name]) for name in _AROUND if name in fields)
     return next((one for one in inside if one is not None), None)
 
 
@@ -187,13 +187,14 @@ def _each_place(messages: Iterable[tuple[Record, Message]], faults: Faults) -> I
     A path is a cubic where its points have velocities, else straight between them. A new trajectory ends the one before
     and begins where that was. One without points ends it, too.
     """
-    every = ((record, _trajectory_in(bags.plain(message))) for record, message in messages)
-    known = sorted(((record, one) for record, one in every if one is not None), key=lambda pair: _begin(*pair))
-    before: _Path | None = None
-    for place, (record, trajectory) in enumerate(known):
-        end = _begin(*known[place + 1]) if place + 1 < len(known) else None
+    every = ((record, trajectory_in(bags.plain(message))) for record, message in messages)
+    begun = ((begin_of(one, record.time), record, one) for record, one in every if one is not None)
+    known = sorted(begun, key=lambda one: one[0])
+    before: CommandedPath | None = None
+    for place, (begin, record, trajectory) in enumerate(known):
+        end = known[place + 1][0] if place + 1 < len(known) else None
         try:
-            path = _Path(record, trajectory, before)
+            path = CommandedPath(trajectory, begin, before)
         except bags.DAMAGE as error:
             faults.leave_out("trajectory", error)
             continue
@@ -202,11 +203,11 @@ def _each_place(messages: Iterable[tuple[Record, Message]], faults: Faults) -> I
         before = path
 
 
-class _Path:
-    """The path of one trajectory, and the names of its ``joints``."""
+class CommandedPath:
+    """The path of one trajectory that begins at some time [ns], and the names of its ``joints``."""
 
-    def __init__(self, record: Record, trajectory: Mapping[str, Any], before: _Path | None) -> None:
-        points, begin = cast(list[Mapping[str, Any]], trajectory["points"]), _begin(record, trajectory)
+    def __init__(self, trajectory: Mapping[str, Any], begin: int, before: CommandedPath | None) -> None:
+        points = cast(list[Mapping[str, Any]], trajectory["points"])
         self.joints: list[str] = list(map(str, trajectory["joint_names"]))
         if before is not None and not points:
             self.joints = before.joints
@@ -232,10 +233,10 @@ class _Path:
             return self._last if order == 0 else np.zeros_like(self._last)
         return self._curve(max(time - first, 0) / 1e9, order)
 
-    def rows(self, end: int | None) -> Iterator[tuple[int, FloatArray]]:
-        """Times [ns] and positions up to the last point, or to where the next trajectory begins."""
+    def rows(self, end: int | None = None) -> Iterator[tuple[int, FloatArray]]:
+        """Times [ns] and positions, each 4 ms, up to the last point, or to where the next trajectory begins."""
         first, last = self._time
-        times = [one for one in (*range(first, last, _STEP), last) if end is None or one < end]
+        times = (one for one in chain(range(first, last, _STEP), (last,)) if end is None or one < end)
         return ((one, self.at(one)) for one in times)
 
 
@@ -250,10 +251,10 @@ def _curve(time: FloatArray, position: FloatArray, velocity: FloatArray | None) 
     return PPoly(np.stack([np.diff(position, axis=0) / np.diff(time)[:, None], position[:-1]]), time)
 
 
-def _begin(record: Record, trajectory: Mapping[str, Any]) -> int:
-    """When a trajectory begins [ns]: as its header says, or, where that is 0, when it was recorded."""
+def begin_of(trajectory: Mapping[str, Any], received: int) -> int:
+    """When a trajectory begins [ns]: as its header says, or, where that is 0, when it was received."""
     stamp = cast(Mapping[str, Any], trajectory.get("header") or {}).get("stamp")
-    return (_nanoseconds(stamp) if stamp else 0) or record.time
+    return (_nanoseconds(stamp) if stamp else 0) or received
 
 
 def _nanoseconds(time: Mapping[str, int]) -> int:

@@ -37,7 +37,7 @@ _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
 _OUT_OF_ORDER_NS = 1_000_000_000  # by which rows are out of order without a word
 _FEW_ROWS = 10  # too few to judge a clock by
 _MOST_ROWS = 30_000_000  # of interpolated commands, all of which are in memory
-_MOST_STEPS, _PAUSE = 1000, 5.0  # between two commands; times the median interval, which is no path
+_MOST_STEPS, PAUSE = 1000, 5.0  # between two commands; times the median interval, which is no path
 
 
 class NoCommandError(RunError):
@@ -203,7 +203,7 @@ class Source:
                 f"{self.label}: interpolation_ms = {step * 1e3:g} is not between a thousandth of the interval of the"
                 f" commands, {interval / 1e6:.4g} ms, and that"
             )
-        goes_on = (gap > 0.0) & (gap <= _PAUSE * interval)
+        goes_on = (gap > 0.0) & (gap <= PAUSE * interval)
         parts = np.where(goes_on, np.maximum(np.rint(np.where(goes_on, gap, 0.0) / (step * 1e9)), 1.0), 1.0)
         parts = np.append(parts, 1.0).astype(np.int64)
         if parts.sum() > _MOST_ROWS:

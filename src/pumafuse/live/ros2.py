@@ -1,0 +1,232 @@
+"""A node of ROS 2 as a source of events: the topics that a ``run.toml`` names.
+
+Types of messages are those that publishers have, so a topic is subscribed to once somebody publishes it. Subscriptions
+take what reliable publishers send and what sensors do (best effort). What comes in a burst waits in a :mod:`.backlog`,
+in the order of its receipt.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+from ..errors import ConfigError, reason, suggestion
+from ..logs.bags import DAMAGE
+from ..logs.manifest import Manifest
+from .backlog import MOST, Backlog
+from .messages import Reader
+from .rate_limit import RateLimitedLog
+from .sources import QUIET
+from .wire import Event
+
+EXTRA = "pip install 'pumafuse[ros2]'"
+FRAME_ID = "frame_id"  # the node's parameter
+_NAME = "pumafuse"  # of the node, where --ros-args names none
+_DEPTH = 1000  # messages of a topic that the middleware keeps
+_MOST_AT_ONCE = 64  # events taken in before the node looks for messages again
+_LOOK = 0.5  # s between two looks at who publishes
+_ALONE = 5.0  # s without a publisher until that is said
+_BYTES = 500  # about, of an event
+
+
+class Topic:
+    """A topic that is listened to.
+
+    Attributes:
+        name: As ``run.toml`` has it.
+        readers: Of the sources that are in its messages.
+        subscription: None until somebody publishes it.
+        publishers: How many there were at the last look; None before anybody was.
+        lost: How many messages the middleware has lost.
+    """
+
+    def __init__(self, name: str, readers: Sequence[Reader]) -> None:
+        self.name, self.readers = name, readers
+        self.subscription: Any = None
+        self.publishers: int | None = None
+        self.lost = 0
+
+
+class Ros2Source:
+    """Events from the topics of a running robot.
+
+    Attributes:
+        node: The node.
+        frame: In which the commands are, by their messages; empty where these do not say.
+        simulated: Whether time is that of a simulation.
+    """
+
+    def __init__(self, listed: Manifest, arguments: Sequence[str], notify: Callable[[str], None]) -> None:
+        """Make the node; :meth:`start` begins to listen, :meth:`close` ends it.
+
+        Args:
+            listed: What ``run.toml`` says.
+            arguments: ``--ros-args`` and what is behind it.
+            notify: Takes a sentence for the log.
+
+        Raises:
+            ConfigError: There is no ROS 2, it refuses the arguments, or a source of ``run.toml`` has no topic, or none
+                that a node could read.
+        """
+        entries, commanded = {"": listed.command, **listed.sensors}, dict[str, float]()
+        for name, entry in entries.items():
+            if not entry.topic:
+                who = f"sensor '{name}' has" if name else "the commands have"
+                raise ConfigError(f"run.toml: {who} no topic; give the running robot's, as in topic = '/joint_states'")
+        readers = [Reader(name, entry, commanded) for name, entry in entries.items()]
+        names = dict.fromkeys(one.entry.topic for one in readers)
+        self._topics = [Topic(name, [one for one in readers if one.entry.topic == name]) for name in names]
+        self._command = readers[0]
+        self._notify, self._log = notify, RateLimitedLog(notify)
+        self._backlog = Backlog[Event]("messages", self._log, lambda event: not event.sensor, lambda _: _BYTES)
+        self._burst = list[tuple[int, Event]]()  # by when each was received [ns]
+        self._rclpy, no_signals = load("rclpy"), load("rclpy.signals").SignalHandlerOptions.NO  # pumafuse has its own
+        try:
+            self._rclpy.init(args=list(arguments), signal_handler_options=no_signals)
+            self.node: Any = self._rclpy.create_node(_NAME)
+        except Exception as error:  # of the middleware, of many kinds
+            self._rclpy.try_shutdown()
+            raise ConfigError(f"--ros-args: {reason(error)}") from None
+        self.node.declare_parameter(FRAME_ID, "")
+        self.frame, self.simulated = "", bool(self.node.get_parameter("use_sim_time").value)
+        self._executor: Any = load("rclpy.executors").SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self._backlog.name = self.node.get_fully_qualified_name()
+
+    def start(self) -> None:
+        """Listen."""
+        self._notify(f"{self._backlog.name}: listening at {', '.join(map(self._resolved, self._topics))}")
+        self._began = time.monotonic()
+        self._look(self._began)
+
+    def get(self) -> list[Event]:
+        """Some events in the order of their receipt; none after a tenth of a second without any."""
+        due = self._command.next_due
+        wait = QUIET if due is None else min(max((due - self.clock()) / 1e9, 0.0), QUIET)
+        self._executor.spin_once(timeout_sec=0.0 if self._backlog else wait)
+        now = time.monotonic()
+        self._receive(now)
+        self._backlog.keep_up(now)
+        if now - self._looked > _LOOK:
+            self._look(now)
+        return self._backlog.take(_MOST_AT_ONCE)
+
+    def stop(self) -> list[Event]:
+        """The events that have come and were not given yet."""
+        self._receive(time.monotonic())
+        return self._backlog.take(MOST)
+
+    def close(self) -> None:
+        """End the node."""
+        self._executor.shutdown(0.0)
+        self.node.destroy_node()
+        self._rclpy.try_shutdown()
+
+    def summary(self) -> str:
+        """How many events came, and how many messages were lost."""
+        waited = self._backlog
+        lost = sum(topic.lost for topic in self._topics) + waited.dropped
+        text = f"{waited.name}: {waited.received} events, {lost} lost"
+        return f"{text}, {waited.shed} shed" if waited.shed else text
+
+    def clock(self) -> int:
+        """The time of the node's clock [ns]."""
+        return self.node.get_clock().now().nanoseconds
+
+    def _receive(self, now: float) -> None:
+        """Put all that has come into the backlog."""
+        for topic in self._topics:
+            if (subscription := topic.subscription) is not None:
+                with subscription.handle:
+                    for _ in range(_DEPTH):
+                        taken = subscription.handle.take_message(subscription.msg_type, False)
+                        if taken is None:
+                            break
+                        self._take(topic, *taken)
+        if self._command.next_due is not None:
+            at = self.clock()
+            self._burst += [(at, event) for event in self._command.due(at)]
+        self._burst.sort(key=lambda one: one[0])
+        for _, event in self._burst:
+            self._backlog.append(now, event)
+        self._burst.clear()
+
+    def _take(self, topic: Topic, message: Any, info: Mapping[str, Any]) -> None:
+        """Take in a message."""
+        received = self.clock() if self.simulated else info["received_timestamp"]
+        for reader in topic.readers:
+            try:
+                self._burst += [(received, event) for event in reader.events(message, received)]
+            except DAMAGE as error:
+                self._log.write(f"{topic.name} bad", f"{topic.name}: a message is left out: {reason(error)}")
+        if not self.frame and not topic.readers[0].name:
+            self.frame = getattr(getattr(message, "header", None), "frame_id", "")
+
+    def _resolved(self, topic: Topic) -> str:
+        """The name of a topic after remapping."""
+        return self.node.resolve_topic_name(topic.name)
+
+    def _look(self, now: float) -> None:
+        """Look at who publishes, and subscribe to what somebody does."""
+        self._looked, self.simulated = now, bool(self.node.get_parameter("use_sim_time").value)
+        for topic in self._topics:
+            name, before = self._resolved(topic), topic.publishers
+            count = self.node.count_publishers(name)
+            if count and topic.subscription is None:
+                self._subscribe(topic, name)
+            if count == before:
+                continue
+            if not count and before is None:
+                if now - self._began < _ALONE:
+                    continue
+                there = [one for one, _ in self.node.get_topic_names_and_types() if one != name]
+                self._notify(f"{name}: nobody publishes it so far; {suggestion(name, there)}")
+            elif not count:
+                self._log.write(f"{name} gone", f"{name}: nobody publishes it any more")
+            elif not before:
+                self._log.write(f"{name} there", f"{name}: is published")
+            if count > max(before or 0, 1) and not any(one.reads_transforms for one in topic.readers):
+                self._log.write(f"{name} many", f"{name}: {count} publishers; their messages are taken as if of one")
+            topic.publishers = count
+
+    def _subscribe(self, topic: Topic, name: str) -> None:
+        """Subscribe by the first of the publishers' types that has what ``run.toml`` asks for."""
+        infos = self.node.get_publishers_info_by_topic(name)
+        for kind in dict.fromkeys(info.topic_type for info in infos):
+            package, _, rest = kind.partition("/")
+            try:
+                message = getattr(import_module(f"{package}.msg"), rest.rpartition("/")[2])
+                lacking = [path for reader in topic.readers for path in reader.lacks(message())]
+            except (ImportError, AttributeError):
+                self._log.write(f"{name} {kind}", f"{name}: no package here has its type {kind}: source one that does")
+                continue
+            if lacking:
+                self._log.write(f"{name} {kind}", f"{name}: is of type {kind}, which has no {', '.join(lacking)}")
+                continue
+            qos = load("rclpy.qos")
+            depth = qos.QoSProfile(depth=_DEPTH, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
+            events = load("rclpy.event_handler").SubscriptionEventCallbacks(message_lost=partial(self._lost, topic))
+            take = partial(self._take, topic)
+            topic.subscription = self.node.create_subscription(message, topic.name, take, depth, event_callbacks=events)
+            return
+
+    def _lost(self, topic: Topic, status: Any) -> None:
+        """Count what the middleware has lost."""
+        topic.lost += status.total_count_change
+        self._log.write(f"{topic.name} lost", f"{topic.name}: {topic.lost} messages lost on the way")
+
+
+def load(module: str) -> Any:
+    """A module of ROS 2.
+
+    Raises:
+        ConfigError: It is not here.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        why = "" if isinstance(error, ModuleNotFoundError) else f" ({reason(error)})"
+        raise ConfigError(f"ROS 2 has no '{module}' here{why}: source the robot's own, or {EXTRA}") from None

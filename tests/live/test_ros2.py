@@ -1,0 +1,319 @@
+"""`pumafuse live ros2:` between processes on real ROS 2 (Fast DDS), on this computer alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bag_files
+import pumafuse as pf
+from executable import EXECUTABLE
+from ros2_player import BEFORE_NS
+
+pytestmark = pytest.mark.skipif(find_spec("rclpy") is None, reason="there are wheels of ROS 2 for Linux alone")
+PLAYER = Path(__file__).parents[1] / "ros2_player.py"
+LONGEST = 60.0  # s that anything here may take
+STARTS = 3 * 10**9  # ns
+
+
+@pytest.fixture(autouse=True)
+def ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Find ROS's libraries, and talk to this computer alone, on a domain of our own."""
+    libraries = [f"{sys.prefix}/lib", *map(str, Path(find_spec("rclpy").origin).parents[1].glob("ros_*.libs"))]
+    monkeypatch.setenv("LD_LIBRARY_PATH", ":".join(libraries))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    monkeypatch.setenv("PYTHONPATH", str(PLAYER.parent))
+
+
+class Node:
+    """`pumafuse live ros2:` as a process."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        words = [str(EXECUTABLE), "live", f"ros2:{folder / 'run.toml'}", "-c", str(folder / "fusion.toml"), *options]
+        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert self.process.stderr is not None
+        assert "listening at" in (first := self.process.stderr.readline()), first + self.process.stderr.read()
+
+    def until(self, words: str) -> None:
+        """Read the log up to a sentence with these words."""
+        assert self.process.stderr is not None
+        last = threading.Timer(LONGEST, self.process.kill)
+        last.start()
+        said = any(words in line for line in self.process.stderr)
+        last.cancel()
+        assert said, f"it ended without '{words}'"
+
+    def end(self) -> str:
+        """Ask for an end; what was logged since."""
+        begin = time.monotonic()
+        self.process.send_signal(signal.SIGTERM)
+        out, log = self.process.communicate(timeout=LONGEST)
+        assert time.monotonic() - begin < 10.0
+        assert (self.process.returncode, out) == (0, ""), log
+        return log
+
+
+@pytest.fixture
+def start() -> Generator[Callable[..., Node]]:
+    """Starts nodes, and ends those that are left."""
+    nodes = list[Node]()
+
+    def begin(folder: Path, *options: str) -> Node:
+        nodes.append(Node(folder, *options))
+        return nodes[-1]
+
+    yield begin
+    for node in nodes:
+        node.process.kill()
+        node.process.communicate()
+
+
+def cell(folder: Path, run: str = bag_files.ROS) -> None:
+    """The arm, its filter and its topics; sensors that the run has not are left out."""
+    (folder / "arm.toml").write_text(bag_files.ARM)
+    head, *sensors = bag_files.FUSION.split("[sensors.")
+    kept = [one for one in sensors if f"[sensors.{one.partition(']')[0]}]" in run]
+    (folder / "fusion.toml").write_text("[sensors.".join([head, *kept]))
+    (folder / "run.toml").write_text(run.format(file="drive.mcap"))
+
+
+def of_now(samples: list[bag_files.Sample]) -> list[bag_files.Sample]:
+    """The same, to be played in some seconds."""
+    later = time.time_ns() + STARTS + BEFORE_NS - samples[0].stamp
+    return [replace(one, stamp=one.stamp + later, logged=one.logged + later) for one in samples]
+
+
+def played(folder: Path, samples: list[bag_files.Sample], *node: str) -> list[dict[str, Any]]:
+    """Play a bag of them; what was published meanwhile."""
+    bag_files.mcap(folder / "drive.mcap", samples)
+    out = folder / "published.jsonl"
+    words = [sys.executable, str(PLAYER), str(folder / "drive.mcap"), str(out), *node]
+    subprocess.run(words, check=True, timeout=LONGEST)
+    return [json.loads(line) for line in out.read_text().splitlines()]
+
+
+STAMPED = bag_files.ROS[: bag_files.ROS.index("[sensors.level]")]  # without what is stamped when it is received
+
+
+@pytest.mark.filterwarnings("ignore::pumafuse.errors.PumafuseWarning")  # the arm is not the one that moved
+def test_poses_are_those_of_the_bag_fused_as_live(tmp_path: Path, start: Callable[..., Node]) -> None:
+    """To the last bit, with covariance and frame; the record fuses to the same; diagnostics tell of each sensor."""
+    cell(tmp_path, STAMPED)
+    node = start(tmp_path, "--record", str(tmp_path / "record"))
+    published = played(tmp_path, of_now(bag_files.motion(100)))
+    log = node.end()
+    assert "100 fused; 100 estimates" in log
+    assert "/pumafuse: 300 events, 0 lost" in log
+    config = pf.FusionConfig.load(tmp_path / "fusion.toml")
+    for source in (tmp_path, tmp_path / "record"):
+        est = pf.fuse(pf.Run.read(source), config, mode="as-live")
+        poses = [one for one in published if one["topic"] == "pose"]
+        assert [one["stamp"] for one in poses] == (est.origin + np.rint(est.time * 1e9).astype(int)).tolist()
+        assert {one["frame"] for one in poses} == {"base"}
+        for column, axis in enumerate("xyz"):
+            assert np.array_equal([one["pose"][column] for one in poses], est[axis].position)
+            variance = np.array([one["covariance"][7 * column] for one in poses])
+            assert np.allclose(variance, est[axis].position_sd ** 2, rtol=1e-12)
+        assert poses[0]["pose"][3:] == [0.0, 0.0, 0.0, 1.0]
+        assert poses[0]["covariance"][35] > 1e3
+    status = [one for one in published if one["topic"] == "diagnostics"][-1]["status"]
+    assert set(status) == {"pumafuse: estimates", "pumafuse: camera", "pumafuse: encoder"}
+    assert status["pumafuse: camera"][2]["rejected"].isdigit()
+
+
+def test_remapping_names_and_parameters(tmp_path: Path, start: Callable[..., Node]) -> None:
+    """--ros-args names the node, moves a topic and the estimates, and gives the frame."""
+    run = STAMPED.replace('topic = "/command"', 'topic = "/orders"')
+    cell(tmp_path, run)
+    arguments = ["-r", "__node:=left", "-r", "/orders:=/command", "-p", "frame_id:=cell"]
+    node = start(tmp_path, "--ros-args", *arguments)
+    published = played(tmp_path, of_now(bag_files.motion(20)), "left")
+    assert "20 fused; 20 estimates" in node.end()
+    poses = [one for one in published if one["topic"] == "pose"]
+    assert len(poses) == 20
+    assert {one["frame"] for one in poses} == {"cell"}
+
+
+def test_publishers_come_late_leave_and_return(tmp_path: Path, start: Callable[..., Node]) -> None:
+    """Each is said, and what the second one brings is taken."""
+    cell(tmp_path, STAMPED)
+    node = start(tmp_path)
+    node.until("/command: nobody publishes it so far")
+    played(tmp_path, of_now(bag_files.motion(20)))
+    node.until("/command: nobody publishes it any more")
+    played(tmp_path, of_now(bag_files.motion(20)))
+    assert "40 fused; 40 estimates" in node.end()
+
+
+def test_what_is_said_of_wrong_types_and_two_publishers(tmp_path: Path, start: Callable[..., Node]) -> None:
+    """A type without the fields asked for, and two publishers of commands."""
+    cell(tmp_path, STAMPED.replace("/joints", "/level"))
+    node = start(tmp_path)
+    samples = of_now(bag_files.motion(60))
+    bag_files.mcap(tmp_path / "second.mcap", samples)
+    words = [sys.executable, str(PLAYER), str(tmp_path / "second.mcap"), str(tmp_path / "second.jsonl")]
+    with subprocess.Popen(words):
+        played(tmp_path, samples)
+    log = node.end()
+    assert "/level: is of type std_msgs/msg/Float64, which has no header.stamp, position[slide]" in log
+    assert "/command: 2 publishers" in log
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "words"),
+    [
+        (["ros2:{}/run.toml", "--ros-args", "-r", "wrong"], 1, "--ros-args: "),
+        (["ros2:{}/nowhere.toml"], 1, "nowhere.toml"),
+        (["stdin", "--ros-args", "-r", "a:=b"], 2, "goes with a source ros2:run.toml"),
+    ],
+)
+def test_wrong_arguments(tmp_path: Path, options: list[str], code: int, words: str) -> None:
+    """One line each."""
+    cell(tmp_path)
+    source, *rest = [one.format(tmp_path) for one in options]
+    command = [str(EXECUTABLE), "live", source, "-c", str(tmp_path / "fusion.toml"), *rest]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=LONGEST, stdin=subprocess.DEVNULL
+    )
+    assert done.returncode == code
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_without_ros_the_way_to_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where its libraries are not found, and where a source has no topic."""
+    monkeypatch.delenv("LD_LIBRARY_PATH")
+    cell(tmp_path)
+    command = [str(EXECUTABLE), "live", f"ros2:{tmp_path / 'run.toml'}", "-c", str(tmp_path / "fusion.toml")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LONGEST)
+    assert done.returncode == 1
+    assert "pip install 'pumafuse[ros2]'" in done.stderr
+    (tmp_path / "run.toml").write_text((tmp_path / "run.toml").read_text().replace('topic = "/level"', ""))
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LONGEST)
+    assert "sensor 'level' has no topic" in done.stderr
+
+
+ANGLE = """
+name = "lever"
+update_period_ms = 4.0
+delay_ms = 30.0
+[axes.elbow]
+kind = "angle"
+plant = "first-order"
+time_constant_ms = 40.0
+"""
+ENCODER = """
+arm = "arm.toml"
+[process]
+input_noise_deg_rtHz = 0.3
+drift_deg_rts = 0.3
+[sensors.encoder]
+sd_deg = 0.1
+"""
+JOINTS = """
+[command]
+file = "drive.mcap"
+topic = "/go"
+time = "{time}"
+elbow = {{ column = "{column}", unit = "rad" }}
+[sensors.encoder]
+file = "drive.mcap"
+topic = "/joint_states"
+time = "{stamps}"
+elbow = {{ column = "position[elbow]", unit = "rad", turn_deg = 360.0 }}
+"""
+
+
+def lever(folder: Path, **run: str) -> None:
+    """An arm of one joint, and its encoder."""
+    for name, text in {"arm": ANGLE, "fusion": ENCODER, "run": JOINTS.format(**run)}.items():
+        (folder / f"{name}.toml").write_text(text)
+
+
+def states(begin: int, count: int, stamps: int) -> list[bag_files.Sent]:
+    """An encoder at 50 Hz from an instant [ns] on that stands at 0.2 rad, a turn too far; ``stamps`` begin at [ns]."""
+    kind, value = "sensor_msgs/msg/JointState", 0.2 + 2.0 * np.pi
+    every = [(20_000_000 * k, {"name": ["lift", "elbow"], "position": [9.0, value]}) for k in range(count)]
+    return [("/joint_states", kind, begin + t, {"header": bag_files.header(stamps + t), **one}) for t, one in every]
+
+
+def publish(folder: Path, sent: list[bag_files.Sent]) -> list[dict[str, Any]]:
+    """Play messages; what was published meanwhile."""
+    bag_files.messages(folder / "drive.mcap", sent)
+    words = [sys.executable, str(PLAYER), str(folder / "drive.mcap"), str(folder / "published.jsonl")]
+    subprocess.run(words, check=True, timeout=LONGEST)
+    return [json.loads(line) for line in (folder / "published.jsonl").read_text().splitlines()]
+
+
+def test_joints_by_a_trajectory(tmp_path: Path, start: Callable[..., Node]) -> None:
+    """A path is commanded as time goes by from when it comes; the joint is published at each command."""
+    lever(tmp_path, time="path.time_ns", column="path.position[elbow]", stamps="header.stamp")
+    node, begin = start(tmp_path, "--record", str(tmp_path / "record")), time.time_ns() + STARTS + BEFORE_NS
+    points = [(0.0, 0.0), (1.0, 0.4)]
+    rest = {"velocities": [], "accelerations": [], "effort": []}
+    made = [{**rest, "positions": [at], "time_from_start": bag_files.stamp(round(t * 1e9))} for t, at in points]
+    goal = {"header": bag_files.header(0), "joint_names": ["elbow"], "points": made}
+    sent = [("/go", "trajectory_msgs/msg/JointTrajectory", begin, goal), *states(begin + 1_000_000, 70, begin)]
+    joints = [one for one in publish(tmp_path, sent) if one["topic"] == "joints"]
+    assert "251 fused; 251 estimates" in node.end()
+    assert [one["name"] for one in joints] == [["elbow"]] * 251
+    run = pf.Run.read(tmp_path / "record")
+    assert [one["stamp"] for one in joints] == run.command.stamp.tolist()
+    assert np.allclose(run.command.values["elbow"], np.linspace(0.0, 0.4, 251), atol=1e-9)
+    assert np.allclose(run.sensors["encoder"].values["elbow"], 0.2)  # without its turn
+    assert all(abs(one["position"][0] - 0.2) < 0.2 for one in joints[20:])
+
+
+def test_the_time_of_a_simulation(tmp_path: Path, start: Callable[..., Node]) -> None:
+    """What has no stamp is stamped by /clock, which runs at half the pace of the day."""
+    lever(tmp_path, time="log_time", column="data[0]", stamps="log_time")
+    node = start(tmp_path, "--record", str(tmp_path / "record"), "--ros-args", "-p", "use_sim_time:=true")
+    begin, sent = time.time_ns() + STARTS + BEFORE_NS, states(0, 0, 0)
+    for k in range(200):
+        clock = bag_files.stamp(100 * 10**9 + 5_000_000 * k)
+        sent.append(("/clock", "rosgraph_msgs/msg/Clock", begin + 10_000_000 * k, {"clock": clock}))
+    for k in range(80):
+        at = begin + 400_000_000 + 20_000_000 * k + 1_000_000
+        sent.append(("/go", "std_msgs/msg/Float64MultiArray", at, {"data": [0.1]}))
+    publish(tmp_path, [*sent, *states(begin + 400_000_000 + 3_000_000, 80, 0)])
+    node.end()
+    run = pf.Run.read(tmp_path / "record")
+    for source in (run.command, run.sensors["encoder"]):
+        assert 100.15 < source.stamp[0] / 1e9 < 100.25
+        assert np.median(np.diff(source.stamp)) == 10_000_000
+
+
+def test_the_launch_file_starts_the_node(
+    tmp_path: Path, start: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its words, with the arguments as a launch fills them in, are ones that the command takes."""
+    cell(tmp_path, STAMPED)
+    given = {"folder": str(tmp_path), "name": "left", "frame_id": "", "use_sim_time": "false"}
+    kept = SimpleNamespace
+    monkeypatch.setitem(sys.modules, "launch", kept(LaunchDescription=list))
+    actions = kept(DeclareLaunchArgument=lambda name, **_: name, ExecuteProcess=lambda cmd, **_: cmd)
+    monkeypatch.setitem(sys.modules, "launch.actions", actions)
+    monkeypatch.setitem(sys.modules, "launch.substitutions", kept(LaunchConfiguration=given.get))
+    file = PLAYER.parents[1] / "examples" / "ros2" / "pumafuse.launch.py"
+    *names, command = runpy.run_path(str(file))["generate_launch_description"]()
+    assert names == list(given)
+    words = [word if isinstance(word, str) else "".join(word) for word in command]
+    assert words[:4] == ["pumafuse", "live", f"ros2:{tmp_path / 'run.toml'}", "-c"]
+    node = start(tmp_path, *words[5:])
+    assert "estimates" in node.end()

@@ -1,0 +1,80 @@
+"""A process of its own that plays a bag of ROS 2 and writes down what `pumafuse live` publishes; run as a script.
+
+    python ros2_player.py BAG OUT [NODE]
+
+Each message goes out when it was recorded, by this computer's clock: the bag is of the near future. OUT gets a JSON
+object a line: of a topic its stamp [ns] and numbers.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from pumafuse.logs.bags import Faults, records_of
+
+BEFORE_NS = 2 * 10**9  # the node looks for publishers twice a second
+AFTER_S = 1.5  # diagnostics come once a second
+
+
+def play(bag: Path, out: Path, name: str) -> None:
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import JointState
+
+    rclpy.init()
+    node: Any = rclpy.create_node("player")
+    written: list[dict[str, Any]] = []
+
+    def write(topic: str, message: Any, **more: Any) -> None:
+        stamp, frame = message.header.stamp, message.header.frame_id
+        written.append({"topic": topic, "stamp": stamp.sec * 10**9 + stamp.nanosec, "frame": frame, **more})
+
+    def pose(message: Any) -> None:
+        at, turned = message.pose.pose.position, message.pose.pose.orientation
+        numbers = [at.x, at.y, at.z, turned.x, turned.y, turned.z, turned.w]
+        write("pose", message, pose=numbers, covariance=message.pose.covariance.tolist())
+
+    def joints(message: Any) -> None:
+        write("joints", message, name=list(message.name), position=list(message.position))
+
+    def diagnostics(message: Any) -> None:
+        status = {
+            one.name: [ord(one.level), one.message, {v.key: v.value for v in one.values}] for one in message.status
+        }
+        write("diagnostics", message, status=status)
+
+    node.create_subscription(PoseWithCovarianceStamped, f"/{name}/pose", pose, 10_000)
+    node.create_subscription(JointState, f"/{name}/joints", joints, 10_000)
+    node.create_subscription(DiagnosticArray, f"/{name}/diagnostics", diagnostics, 100)
+    records = sorted(records_of(bag, None, Faults(), set()), key=lambda record: record.time)
+    publishers: dict[str, Any] = {}
+    for record in records:
+        if record.channel.topic not in publishers:
+            package, _, kind = record.channel.type.split("/")
+            message = getattr(import_module(f"{package}.msg"), kind)
+            publishers[record.channel.topic] = node.create_publisher(
+                message, record.channel.topic, qos_profile_sensor_data
+            )
+    executor = rclpy.executors.SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def wait(until: float) -> None:
+        while (left := until - time.time()) > 0.0:
+            executor.spin_once(timeout_sec=left)
+
+    for record in records:
+        wait(record.time / 1e9)
+        publishers[record.channel.topic].publish(record.payload)
+    wait(time.time() + AFTER_S)
+    out.write_text("".join(json.dumps(one) + "\n" for one in written))
+
+
+if __name__ == "__main__":
+    play(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3] if len(sys.argv) > 3 else "pumafuse")
