@@ -70,6 +70,7 @@ notebooks: $(READY)
 
 bench: .venv-bench/.ready
 	.venv-bench/bin/python benchmarks/run.py --write
+	.venv-bench/bin/python benchmarks/ros2.py --busy --seconds 60
 
 # Universal: one lock for every platform and Python. No index address goes into it. ROS's bootstrapper would start every
 # Python a second time, to set a path of libraries: the tests of ROS set it.

@@ -19,9 +19,11 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy
 import numpy as np
 
 COMMAND_S = 0.028
+LIBRARIES = [f"{sys.prefix}/lib", *map(str, Path(numpy.__file__).parents[1].glob("ros_*.libs"))]  # of the wheels
 TOPIC = """
 [{source}]
 file = "no file"
@@ -74,6 +76,9 @@ def main() -> None:
     parser.add_argument("--busy", action="store_true")
     parser.add_argument("--play", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if LIBRARIES[0] not in os.environ.get("LD_LIBRARY_PATH", ""):  # the loader reads it when a process begins
+        path = ":".join([*LIBRARIES, os.environ.get("LD_LIBRARY_PATH", "")])
+        os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | {"LD_LIBRARY_PATH": path})
     if args.play:
         play(args.hz, args.seconds)
     else:

@@ -269,7 +269,10 @@ def test_joints_by_a_trajectory(tmp_path: Path, start: Callable[..., Node]) -> N
     rest = {"velocities": [], "accelerations": [], "effort": []}
     made = [{**rest, "positions": [at], "time_from_start": bag_files.stamp(round(t * 1e9))} for t, at in points]
     goal = {"header": bag_files.header(0), "joint_names": ["elbow"], "points": made}
-    sent = [("/go", "trajectory_msgs/msg/JointTrajectory", begin, goal), *states(begin + 1_000_000, 70, begin)]
+    sent = [
+        ("/go", "trajectory_msgs/msg/JointTrajectory", begin, goal),
+        *states(begin + 100_000_000, 65, begin + 99_000_000),
+    ]
     joints = [one for one in publish(tmp_path, sent) if one["topic"] == "joints"]
     assert "251 fused; 251 estimates" in node.end()
     assert [one["name"] for one in joints] == [["elbow"]] * 251
