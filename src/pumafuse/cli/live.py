@@ -25,12 +25,16 @@ from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from ..fusion.placing import with_tool
 from ..live import network
-from ..live.address import LISTENERS, NETWORK, Address
+from ..live.address import LISTENERS, NETWORK, OF_A_RUN, Address
 from ..live.estimator import LiveEstimator
 from ..live.health import Health
 from ..live.network import UdpSender
 from ..live.record import Recorder
 from ..live.results import LiveEstimate
+from ..live.ros2 import Ros2Source
+from ..live.ros2_estimates import Ros2Estimates
+from ..live.rtde import RtdeSource
+from ..live.several import Remote, Several
 from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream, Watcher
 from ..live.wire import Event
@@ -58,7 +62,7 @@ _SENSOR: Columns = {
 
 
 def run(
-    source: str,
+    given: list[str],
     config: Path,
     rate: float | None,
     window: float,
@@ -76,31 +80,35 @@ def run(
     Raises:
         PumafuseError: The configuration, the source, the run or a folder is wrong.
     """
-    address, known, start = Address.parse(source), FusionConfig.load(config), dict[str, float]()
-    if listen and address.kind not in LISTENERS:
-        raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {source}")
-    recorded = Run.read(address.path) if address.kind == "replay" else None
+    sources, known, start = list(map(Address.parse, given)), FusionConfig.load(config), dict[str, float]()
+    alone, kinds = sources[0], [one.kind for one in sources]
+    if listen and not set(LISTENERS) & set(kinds):
+        raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {given[0]}")
+    if len(sources) > 1 and (lonely := {"stdin", "replay"} & set(kinds)):
+        raise ConfigError(f"{lonely.pop()}: is a source alone; several may be of the network")
+    recorded = Run.read(alone.path) if alone.kind == "replay" else None
     if recorded is not None:
         start = dict(recorded.start)
         known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
-    listed = manifest.load(Path(address.path)) if address.kind == "ros2" else None
-    if listed is not None:
-        start = dict(listed.command.start)
-        robot = known.robot if listed.robot is None else listed.robot.beside(Path(address.path).parent)
-        known = msgspec.structs.replace(known, frame=listed.frame or known.frame, robot=robot)
+    listed = {one: manifest.load(Path(one.path)) for one in sources if one.kind in OF_A_RUN}
+    for address, one in listed.items():
+        start |= one.command.start
+        robot = known.robot if one.robot is None else one.robot.beside(Path(address.path).parent)
+        known = msgspec.structs.replace(known, frame=one.frame or known.frame, robot=robot)
     errors = console(sys.stderr)
 
     def notify(text: str) -> None:
         with contextlib.suppress(OSError):  # a log that is full costs the log, not the estimates
             errors.print(text, markup=False, soft_wrap=True)
 
-    remote = network.source(address, listen, allow, notify) if address.kind in NETWORK else None
     with contextlib.ExitStack() as stack:
-        ros = None
-        if listed is not None:
-            from ..live.ros2 import Ros2Source
-
-            remote = ros = stack.enter_context(contextlib.closing(Ros2Source(listed, ros_args, notify)))
+        remotes = [
+            _opened(one, listed.get(one), known, stack, notify, listen=listen, allow=allow, ros_args=ros_args)
+            for one in sources
+            if one.kind in (*NETWORK, *OF_A_RUN)
+        ]
+        remote = Several(remotes) if len(remotes) > 1 else next(iter(remotes), None)
+        ros = next((one for one in remotes if isinstance(one, Ros2Source)), None)
         signals = stack.enter_context(_caught_signals())
         sender = stack.enter_context(contextlib.closing(UdpSender(out))) if out else None
         estimator = partial(LiveEstimator, known, window=window, stale_after=stale_after, start=start, on_notice=notify)
@@ -117,8 +125,6 @@ def run(
 
             views.append(stack.enter_context(contextlib.closing(LiveView(rerun, known, notify))))
         if ros is not None:
-            from ..live.ros2_estimates import Ros2Estimates
-
             views.append(Ros2Estimates(ros, live))
         write = sender or (_nowhere if ros is not None else _output(status))
         stream = Stream(live, write, notify, rate, views)
@@ -126,13 +132,13 @@ def run(
         if status and errors.is_terminal:
             screen = stack.enter_context(Live(console=errors, auto_refresh=False, transient=True))
         summaries = [part.summary for part in (remote, recorder, sender) if part is not None]
-        speed = math.inf if ros is not None and ros.simulated else address.speed  # a simulation may stand still
+        speed = math.inf if ros is not None and ros.simulated else alone.speed  # a simulation may stand still
         feeder = _Feeder(stream, summaries, speed, recorder, views, screen)
         if remote is not None:
             if left := _listen(remote, feeder, signals):
                 notify(f"{left} lines had come and were not taken in any more: the end was asked for")
         else:
-            for items in standard_input() if recorded is None else replayed(recorded, known, address.speed):
+            for items in standard_input() if recorded is None else replayed(recorded, known, alone.speed):
                 feeder.take(items)
                 if signals:
                     break
@@ -141,6 +147,39 @@ def run(
         notify(sentence)
     with contextlib.suppress(OSError):
         print_tables([_sensor_table(live, feeder.now)], "stderr")
+
+
+def _opened(
+    address: Address,
+    listed: manifest.Manifest | None,
+    config: FusionConfig,
+    stack: contextlib.ExitStack,
+    notify: Callable[[str], None],
+    *,
+    listen: str | None,
+    allow: list[str],
+    ros_args: list[str],
+) -> Remote:
+    """A source of the network; the stack closes what has to be.
+
+    Args:
+        address: Of the source.
+        listed: What its ``run.toml`` says, of a kind that has one.
+        config: Of the estimator.
+        stack: It.
+        notify: Takes a sentence for the log.
+        listen: The options.
+        allow: The options.
+        ros_args: The options.
+
+    Raises:
+        PumafuseError: The source cannot be opened.
+    """
+    if listed is None:
+        return network.source(address, listen, allow, notify)
+    if address.kind == "rtde":
+        return RtdeSource(address, listed, 1.0 / config.arm.update_period, notify)
+    return stack.enter_context(contextlib.closing(Ros2Source(listed, ros_args, notify)))
 
 
 def _nowhere(_: list[bytes]) -> None:
@@ -167,7 +206,7 @@ def _to_standard_output(lines: list[bytes]) -> None:
         raise RunError(f"standard output: cannot be written: {error.strerror}") from None
 
 
-def _listen(remote: _Remote, feeder: _Feeder, signals: list[int]) -> int:
+def _listen(remote: Remote, feeder: _Feeder, signals: list[int]) -> int:
     """Feed what comes from the network until a signal ends it, and then for at most 1 s what has come until then.
 
     Returns:
@@ -185,25 +224,6 @@ def _listen(remote: _Remote, feeder: _Feeder, signals: list[int]) -> int:
             return len(left) - begin
         feeder.take(left[begin : begin + _AT_ONCE])
     return 0
-
-
-class _Remote(Protocol):
-    """A source that is listened to until a signal ends it."""
-
-    def start(self) -> None:
-        """Begin to listen."""
-
-    def get(self) -> Sequence[bytes | Event]:
-        """Some lines or events; none after a tenth of a second without any."""
-        ...
-
-    def stop(self) -> Sequence[bytes | Event]:
-        """Those that have come and were not given yet."""
-        ...
-
-    def summary(self) -> str:
-        """How many came."""
-        ...
 
 
 class _View(Watcher, Protocol):

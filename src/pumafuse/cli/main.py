@@ -355,7 +355,7 @@ def tune(
 @app.command()
 def live(
     context: typer.Context,
-    source: Annotated[str, Argument(metavar="SOURCE", help="Where events come from, see above.")],
+    sources: Annotated[list[str], Argument(metavar="SOURCE...", help="Where events come from, see above.")],
     config: Config,
     rate: Rate = None,
     window: Annotated[float, Option(metavar="S", help="How late an event may come; at least 1 s.")] = 2.0,
@@ -371,9 +371,10 @@ def live(
 ) -> None:
     """Estimate from a stream of commands and measurements, as they come.
 
-    SOURCE is stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, a recorded run: replay:RUN?speed=4
-    (speed=max: as fast as it can be), or topics of a running ROS 2, as a run.toml names them: ros2:run.toml. Then
-    estimates go to topics as well, and --ros-args is as everywhere in ROS.
+    SOURCE is stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, or a recorded run: replay:RUN?speed=4
+    (speed=max: as fast as it can be). It is topics of a running ROS 2, as a run.toml names them: ros2:run.toml; then
+    estimates go to topics, and --ros-args is as everywhere in ROS. Or it is the controller of a robot of Universal
+    Robots: rtde:run.toml?host=HOST. Of the network there may be several, with stamps of one clock.
 
     One JSON object a line, in s and mm (of angles degrees). In: {"t": 12.345, "command": {"x": 570.0}} and {"t": 12.35,
     "sensor": "tracker", "x": 569.7}. Out: {"t": ..., "x": {"position_mm": ..., "sd_mm": ..., "velocity_mm_s": ...}}.
@@ -384,9 +385,9 @@ def live(
         raise BadParameter("--listen ADDR and --allow CIDR go together", param_hint="--listen")
     _check_positive(rate=rate, window=window, stale_after=stale_after)
     ros: list[str] = context.obj
-    if ros and not source.startswith("ros2:"):
+    if ros and not any(source.startswith("ros2:") for source in sources):
         raise BadParameter("goes with a source ros2:run.toml", param_hint=ROS_ARGS)
-    command.run(source, config, rate, window, stale_after, out, record, rerun, status, listen, allow or [], ros)
+    command.run(sources, config, rate, window, stale_after, out, record, rerun, status, listen, allow or [], ros)
 
 
 @app.command()

@@ -18,10 +18,12 @@ Allowed: TypeAlias = Callable[[str], bool]  # whether a sender's host is accepte
 
 LISTENERS = ("udp", "tcp-listen")
 NETWORK = (*LISTENERS, "tcp")
+OF_A_RUN = ("ros2", "rtde")  # what comes is read by a run.toml
+_RTDE = 30004  # the controller's port
 _LOOPBACK = "127.0.0.1"
 _SOURCES = (
-    "stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, ros2:run.toml, replay:RUN, replay:RUN?speed=4 (or"
-    " max)"
+    "stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, ros2:run.toml, rtde:run.toml?host=HOST,"
+    " replay:RUN, replay:RUN?speed=4 (or max)"
 )
 
 
@@ -30,8 +32,8 @@ class Address:
     """A source as the command line names it.
 
     Attributes:
-        kind: ``stdin``, ``replay``, ``ros2``, ``udp``, ``tcp-listen`` or ``tcp``.
-        path: Of the run to replay, or of a ``run.toml`` that names topics.
+        kind: ``stdin``, ``replay``, ``ros2``, ``rtde``, ``udp``, ``tcp-listen`` or ``tcp``.
+        path: Of the run to replay, or of a ``run.toml`` that names topics or columns.
         speed: Seconds of the run in one second; infinite: as fast as it can be.
         host: Of a network source, empty where none is given.
         port: Of a network source.
@@ -57,6 +59,8 @@ class Address:
             return _replay(text, rest)
         if kind == "ros2" and rest:
             return Address("ros2", rest)
+        if kind == "rtde" and rest:
+            return _rtde(text, rest)
         if kind in NETWORK and rest.startswith("//"):
             return _network_address(text, f"source '{text}'")
         raise ConfigError(f"no source '{text}'; there are: {_SOURCES}")
@@ -141,6 +145,15 @@ def _replay(text: str, rest: str) -> Address:
     if name != "speed" or not speed > 0.0:
         raise ConfigError(f"source '{text}': expected ?speed= and a positive number or max after the run")
     return Address("replay", path, speed)
+
+
+def _rtde(text: str, rest: str) -> Address:
+    path, _, option = rest.rpartition("?")
+    name, _, place = option.partition("=")
+    if not path or name != "host" or not place:
+        raise ConfigError(f"source '{text}': expected rtde:run.toml?host=HOST, the address of the robot's controller")
+    address = _network_address(f"tcp://{place}" if ":" in place else f"tcp://{place}:{_RTDE}", f"source '{text}'")
+    return Address("rtde", path, host=address.host, port=address.port)
 
 
 def _network_address(text: str, where: str) -> Address:

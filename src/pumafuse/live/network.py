@@ -16,14 +16,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import TypeAlias
+from typing import Generic, TypeAlias, TypeVar
 
 from ..errors import RunError
 from .address import Address, Allowed, SocketAddress, host_port, listener, receiver
 from .backlog import MOST, Backlog
 from .rate_limit import RateLimitedLog
 from .sources import QUIET
-from .wire import Lines
+from .wire import Event, Lines
 
 _LARGEST = 65_536  # bytes of a datagram, or of a piece of a connection
 _MOST_RECEIVED = 1024  # datagrams that are read from the socket at once
@@ -135,49 +135,58 @@ class UdpListener:
         return self._backlog.dropped + self._dropped_before
 
 
-class _Tcp:
-    """Connections, each read by a thread, whose lines are put together in the order in which they come."""
+T = TypeVar("T", bytes, Event)
+
+
+class _Tcp(Generic[T]):
+    """Connections, each read by a thread, whose lines or events are put together in the order in which they come."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._pieces = queue.Queue[list[bytes]](_MOST_PIECES)
+        self._pieces = queue.Queue[list[T]](_MOST_PIECES)
 
-    def get(self) -> list[bytes]:
-        """Some lines of one connection; none after a tenth of a second without any."""
+    def get(self) -> list[T]:
+        """Some of one connection; none after a tenth of a second without any."""
         try:
             return self._pieces.get(timeout=QUIET)
         except queue.Empty:
             return []
 
-    def stop(self) -> list[bytes]:
-        """The lines that have come and were not given yet; the connections end with the process."""
+    def stop(self) -> list[T]:
+        """What has come and was not given yet; the connections end with the process."""
         self._log = RateLimitedLog(lambda _: None)  # a thread that writes while the process ends would stop it
-        lines: list[bytes] = []
+        found: list[T] = []
         with contextlib.suppress(queue.Empty):
             for _ in range(_MOST_PIECES + _MOST_CONNECTIONS):  # and one that each thread holds; a flood has no end
-                lines += self._pieces.get(timeout=_HANDED_OVER)
-        return lines
-
-    def _heard(self, connection: socket.socket) -> None:
-        """Something has come on a connection for the first time."""
-
-    def _read(self, connection: socket.socket) -> bool:
-        """Read a connection to its end, a last line without its end, too; whether there was anything."""
-        lines, some = Lines(), False
-        with connection, contextlib.suppress(OSError):
-            _keep_alive(connection)
-            while piece := connection.recv(_LARGEST):
-                if not some:
-                    self._heard(connection)
-                some = True
-                if whole := lines.cut(piece):
-                    self._pieces.put(whole)
-        if rest := lines.rest():
-            self._pieces.put(rest)
-        return some
+                found += self._pieces.get(timeout=_HANDED_OVER)
+        return found
 
 
-class TcpListener(_Tcp):
+def _read_lines(
+    connection: socket.socket, put: Callable[[list[bytes]], None], heard: Callable[[], object] = lambda: None
+) -> bool:
+    """Read a connection to its end, a last line without its end, too; whether there was anything.
+
+    Args:
+        connection: It is closed then.
+        put: Takes lines.
+        heard: Called when something has come for the first time.
+    """
+    lines, some = Lines(), False
+    with connection, contextlib.suppress(OSError):
+        keep_alive(connection)
+        while piece := connection.recv(_LARGEST):
+            if not some:
+                heard()
+            some = True
+            if whole := lines.cut(piece):
+                put(whole)
+    if rest := lines.rest():
+        put(rest)
+    return some
+
+
+class TcpListener(_Tcp[bytes]):
     """Lines from all who connect."""
 
     def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
@@ -236,18 +245,15 @@ class TcpListener(_Tcp):
                 return True
         return False
 
-    def _heard(self, connection: socket.socket) -> None:
-        self._silent.pop(connection, None)
-
     def _serve(self, connection: socket.socket, peer: str) -> None:
-        self._read(connection)
+        _read_lines(connection, self._pieces.put, lambda: self._silent.pop(connection, None))
         self._silent.pop(connection, None)
         self._open.discard(connection)
         self._log.write("gone", f"the connection from {peer} has ended")
 
 
-class TcpClient(_Tcp):
-    """Lines from a server, to which the connection is made again whenever it ends."""
+class Client(_Tcp[T]):
+    """What a server sends, to which the connection is made again whenever it ends."""
 
     def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
         """Prepare; :meth:`start` connects."""
@@ -260,14 +266,18 @@ class TcpClient(_Tcp):
         """Begin to connect."""
         _in_a_thread(self._stay_connected)
 
-    def stop(self) -> list[bytes]:
-        """The lines that have come and were not given yet; no connection is made any more."""
+    def stop(self) -> list[T]:
+        """What has come and was not given yet; no connection is made any more."""
         self._stopped.set()
         return super().stop()
 
     def summary(self) -> str:
         """How often the connection was made, and whether it is there."""
         return f"{self._name}: connections made: {self._made}, {'open' if self._connected else 'none open'}"
+
+    def _read(self, connection: socket.socket) -> bool:
+        """Read a connection to its end, and close it; whether there was anything."""
+        raise NotImplementedError
 
     def _stay_connected(self) -> None:
         """Connect and read, again and again, with waits that double as long as nothing comes."""
@@ -288,6 +298,13 @@ class TcpClient(_Tcp):
                 self._log.write("ended", f"{self._name}: the connection has ended; made again in {wait:g} s")
             self._stopped.wait(wait)
             wait = min(2.0 * wait, _LONGEST_WAIT)
+
+
+class TcpClient(Client[bytes]):
+    """Lines from a server."""
+
+    def _read(self, connection: socket.socket) -> bool:
+        return _read_lines(connection, self._pieces.put)
 
 
 Source: TypeAlias = UdpListener | TcpListener | TcpClient
@@ -316,7 +333,7 @@ def _in_a_thread(work: Callable[..., None], *given: object) -> None:
     threading.Thread(target=work, args=given, name="network", daemon=True).start()
 
 
-def _keep_alive(connection: socket.socket) -> None:
+def keep_alive(connection: socket.socket) -> None:
     """Find within half a minute that the other side is gone without a word."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):

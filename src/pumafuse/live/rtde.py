@@ -1,0 +1,158 @@
+"""A robot of Universal Robots as a source of events: what its controller tells by RTDE, version 2 of the protocol.
+
+Where the controller wants the arm to be (``target_q``, ``target_TCP_pose``) are the commands, its encoders
+(``actual_q``, ``actual_TCP_pose``) a sensor, and more than one may listen. Names are those that UR's own ``record.py``
+gives to the columns of its CSV files, so the ``run.toml`` that reads such a file reads the running robot: an element of
+a vector is ``target_q_0``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import NamedTuple
+
+from ..errors import ConfigError
+from ..logs.columns import LOG_TIME
+from ..logs.manifest import Manifest
+from .address import Address
+from .messages import Reader
+from .network import Client, keep_alive
+from .wire import Event
+
+_HEAD = struct.Struct(">HB")  # bytes of a package, and its type
+_VERSION, _OUTPUTS, _BEGIN, _DATA, _TEXT = b"VOSUM"  # types of packages
+_PROTOCOL = 2
+_TYPES = {  # of variables, in big endian
+    "BOOL": "?",
+    "UINT8": "B",
+    "UINT32": "I",
+    "UINT64": "Q",
+    "INT32": "i",
+    "DOUBLE": "d",
+    "VECTOR3D": "3d",
+    "VECTOR6D": "6d",
+    "VECTOR6INT32": "6i",
+    "VECTOR6UINT32": "6I",
+}
+_PATIENCE = 5.0  # s without a package, of a robot that sends one every few ms
+
+
+class _Refused(Exception):  # noqa: N818 - what a robot does, and never leaves this module
+    """The robot does not do what it was asked; the text says what."""
+
+
+class _Recipe(NamedTuple):
+    """How a data package is read: its columns after the first byte, which is the ``number`` of the recipe."""
+
+    number: int
+    layout: struct.Struct
+    columns: list[str]
+
+    def row(self, body: bytes) -> SimpleNamespace:
+        """The columns of a package.
+
+        Raises:
+            struct.error: It is too short.
+        """
+        return SimpleNamespace(**dict(zip(self.columns, self.layout.unpack_from(body, 1), strict=True)))
+
+
+class RtdeSource(Client[Event]):
+    """Events of a robot, to which the connection is made again whenever it ends."""
+
+    def __init__(self, address: Address, listed: Manifest, rate: float, notify: Callable[[str], None]) -> None:
+        """Prepare; :meth:`start` connects.
+
+        Args:
+            address: Of the controller.
+            listed: What ``run.toml`` says.
+            rate: How often the robot is to send [Hz]: it knows up to 125, of the e-Series up to 500.
+            notify: Takes a sentence for the log.
+
+        Raises:
+            ConfigError: A column has no unit, or there are no stamps that a stream could have.
+        """
+        super().__init__(address, notify)
+        commanded, entries = dict[str, float](), {"": listed.command, **listed.sensors}
+        self._readers = [Reader(name, entry, commanded) for name, entry in entries.items()]
+        asked = [column for reader in self._readers for column in reader.entry.fields if column != LOG_TIME]
+        self._variables = dict.fromkeys(map(_variable, asked))
+        self._rate = rate
+        if not self._variables:
+            raise ConfigError(f"{self._name}: run.toml names no column of the robot, as in target_q_0")
+
+    def _read(self, connection: socket.socket) -> bool:
+        some = False
+        with connection, contextlib.suppress(OSError):
+            keep_alive(connection)
+            connection.settimeout(_PATIENCE)
+            packages = _packages(connection)
+            try:
+                recipe = self._agree(connection, packages)
+                for kind, body in packages:
+                    received = time.time_ns()
+                    if kind == _DATA and body[:1] == bytes([recipe.number]):
+                        row = recipe.row(body)
+                        events = [event for one in self._readers for event in one.events(row, received)]
+                        some = True
+                        self._pieces.put(events)
+            except (_Refused, struct.error) as error:
+                self._log.write("refused", f"{self._name}: {error}")
+        return some
+
+    def _agree(self, connection: socket.socket, packages: Iterator[tuple[int, bytes]]) -> _Recipe:
+        """Agree on the protocol and on what is sent, and let the robot begin.
+
+        Raises:
+            _Refused: It does not.
+        """
+
+        def ask(kind: int, body: bytes) -> bytes:
+            connection.sendall(_HEAD.pack(_HEAD.size + len(body), kind) + body)
+            for answer, found in packages:
+                if answer == kind:
+                    return found
+            raise _Refused("the robot has ended the connection instead of an answer")
+
+        if ask(_VERSION, struct.pack(">H", _PROTOCOL)) != b"\x01":
+            raise _Refused(f"the robot does not know version {_PROTOCOL} of RTDE (software 3.3 or newer does)")
+        found = ask(_OUTPUTS, struct.pack(">d", self._rate) + ",".join(self._variables).encode())
+        kinds = found[1:].decode("ascii", "replace").split(",")
+        known = dict(zip(self._variables, kinds, strict=False))
+        if unknown := [name for name in self._variables if known.get(name) not in _TYPES]:
+            raise _Refused(f"the robot has no variable {', '.join(unknown)}; names are those of record.py")
+        sizes = {name: int(_TYPES[kind][:-1] or 1) for name, kind in known.items()}
+        columns = [
+            column
+            for name, size in sizes.items()
+            for column in ([name] if size == 1 else [f"{name}_{place}" for place in range(size)])
+        ]
+        recipe = _Recipe(found[0], struct.Struct(">" + "".join(_TYPES[kind] for kind in kinds)), columns)
+        empty = SimpleNamespace(**dict.fromkeys(columns, 0.0))
+        if lacking := [path for one in self._readers for path in one.lacks(empty)]:
+            raise _Refused(f"the robot has no column {', '.join(lacking)}; it has {', '.join(columns)}")
+        if ask(_BEGIN, b"") != b"\x01":
+            raise _Refused(f"the robot does not begin to send {self._rate:g} times a second")
+        return recipe
+
+
+def _variable(column: str) -> str:
+    """The variable that a column is of: ``target_q_0`` is an element of ``target_q``; registers are numbered alike."""
+    name, _, place = column.rpartition("_")
+    return name if len(place) == 1 and place.isdigit() and not name.endswith("_register") else column
+
+
+def _packages(connection: socket.socket) -> Iterator[tuple[int, bytes]]:
+    """Type and body of each package, until the connection ends."""
+    with connection.makefile("rb") as stream:
+        while len(head := stream.read(_HEAD.size)) == _HEAD.size:
+            size, kind = _HEAD.unpack(head)
+            body = stream.read(max(size - _HEAD.size, 0))
+            if len(body) < size - _HEAD.size:
+                return
+            yield kind, body
