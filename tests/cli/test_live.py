@@ -71,7 +71,7 @@ def test_the_status_goes_on_while_nothing_comes(monkeypatch: pytest.MonkeyPatch)
             shown.append(group)
 
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    feeder = _Feeder(both.stream, (), 1.0, None, None, Screen(), moved=0.0, drawn=0.0)
+    feeder = _Feeder(both.stream, (), 1.0, None, (), Screen(), moved=0.0, drawn=0.0)
     feeder.take([line(100.0, radial=570.0).strip(), line(100.0, "tracker", radial=570.0).strip()])
     now[0] = 5.0
     feeder.take([])
