@@ -71,7 +71,10 @@ class Ros2Source:
             ConfigError: There is no ROS 2, it refuses the arguments, or a source of ``run.toml`` has no topic, or none
                 that a node could read.
         """
-        entries, commanded = {"": listed.command, **listed.sensors}, dict[str, float]()
+        entries, commanded = (
+            {**listed.sensors, "": listed.command},
+            dict[str, float](),
+        )  # commands of an instant last
         for name, entry in entries.items():
             if not entry.topic:
                 who = f"sensor '{name}' has" if name else "the commands have"
@@ -79,7 +82,7 @@ class Ros2Source:
         readers = [Reader(name, entry, commanded) for name, entry in entries.items()]
         names = dict.fromkeys(one.entry.topic for one in readers)
         self._topics = [Topic(name, [one for one in readers if one.entry.topic == name]) for name in names]
-        self._command = readers[0]
+        self._command = readers[-1]
         self._notify, self._log = notify, RateLimitedLog(notify)
         self._backlog = Backlog[Event]("messages", self._log, lambda event: not event.sensor, lambda _: _BYTES)
         self._burst = list[tuple[int, Event]]()  # by when each was received [ns]
@@ -162,7 +165,7 @@ class Ros2Source:
                 self._burst += [(received, event) for event in reader.events(message, received)]
             except DAMAGE as error:
                 self._log.write(f"{topic.name} bad", f"{topic.name}: a message is left out: {reason(error)}")
-        if not self.frame and not topic.readers[0].name:
+        if not self.frame and not topic.readers[-1].name:
             self.frame = getattr(getattr(message, "header", None), "frame_id", "")
 
     def _resolved(self, topic: Topic) -> str:
@@ -208,9 +211,13 @@ class Ros2Source:
                 continue
             qos = load("rclpy.qos")
             depth = qos.QoSProfile(depth=_DEPTH, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
-            events = load("rclpy.event_handler").SubscriptionEventCallbacks(message_lost=partial(self._lost, topic))
-            take = partial(self._take, topic)
-            topic.subscription = self.node.create_subscription(message, topic.name, take, depth, event_callbacks=events)
+            handler, take = load("rclpy.event_handler"), partial(self._take, topic)
+            lost = handler.SubscriptionEventCallbacks(message_lost=partial(self._lost, topic))
+            subscribe = partial(self.node.create_subscription, message, topic.name, take, depth)
+            try:
+                topic.subscription = subscribe(event_callbacks=lost)
+            except handler.UnsupportedEventTypeError:  # not every middleware tells
+                topic.subscription = subscribe()
             return
 
     def _lost(self, topic: Topic, status: Any) -> None:

@@ -78,7 +78,10 @@ class RtdeSource(Client[Event]):
             ConfigError: A column has no unit, or there are no stamps that a stream could have.
         """
         super().__init__(address, notify)
-        commanded, entries = dict[str, float](), {"": listed.command, **listed.sensors}
+        commanded, entries = (
+            dict[str, float](),
+            {**listed.sensors, "": listed.command},
+        )  # commands of an instant last
         self._readers = [Reader(name, entry, commanded) for name, entry in entries.items()]
         asked = [column for reader in self._readers for column in reader.entry.fields if column != LOG_TIME]
         self._variables = dict.fromkeys(map(_variable, asked))
