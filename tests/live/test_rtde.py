@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import pumafuse as pf
 from listening import Live
@@ -222,6 +224,38 @@ x = { column = "output_int_register_0", unit = "mm" }
     found.stop()
     assert [round(1e3 * event.values["x"]) for event in came[:10]] == list(range(10))
     assert all(abs(event.t - begin) < 10e9 for event in came)
+
+
+def test_stamps_without_a_unit_are_said(robot: Callable[..., Robot]) -> None:
+    """A column of numbers is no time before somebody says of which unit."""
+    notices = list[str]()
+    found = source(robot(), RUN.replace(', unit = "s"', ""), notices)
+    found.start()
+    assert events(found, lambda _: any("column 'timestamp' has no unit" in notice for notice in notices)) == []
+    found.stop()
+
+
+BODIES = st.sampled_from([b"", b"\x01", b"\x01DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D", bytes(160)]) | st.binary(max_size=60)
+
+
+@given(st.lists(st.tuples(st.sampled_from(list(b"VOSUMx")), BODIES), max_size=6), st.binary(max_size=5))
+@settings(max_examples=200, deadline=None)
+def test_whatever_a_server_sends_ends_in_a_sentence(packages: list[tuple[int, bytes]], rest: bytes) -> None:
+    """One that speaks another protocol, or a broken one: no exception in the thread."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        notices = list[str]()
+        listed = manifest.of_tables(manifest.toml.parsed(RUN, "run.toml"))
+        found = RtdeSource(
+            Address.parse(f"rtde:a?host=127.0.0.1:{server.getsockname()[1]}"), listed, 125.0, notices.append
+        )
+        ours = socket.create_connection(server.getsockname())
+        theirs, _ = server.accept()
+        answers = [(ord("V"), b"\x01"), *packages]
+        with contextlib.suppress(OSError):
+            theirs.sendall(b"".join(struct.pack(">HB", 3 + len(body), kind) + body for kind, body in answers) + rest)
+            theirs.close()
+        found._read(ours)
+        assert all(event.sensor in ("", "encoder") for event in found.stop())
 
 
 @pytest.mark.parametrize(

@@ -180,7 +180,11 @@ class Reader:
         self._next: SimpleNamespace | None = None  # of the path; then come the others
 
     def lacks(self, empty: Any) -> list[str]:
-        """The fields that a type of messages has not, of which this is an empty one."""
+        """The fields that a type of messages has not, of which this is an empty one.
+
+        Raises:
+            ConfigError: Its stamps are numbers, of which nobody says the unit.
+        """
         parts = _rows(empty, self._asks_whole)
         self.reads_transforms = parts is not None
         if self._is_of_paths:
@@ -195,6 +199,8 @@ class Reader:
                 lacking.append(path)
             except _LACKS:
                 pass
+        if not lacking and parts is None:
+            self._stamp(empty, 0)
         return lacking
 
     def events(self, message: Any, received: int) -> Iterator[Event]:

@@ -206,6 +206,9 @@ class Ros2Source:
             except (ImportError, AttributeError):
                 self._log.write(f"{name} {kind}", f"{name}: no package here has its type {kind}: source one that does")
                 continue
+            except ConfigError as error:
+                self._log.write(f"{name} {kind}", str(error))
+                continue
             if lacking:
                 self._log.write(f"{name} {kind}", f"{name}: is of type {kind}, which has no {', '.join(lacking)}")
                 continue

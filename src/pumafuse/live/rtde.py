@@ -104,7 +104,7 @@ class RtdeSource(Client[Event]):
                         events = [event for one in self._readers for event in one.events(row, received)]
                         some = True
                         self._pieces.put(events)
-            except (_Refused, struct.error) as error:
+            except (_Refused, ConfigError, struct.error) as error:
                 self._log.write("refused", f"{self._name}: {error}")
         return some
 
@@ -125,8 +125,7 @@ class RtdeSource(Client[Event]):
         if ask(_VERSION, struct.pack(">H", _PROTOCOL)) != b"\x01":
             raise _Refused(f"the robot does not know version {_PROTOCOL} of RTDE (software 3.3 or newer does)")
         found = ask(_OUTPUTS, struct.pack(">d", self._rate) + ",".join(self._variables).encode())
-        kinds = found[1:].decode("ascii", "replace").split(",")
-        known = dict(zip(self._variables, kinds, strict=False))
+        known = dict(zip(self._variables, found[1:].decode("ascii", "replace").split(","), strict=False))
         if unknown := [name for name in self._variables if known.get(name) not in _TYPES]:
             raise _Refused(f"the robot has no variable {', '.join(unknown)}; names are those of record.py")
         sizes = {name: int(_TYPES[kind][:-1] or 1) for name, kind in known.items()}
@@ -135,7 +134,7 @@ class RtdeSource(Client[Event]):
             for name, size in sizes.items()
             for column in ([name] if size == 1 else [f"{name}_{place}" for place in range(size)])
         ]
-        recipe = _Recipe(found[0], struct.Struct(">" + "".join(_TYPES[kind] for kind in kinds)), columns)
+        recipe = _Recipe(found[0], struct.Struct(">" + "".join(_TYPES[kind] for kind in known.values())), columns)
         empty = SimpleNamespace(**dict.fromkeys(columns, 0.0))
         if lacking := [path for one in self._readers for path in one.lacks(empty)]:
             raise _Refused(f"the robot has no column {', '.join(lacking)}; it has {', '.join(columns)}")

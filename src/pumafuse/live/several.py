@@ -42,6 +42,7 @@ class Several:
         self._sources = sources
         self._pieces = queue.Queue[Items](_MOST)
         self._ended = threading.Event()
+        self._error: Exception | None = None
 
     def start(self) -> None:
         """Begin to listen.
@@ -56,7 +57,13 @@ class Several:
             thread.start()
 
     def get(self) -> Items:
-        """Some of one source; none after a tenth of a second without any."""
+        """Some of one source; none after a tenth of a second without any.
+
+        Raises:
+            Exception: What a source has raised.
+        """
+        if self._error is not None:
+            raise self._error
         try:
             return self._pieces.get(timeout=QUIET)
         except queue.Empty:
@@ -76,6 +83,9 @@ class Several:
         return "; ".join(filter(None, (source.summary() for source in self._sources)))
 
     def _ask(self, source: Remote) -> None:
-        while not self._ended.is_set():
-            if items := source.get():
-                self._pieces.put(items)
+        try:
+            while not self._ended.is_set():
+                if items := source.get():
+                    self._pieces.put(items)
+        except Exception as error:  # it is the thread that takes what comes that is to end by it
+            self._error = error
