@@ -129,6 +129,17 @@ def test_a_log_of_several_tables_is_found_and_read_again(write: Callable[[Path],
         assert np.allclose(read.command.values[axis], told, atol=1e-6)
 
 
+def test_a_damaged_log_of_px4_is_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What its reader prints is a warning, and does not get among what a command prints."""
+    file = ulg(tmp_path)
+    content = bytearray(file.read_bytes())
+    content[-21:] = struct.pack("<HBHQff", 18, ord("D"), 77, 0, 0.0, 0.0)  # the last row, of no topic
+    file.write_bytes(content)
+    with pytest.warns(pf.PumafuseWarning, match=r"log\.ulg: damaged, and read as far as it goes; pyulog says: "):
+        assert len(formats.names(file)) == 2
+    assert capsys.readouterr().out == ""
+
+
 @pytest.mark.parametrize("ending", ["npy", "npz", "mat", "json", "lines", "split", "xlsx"])
 def test_a_single_table_needs_no_name(ending: str, tmp_path: Path) -> None:
     """A structured array, arrays, a struct, records, lines of them, pandas' split, a sheet: a run in one table."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from ..errors import RunError, one_line, unknown_part
+from ..errors import RunError, one_line, unknown_part, warn
 
 Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 
@@ -70,12 +71,16 @@ def _sheets(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     return found
 
 
-def _topics(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
-    """The topics of a log of PX4, whose stamps are in us."""
+def _topics(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
+    """The topics of a log of PX4, whose stamps are in us; what its reader prints of a damaged one is a warning."""
     from pyulog import ULog  # pyright: ignore[reportMissingTypeStubs]
 
     found = dict[str, pa.Table | bytes]()
-    for topic in cast(Any, ULog)(file).data_list:
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        topics = cast(Any, ULog)(file).data_list
+    if lines := said.getvalue().splitlines():
+        warn([f"{path.name}: damaged, and read as far as it goes; pyulog says: {lines[0]}"])
+    for topic in topics:
         data: Mapping[str, npt.NDArray[Any]] = topic.data
         columns = {f"{name}_us" if name.startswith("timestamp") else name: column for name, column in data.items()}
         found[f"{topic.name}_{topic.multi_id}" if topic.multi_id else topic.name] = pa.table(columns)
