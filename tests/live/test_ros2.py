@@ -134,7 +134,10 @@ def test_poses_are_those_of_the_bag_fused_as_live(tmp_path: Path, start: Callabl
         assert poses[0]["covariance"][35] > 1e3
     status = [one for one in published if one["topic"] == "diagnostics"][-1]["status"]
     assert set(status) == {"pumafuse: estimates", "pumafuse: camera", "pumafuse: encoder"}
+    assert "far larger than expected" in status["pumafuse: camera"][1]  # its arm is not the one that moved
     assert status["pumafuse: camera"][2]["rejected"].isdigit()
+    first = next(one for one in published if one["topic"] == "diagnostics")["status"]
+    assert first["pumafuse: estimates"][:2] == [3, "no command yet"]  # STALE
 
 
 def test_remapping_names_and_parameters(tmp_path: Path, start: Callable[..., Node]) -> None:

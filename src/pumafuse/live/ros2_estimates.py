@@ -35,12 +35,8 @@ class Ros2Estimates:
             ConfigError: Packages of ROS 2 are missing.
         """
         self._source, self._live, node = source, live, source.node
-        self._diagnostic, poses, joints = (
-            load("diagnostic_msgs.msg"),
-            load("geometry_msgs.msg"),
-            load("sensor_msgs.msg"),
-        )
-        axes = live.axes
+        poses, joints = load("geometry_msgs.msg"), load("sensor_msgs.msg")
+        self._diagnostic, axes = load("diagnostic_msgs.msg"), live.axes
         in_space = CARTESIAN if live.config.frame is None else CANONICAL_AXES
         self._joints = [axis for axis in axes if axis not in (*in_space, *TURNING)]
         self._pose: Any = None
@@ -110,8 +106,10 @@ class Ros2Estimates:
         """The status of the estimates, and of each sensor."""
         kind, estimate = self._diagnostic.DiagnosticStatus, self._live.estimate()
         stale, doubtful = ", ".join(estimate.stale), ", ".join(estimate.doubtful)
-        level = kind.WARN if doubtful or health.faults else kind.STALE if stale else kind.OK
-        words = [f"doubtful: {doubtful}"] if doubtful else []
+        fused = estimate.outcome is Outcome.FUSED
+        level = kind.WARN if doubtful or health.faults else kind.STALE if stale or not fused else kind.OK
+        words = [] if fused else [estimate.reason]
+        words += [f"doubtful: {doubtful}"] if doubtful else []
         words += [f"stale: {stale}"] if stale else []
         whole = self._status(
             "estimates",
@@ -128,7 +126,7 @@ class Ros2Estimates:
 
     def _of_sensor(self, name: str, sensor: SensorHealth, health: Health) -> Any:
         kind = self._diagnostic.DiagnosticStatus
-        faults = [fault for fault in health.faults if fault.startswith((f"{name}:", f"{name} "))]
+        faults = [fault for fault in health.faults if f"'{name}'" in fault]
         level = kind.STALE if sensor.stale else kind.WARN if faults else kind.OK
         silent = "no row yet" if sensor.silent is None else f"silent for {sensor.silent:.1f} s"
         values = {
