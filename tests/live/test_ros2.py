@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import runpy
 import signal
@@ -13,6 +14,7 @@ import time
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import accumulate
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -323,3 +325,39 @@ def test_the_launch_file_starts_the_node(
     assert words[:4] == ["pumafuse", "live", f"ros2:{tmp_path / 'run.toml'}", "-c"]
     node = start(tmp_path, *words[5:])
     assert "estimates" in node.end()
+
+
+def moved(begin: int, seconds: float, phase: float) -> tuple[list[bag_files.Sent], np.ndarray]:
+    """A lever, 30 ms and a lag of 50 ms late, that is told each 10 ms and seen at 50 Hz; where it is each 10 ms [rad]."""
+    time_ = 0.01 * np.arange(round(100 * seconds))
+    told = 0.5 * np.sin(1.3 * time_ + phase) * np.sin(0.4 * time_) ** 2 + 0.2 * np.sin(3.1 * time_) ** 2
+    share, late = math.exp(-0.01 / 0.05), np.concatenate([np.zeros(3), told[:-3]])
+    where = np.array(list(accumulate(late, lambda at, to: share * at + (1.0 - share) * to)))
+    seen = where + np.random.default_rng(7).normal(scale=np.radians(0.2), size=len(where))
+    sent = list[bag_files.Sent]()
+    for k in range(len(time_)):
+        at = begin + 10_000_000 * k
+        state = {"header": bag_files.header(at), "name": ["elbow"]}
+        sent.append(("/arm/command", "sensor_msgs/msg/JointState", at, {**state, "position": [float(told[k])]}))
+        if k % 2:
+            one = {**state, "header": bag_files.header(at - 100), "position": [float(seen[k])]}
+            sent.append(("/joint_states", "sensor_msgs/msg/JointState", at + 4_000_000, one))
+    return sent, where
+
+
+@pytest.mark.long
+def test_from_a_bag_to_the_node_nothing_is_edited(tmp_path: Path, start: Callable[..., Node]) -> None:
+    """`fuse BAG` prints the line that runs the node; its estimates are twice as good as the sensor."""
+    (tmp_path / "drive").mkdir()
+    bag_files.messages(tmp_path / "drive" / "drive_0.mcap", moved(1_790_000_000 * 10**9, 40.0, 0.0)[0])
+    command = [str(EXECUTABLE), "fuse", str(tmp_path / "drive"), "-o", str(tmp_path / "mine")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    line = next(one for one in done.stdout.splitlines() if one.startswith("or as a node of ROS 2: "))
+    assert line.split()[-4:] == ["live", f"ros2:{tmp_path}/mine/run.toml", "-c", f"{tmp_path}/mine/fusion.toml"]
+    node, begin = start(tmp_path / "mine"), time.time_ns() + STARTS + BEFORE_NS
+    sent, where = moved(begin, 8.0, 1.0)
+    joints = [one for one in publish(tmp_path, sent) if one["topic"] == "joints"]
+    log = node.end()
+    assert "800 fused; 800 estimates" in log
+    wrong = np.degrees([one["position"][0] for one in joints] - where)[100:]
+    assert np.sqrt(np.mean(wrong**2)) < 0.1

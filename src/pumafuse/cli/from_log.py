@@ -28,6 +28,7 @@ from .register import taken
 from .tune import end, fitting, show_lags
 
 _STRAYS = 1.5  # times its sd, by which a sensor errs from what is predicted where the arm strays, too
+_BAGS = (".mcap", ".db3")  # which ROS 2 records
 _FITTED: Sequence[Fit] = ("noise", "delay", "plant", "gain")
 
 
@@ -76,7 +77,10 @@ def run(
         typer.echo(line)
     for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
         typer.echo(taken(name, 0.0))
-    typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {shlex.quote(str(output))}/fusion.toml -o DIR")
+    folder = shlex.quote(str(output))
+    typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {folder}/fusion.toml -o DIR")
+    if any(one.suffix in _BAGS for one in (log.iterdir() if log.is_dir() else [log])):
+        typer.echo(f"or as a node of ROS 2: pumafuse live ros2:{folder}/run.toml -c {folder}/fusion.toml")
     end(fitted.details)
 
 
