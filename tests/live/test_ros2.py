@@ -328,7 +328,7 @@ def test_the_launch_file_starts_the_node(
 
 
 def moved(begin: int, seconds: float, phase: float) -> tuple[list[bag_files.Sent], np.ndarray]:
-    """A lever, 30 ms and a lag of 50 ms late, that is told each 10 ms and seen at 50 Hz; where it is each 10 ms [rad]."""
+    """A lever, 30 ms and a lag of 50 ms late, that is told each 10 ms and seen at 50 Hz; where it is then [rad]."""
     time_ = 0.01 * np.arange(round(100 * seconds))
     told = 0.5 * np.sin(1.3 * time_ + phase) * np.sin(0.4 * time_) ** 2 + 0.2 * np.sin(3.1 * time_) ** 2
     share, late = math.exp(-0.01 / 0.05), np.concatenate([np.zeros(3), told[:-3]])
