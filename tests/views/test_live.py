@@ -7,7 +7,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -122,6 +124,30 @@ def test_the_estimators_process_does_not_load_rerun() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_faults_are_logged_as_they_begin_and_end(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
+    """Each once with its time: a warning, and that it is over."""
+    driven, path = Driven("connect"), recorder[1]
+    until(lambda: driven.noticed("drawing into the viewer"))
+    driven.go(30)
+    health = driven.live.health()
+    for faults in ((), ("sensor 'range': twice",), ("sensor 'range': twice", "commands: two senders"), ()):
+        read = driven.view._health_read
+        until(
+            lambda faults=faults, read=read: (
+                driven.view.tick(lambda: replace(health, faults=faults)) or driven.view._health_read > read
+            )
+        )
+    logged = lambda: [  # noqa: E731
+        text for chunk in columns(path, "/log") for text in chunk["TextLog:text"].flatten().to_pylist()
+    ]
+    until(lambda: driven.tick() or len(logged()) == 4)
+    said = ["sensor 'range': twice", "commands: two senders"]
+    assert logged() == [*said, *(f"no longer: {one}" for one in said)]
+    levels = [level for chunk in columns(path, "/log") for level in chunk["TextLog:level"].flatten().to_pylist()]
+    assert levels == ["WARN", "WARN", "INFO", "INFO"]
+    driven.view.close()
+
+
 def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
     """In mm, at seconds since the first event: commands, estimates, measurements at their valid times, one rejected."""
     driven, path = Driven("connect"), recorder[1]
@@ -150,10 +176,14 @@ def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Pa
 
 
 def newest(path: Path, entity: str, component: str, *, static: bool = False) -> np.ndarray:
-    """The last value of a component that has arrived, (n, …)."""
-    return np.array(
-        [one[component].to_pylist()[-1] for one in columns(path, entity, static=static) if component in one][-1]
+    """The last value of a component, (n, …), once there is one: what has arrived may not be in the file yet."""
+    found = list[Any]()
+    until(
+        lambda: (
+            found.extend(one[component] for one in columns(path, entity, static=static) if component in one) or found
+        )
     )
+    return np.array(found[-1].to_pylist()[-1])
 
 
 def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(

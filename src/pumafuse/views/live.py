@@ -7,10 +7,10 @@ a frame that does not fit into the pipe is left out.
 Entities: ``<axis>/command``, ``/estimate`` with its variance, ``/<sensor>`` and ``/<sensor>/rejected``;
 ``residual/<axis>/<sensor>``, the measurement minus the estimate, about ``residual/<axis>/estimate``, 0 with the
 estimate's variance; ``path/command``, ``path/estimate``, ``path/tool`` in 3D, and with a frame ``path/<sensor>``;
-``nis/<sensor>``, ``rate/<sensor>``. Of a tool that turns ``path`` has the entities of a recorded result
-(:mod:`pumafuse.views.scene`). All against seconds since the first event, positions in mm or degrees. With a frame,
-commands and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its mean distance from the
-estimate.
+``nis/<sensor>``, ``rate/<sensor>``; ``log``, the faults that begin and end. Of a tool that turns ``path`` has the
+entities of a recorded result (:mod:`pumafuse.views.scene`). All against seconds since the first event, positions in mm
+or degrees. With a frame, commands and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its
+mean distance from the estimate.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 # Everything since the frame before, as rows that begin with their time [s]; the first word of a name says what follows:
 # ``command/<axis>`` u [m]; ``measurement/<axis>/<sensor>`` z [m] and whether it was rejected (0 or 1);
 # ``estimate/<axis>`` position and sd [m]; ``path/command``, ``path/estimate`` and ``path/<sensor>`` a position in space
-# [m]; ``nis/<sensor>``; ``rate/<sensor>`` [Hz].
-Frame: TypeAlias = dict[str, list[tuple[float, ...]]]
+# [m]; ``nis/<sensor>``; ``rate/<sensor>`` [Hz]; ``log`` a level and a sentence.
+Frame: TypeAlias = dict[str, list[tuple[float | str, ...]]]
 
 
 class SensorHead(msgspec.Struct):
@@ -136,7 +136,7 @@ class LiveView:
         }
         self._origin: float | None = None
         self._newest = 0.0
-        self._segments = 1
+        self._segments, self._faults = 1, tuple[str, ...]()
         self._events: dict[str, list[Any]] = {name: [] for name in ("", *config.sensors)}
         self._estimates: list[Any] = []
         self._sent = self._health_read = 0.0
@@ -228,6 +228,10 @@ class LiveView:
         if health.segments != self._segments and health.newest is not None and self._origin is not None:
             self._segments = health.segments
             self._origin = health.newest / 1e9 - self._newest
+        before, self._faults = self._faults, health.faults
+        begun = [(self._newest, "WARN", fault) for fault in health.faults if fault not in before]
+        over = [(self._newest, "INFO", f"no longer: {fault}") for fault in before if fault not in health.faults]
+        frame["log"] = [*over, *begun]
         for name, sensor in health.sensors.items():
             frame[f"rate/{name}"] = [(self._newest, sensor.rate)]
             if sensor.nis is not None:

@@ -42,6 +42,7 @@ _LONGEST_GAP = 0.25  # s between estimates; in a longer one the arm may have gon
 _PATH_POINTS = 300
 _AVERAGED = 1000  # measurements that a bias is averaged over
 _AXES = 0.1  # m: a tenth of the way from the eye to the tool, whose axes are so long
+_LOG = "log"  # of faults
 _LARGER = 10.0  # times: an ellipsoid of some tenths of a millimetre is seen then, one of a centimetre fits in
 
 
@@ -98,6 +99,9 @@ class Picture:
         for name, colour in self._of_sensors.items():
             for path in (f"nis/{name}", f"rate/{name}"):
                 self._plot(path, styles.line(colour, name), *_columns(frame, path, 2))
+        for moment, level, text in frame.get("log", ()):
+            self._stream.set_time(styles.TIMELINE, duration=float(moment))
+            self._stream.log(_LOG, rr.TextLog(str(text), level=str(level)))
         for name, colour in self._colours.items():
             self._draw_path(name, colour, _columns(frame, f"path/{name}", 4))
         if self._tool is not None:
@@ -294,11 +298,12 @@ def _blueprint(header: Header, first: FloatArray | None = None) -> rrb.Blueprint
     if header.tool is not None:
         layout = _of_turning(header, first, positions, residuals, health)
     else:
-        right: rrb.Container = rrb.Tabs(*health)
+        parts, shares = [rrb.Tabs(*health), _faults()], [2, 1]
         if header.space:
             name = f"path of the last {_SHOWN:.0f} s [mm]"
             path = rrb.Spatial3DView(origin="/path", name=name, line_grid=False, eye_controls=_eye(first))
-            right = rrb.Vertical(path, right, row_shares=[3, 2])
+            parts, shares = [path, *parts], [3, *shares]
+        right = rrb.Vertical(*parts, row_shares=shares)
         left, middle = rrb.Vertical(*positions.values()), rrb.Vertical(*residuals.values())
         layout = rrb.Horizontal(left, middle, right, column_shares=[4, 3, 3])
     return rrb.Blueprint(
@@ -323,7 +328,13 @@ def _of_turning(
     plots = {"positions": positions, "residuals": residuals}
     tabs = [scene.by_kind(of_axis, header.axes, name) for name, of_axis in plots.items()]
     left = rrb.Vertical(*views, row_shares=[5, 3][: len(views)])
-    return rrb.Horizontal(left, rrb.Tabs(*tabs, rrb.Vertical(*health, name="sensors")), column_shares=[1, 1])
+    plotted = rrb.Tabs(*tabs, rrb.Vertical(*health, name="sensors"))
+    return rrb.Horizontal(left, rrb.Vertical(plotted, _faults(), row_shares=[5, 1]), column_shares=[1, 1])
+
+
+def _faults() -> rrb.TextLogView:
+    """What is wrong, as it begins and ends."""
+    return rrb.TextLogView(origin=f"/{_LOG}", name="faults")
 
 
 def _eye(first: FloatArray | None) -> rrb.EyeControls3D | None:
