@@ -288,6 +288,9 @@ def test_who_contradicts_whom_is_said_with_axes_and_sizes() -> None:
     (said,) = [text for text in notices if "contradicts" in text]
     assert said.startswith("sensor 'camera' contradicts 'tracker' since 1.")
     assert said.endswith("s (radial by +50 mm): its measurements are rejected")
+    assert live.health().faults == ("sensor 'camera' contradicts 'tracker': its measurements are rejected",)
+    live.measurement(t + PERIOD / 2, "camera", radial=0.57)
+    assert live.health().faults == ()
 
 
 @pytest.mark.parametrize(("lost", "said"), [(0, False), (10, True), (50, False)])

@@ -37,6 +37,7 @@ _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _ABSENT = bytes((ABSENT,))
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
+_REJECTED = "its measurements are rejected"
 _STRAY, _HELD = Outcome.STRAY, Outcome.HELD
 
 
@@ -275,7 +276,9 @@ class LiveEstimator:
             for name, sensor in self._sensors.items()
         }
         commands = by_word(counts.outcomes[COMMAND] + self._refused[COMMAND])
-        return Health(newest, self.segment + 1, commands, sensors, self._strangers, self._diagnosis.shown)
+        rejected = (f"sensor '{one}' contradicts '{other}': {_REJECTED}" for one, other in self._contradicting.items())
+        faults = (*self._diagnosis.shown, *rejected)
+        return Health(newest, self.segment + 1, commands, sensors, self._strangers, faults)
 
     def _begin(self, counts: Counts) -> None:
         """An empty window; ``counts`` go on."""
@@ -697,7 +700,7 @@ class LiveEstimator:
         )
         self._log.write(
             f"{sensor} contradicts {other}",
-            f"sensor '{sensor}' contradicts '{other}' since {stamp / 1e9:.3f} s ({off}): its measurements are rejected",
+            f"sensor '{sensor}' contradicts '{other}' since {stamp / 1e9:.3f} s ({off}): {_REJECTED}",
         )
 
     def _no_axis(self, stranger: str) -> str:
