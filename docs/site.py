@@ -23,7 +23,7 @@ from pumafuse.cli.main import app
 
 ROOT = Path(__file__).parent.parent
 PAGES = {f"{name}.md": f"{name.lower()}.md" for name in ("CONTRIBUTING", "SECURITY", "CHANGELOG")}
-PAGES["README.md"] = "index.md"
+PAGES |= {"README.md": "index.md", "examples/ros2/README.md": "ros2.md"}
 FIRST_NOTEBOOK = "notebooks/1-step-trials-to-arm-model.ipynb"
 _LINK = re.compile(r"(?<=\]\()([^)#:\s]+)(?=[)#])")  # of Markdown, to a file
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
@@ -35,7 +35,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for source, place in PAGES.items():
         files.append(File.generated(config, place, abs_src_path=str(ROOT / source)))
     for pattern in ("notebooks/*.ipynb", "examples/**/*.*", "scenarios/*"):
-        for path in sorted(ROOT.glob(pattern)):
+        for path in sorted(path for path in ROOT.glob(pattern) if path.suffix != ".md"):
             files.append(File(str(path.relative_to(ROOT)), str(ROOT), config.site_dir, config.use_directory_urls))
     for file in files:
         if file.src_uri.endswith(".py") and not file.src_uri.startswith("examples/"):

@@ -255,7 +255,7 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
         "def whole():\n    with folders.replacing(out / 'a') as new:\n        (new / 'x').write_text('')\n"
         "def die():\n    while not (out / 'a').exists():\n        time.sleep(0.01)\n"
         "    with folders.replacing(out / 'b'):\n        os.kill(os.getpid(), signal.SIGKILL)\n"
-        "def app():\n    from joblib.externals.loky.backend import resource_tracker\n"
+        "def app(*_, **__):\n    from joblib.externals.loky.backend import resource_tracker\n"
         "    resource_tracker.register('/loky-left', 'semlock')\n"
         "    many.run_jobs('x', {'a': whole, 'b': die}, [out / 'a', out / 'b'])\n"
         "if __name__ == '__main__':\n    main.app = app\n    main.main()\n"
