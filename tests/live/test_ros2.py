@@ -185,14 +185,16 @@ def test_what_is_said_of_wrong_types_and_two_publishers(tmp_path: Path, start: C
     [
         (["ros2:{}/run.toml", "--ros-args", "-r", "wrong"], 1, "--ros-args: "),
         (["ros2:{}/nowhere.toml"], 1, "nowhere.toml"),
+        (["ros2:{}/run.toml", "ros2:{}/run.toml"], 1, "one node is enough"),
+        (["stdin", "ros2:{}/run.toml"], 1, "stdin: is a source alone"),
         (["stdin", "--ros-args", "-r", "a:=b"], 2, "goes with a source ros2:run.toml"),
     ],
 )
 def test_wrong_arguments(tmp_path: Path, options: list[str], code: int, words: str) -> None:
     """One line each."""
     cell(tmp_path)
-    source, *rest = [one.format(tmp_path) for one in options]
-    command = [str(EXECUTABLE), "live", source, "-c", str(tmp_path / "fusion.toml"), *rest]
+    given = [one.format(tmp_path) for one in options]
+    command = [str(EXECUTABLE), "live", "-c", str(tmp_path / "fusion.toml"), *given]
     done = subprocess.run(
         command, capture_output=True, text=True, check=False, timeout=LONGEST, stdin=subprocess.DEVNULL
     )

@@ -86,6 +86,8 @@ def run(
         raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {given[0]}")
     if len(sources) > 1 and (lonely := {"stdin", "replay"} & set(kinds)):
         raise ConfigError(f"{lonely.pop()}: is a source alone; several may be of the network")
+    if kinds.count("ros2") > 1:
+        raise ConfigError("ros2: one node is enough; one run.toml may name all topics")
     recorded = Run.read(alone.path) if alone.kind == "replay" else None
     if recorded is not None:
         start = dict(recorded.start)

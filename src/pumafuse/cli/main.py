@@ -384,7 +384,7 @@ def live(
     if bool(listen) != bool(allow) or listen == "":
         raise BadParameter("--listen ADDR and --allow CIDR go together", param_hint="--listen")
     _check_positive(rate=rate, window=window, stale_after=stale_after)
-    ros: list[str] = context.obj
+    ros: list[str] = context.obj or []
     if ros and not any(source.startswith("ros2:") for source in sources):
         raise BadParameter("goes with a source ros2:run.toml", param_hint=ROS_ARGS)
     command.run(sources, config, rate, window, stale_after, out, record, rerun, status, listen, allow or [], ros)
