@@ -334,7 +334,8 @@ def _of_turning(
 
 def _faults() -> rrb.TextLogView:
     """What is wrong, as it begins and ends."""
-    return rrb.TextLogView(origin=f"/{_LOG}", name="faults")
+    columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    return rrb.TextLogView(origin=f"/{_LOG}", name="faults", columns=columns)
 
 
 def _eye(first: FloatArray | None) -> rrb.EyeControls3D | None:
