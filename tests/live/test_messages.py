@@ -226,6 +226,23 @@ def test_what_no_stream_has_is_refused(change: str, words: str, tmp_path: Path) 
         Reader("", manifest.load(path).command, {})
 
 
+@pytest.mark.parametrize(
+    ("time", "message", "ns"),
+    [
+        ({"column": "log_time", "shift_s": 0.25}, {}, 1_250_000_000),
+        ({"column": "t_ms", "shift_s": -0.5}, {"t_ms": 2500}, 2_000_000_000),
+        ({"column": "t_s", "shift_s": 1.0}, {"t_s": 0.1234567891}, 1_123_456_789),
+        ({"column": "s", "nanoseconds": "n", "shift_s": 1.0}, {"s": 3, "n": 5}, 4_000_000_005),
+    ],
+)
+def test_stamps_in_ns_with_a_shift(time: dict[str, Any], message: dict[str, Any], ns: int) -> None:
+    """Whole numbers and decimals in their unit, two numbers, and when a message was received, here 1 s."""
+    entry = {"file": "f", "topic": "/t", "time": time, "x": {"column": "x", "unit": "m"}}
+    reader = Reader("", manifest.of_tables({"command": entry}).command, {})
+    (event,) = reader.events(SimpleNamespace(x=0.1, **message), 1_000_000_000)
+    assert event.t == ns
+
+
 def test_fields_that_a_type_has_not_are_named() -> None:
     """All of them; elements of lists may come later."""
     entry = {"file": "f", "topic": "/t", "time": "header.stamp", "x": {"column": "point.w", "unit": "m"}}

@@ -185,6 +185,7 @@ def test_what_is_said_of_wrong_types_and_two_publishers(tmp_path: Path, start: C
     [
         (["ros2:{}/run.toml", "--ros-args", "-r", "wrong"], 1, "--ros-args: "),
         (["ros2:{}/nowhere.toml"], 1, "nowhere.toml"),
+        (["ros2:{}"], 1, "topic 'no topic' is no name of ROS 2"),
         (["ros2:{}/run.toml", "ros2:{}/run.toml"], 1, "one node is enough"),
         (["stdin", "ros2:{}/run.toml"], 1, "stdin: is a source alone"),
         (["stdin", "--ros-args", "-r", "a:=b"], 2, "goes with a source ros2:run.toml"),
@@ -192,7 +193,7 @@ def test_what_is_said_of_wrong_types_and_two_publishers(tmp_path: Path, start: C
 )
 def test_wrong_arguments(tmp_path: Path, options: list[str], code: int, words: str) -> None:
     """One line each."""
-    cell(tmp_path)
+    cell(tmp_path, STAMPED.replace("/joints", "no topic") if options == ["ros2:{}"] else STAMPED)
     given = [one.format(tmp_path) for one in options]
     command = [str(EXECUTABLE), "live", "-c", str(tmp_path / "fusion.toml"), *given]
     done = subprocess.run(

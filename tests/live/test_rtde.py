@@ -216,6 +216,7 @@ def test_registers_are_no_vectors_and_stamps_may_be_those_of_receipt(robot: Call
 file = "robot.csv"
 time = "log_time"
 x = { column = "output_int_register_0", unit = "mm" }
+elbow = { column = "target_q_2", unit = "rad" }
 """
     found = source(robot(), run, [])
     found.start()
@@ -223,6 +224,7 @@ x = { column = "output_int_register_0", unit = "mm" }
     came = events(found, lambda taken: len(taken) >= 10)
     found.stop()
     assert [round(1e3 * event.values["x"]) for event in came[:10]] == list(range(10))
+    assert [event.values["elbow"] for event in came[:10]] == [state(k)["target_q"][2] for k in range(10)]
     assert all(abs(event.t - begin) < 10e9 for event in came)
 
 
@@ -271,7 +273,8 @@ def test_with_a_tracker_beside_it(tmp_path: Path, robot: Callable[..., Robot]) -
     """Two sources at once: the robot's commands and encoders, and lines of a tracker; all is recorded and fuses."""
     run = written(tmp_path)
     run.write_text(RUN.replace('{ column = "timestamp", unit = "s" }', '"log_time"'))
-    address = f"rtde:{run}?host=127.0.0.1:{robot(rows=300).port}"
+    one = robot(rows=300)
+    address = f"rtde:{run}?host=127.0.0.1:{one.port}"
     live = Live(address, tmp_path / "fusion.toml", "udp://127.0.0.1:0", "--record", str(tmp_path / "record"))
     try:
         place = ("127.0.0.1", live.port())
@@ -285,6 +288,7 @@ def test_with_a_tracker_beside_it(tmp_path: Path, robot: Callable[..., Robot]) -
         live.process.kill()
         live.process.communicate()
         live.estimates.close()
+    assert one.asked[0][0] == 125.0  # once an update period
     assert {"x", "elbow"} <= estimates[-1].keys()
     assert "50 datagrams taken in, 0 lost" in log
     assert "connections made: 1" in log

@@ -92,10 +92,11 @@ def run(
     if recorded is not None:
         start = dict(recorded.start)
         known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
-    listed = {one: manifest.load(Path(one.path)) for one in sources if one.kind in OF_A_RUN}
+    files = {one: _manifest_of(Path(one.path)) for one in sources if one.kind in OF_A_RUN}
+    listed = {address: manifest.load(file) for address, file in files.items()}
     for address, one in listed.items():
         start |= one.command.start
-        robot = known.robot if one.robot is None else one.robot.beside(Path(address.path).parent)
+        robot = known.robot if one.robot is None else one.robot.beside(files[address].parent)
         known = msgspec.structs.replace(known, frame=one.frame or known.frame, robot=robot)
     errors = console(sys.stderr)
 
@@ -149,6 +150,11 @@ def run(
         notify(sentence)
     with contextlib.suppress(OSError):
         print_tables([_sensor_table(live, feeder.now)], "stderr")
+
+
+def _manifest_of(path: Path) -> Path:
+    """The ``run.toml`` that a path is, or that a folder has."""
+    return path / "run.toml" if path.is_dir() else path
 
 
 def _opened(

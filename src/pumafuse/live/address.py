@@ -150,9 +150,13 @@ def _replay(text: str, rest: str) -> Address:
 def _rtde(text: str, rest: str) -> Address:
     path, _, option = rest.rpartition("?")
     name, _, place = option.partition("=")
+    expected = f"source '{text}': expected rtde:run.toml?host=HOST or HOST:PORT, the address of the robot's controller"
     if not path or name != "host" or not place:
-        raise ConfigError(f"source '{text}': expected rtde:run.toml?host=HOST, the address of the robot's controller")
-    address = _network_address(f"tcp://{place}" if ":" in place else f"tcp://{place}:{_RTDE}", f"source '{text}'")
+        raise ConfigError(expected)
+    try:
+        address = _network_address(f"tcp://{place}" if ":" in place else f"tcp://{place}:{_RTDE}", "")
+    except ConfigError:
+        raise ConfigError(expected) from None
     return Address("rtde", path, host=address.host, port=address.port)
 
 

@@ -98,6 +98,12 @@ class Ros2Source:
         self._executor: Any = load("rclpy.executors").SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._backlog.name = self.node.get_fully_qualified_name()
+        for topic in self._topics:
+            try:
+                self._resolved(topic)
+            except Exception as error:  # of the middleware
+                self.close()
+                raise ConfigError(f"run.toml: topic '{topic.name}' is no name of ROS 2: {reason(error)}") from None
 
     def start(self) -> None:
         """Listen."""
