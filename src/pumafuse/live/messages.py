@@ -143,7 +143,6 @@ class Reader:
     Attributes:
         name: Of the sensor; empty for the commands.
         entry: What ``run.toml`` says of it.
-        reads_transforms: Whether messages are of tf: many send these on one topic.
     """
 
     def __init__(self, name: str, entry: SourceEntry, commanded: dict[str, float]) -> None:
@@ -171,7 +170,6 @@ class Reader:
         if self._is_of_paths:
             import_module("scipy.interpolate")  # takes a second, which the first path would wait
         self._asks_whole = TRANSFORMS in holders(entry.fields)
-        self.reads_transforms = False
         self._step = entry.interpolation if isinstance(entry, CommandEntry) else 0.0
         self._before: Event | None = None
         self._gaps = deque[float](maxlen=_USUAL)  # between commands [ns]
@@ -186,7 +184,6 @@ class Reader:
             ConfigError: Its stamps are numbers, of which nobody says the unit.
         """
         parts = _rows(empty, self._asks_whole)
-        self.reads_transforms = parts is not None
         if self._is_of_paths:
             return [] if trajectory_in(bags.plain(empty)) is not None else [PATH]
         lacking = list[str]()

@@ -39,6 +39,7 @@ class Topic:
         name: As ``run.toml`` has it.
         readers: Of the sources that are in its messages.
         subscription: None until somebody publishes it.
+        kind: The type of messages that is subscribed to.
         publishers: How many there were at the last look; None before anybody was.
         lost: How many messages the middleware has lost.
     """
@@ -46,6 +47,7 @@ class Topic:
     def __init__(self, name: str, readers: Sequence[Reader]) -> None:
         self.name, self.readers = name, readers
         self.subscription: Any = None
+        self.kind = ""
         self.publishers: int | None = None
         self.lost = 0
 
@@ -197,7 +199,7 @@ class Ros2Source:
                 self._log.write(f"{name} gone", f"{name}: nobody publishes it any more")
             elif not before:
                 self._log.write(f"{name} there", f"{name}: is published")
-            if count > max(before or 0, 1) and not any(one.reads_transforms for one in topic.readers):
+            if count > max(before or 0, 1) and not topic.kind.endswith("/TFMessage"):  # which many send
                 self._log.write(f"{name} many", f"{name}: {count} publishers; their messages are taken as if of one")
             topic.publishers = count
 
@@ -227,6 +229,7 @@ class Ros2Source:
                 topic.subscription = subscribe(event_callbacks=lost)
             except handler.UnsupportedEventTypeError:  # not every middleware tells
                 topic.subscription = subscribe()
+            topic.kind = kind
             return
 
     def _lost(self, topic: Topic, status: Any) -> None:
