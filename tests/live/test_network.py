@@ -13,7 +13,7 @@ import pytest
 import pumafuse as pf
 from pumafuse.live import backlog, network
 from pumafuse.live.address import Address
-from pumafuse.live.network import Source, TcpClient, TcpListener, UdpListener, UdpSender
+from pumafuse.live.network import Connection, Source, TcpClient, TcpListener, UdpListener, UdpSender
 
 LOOPBACK = (socket.AF_INET, ("127.0.0.1", 0))
 
@@ -227,7 +227,7 @@ class TestTcpClient:
     def test_it_waits_longer_and_longer(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Half a second, twice that, up to half a minute."""
         waits: list[float] = []
-        source = TcpClient(Address.parse("tcp://127.0.0.1:9"), lambda _: None)
+        source = Connection(Address.parse("tcp://127.0.0.1:9"), lambda _: False, lambda _: None)
 
         def wait(seconds: float) -> None:
             waits.append(seconds)
@@ -239,7 +239,7 @@ class TestTcpClient:
 
         monkeypatch.setattr(source._stopped, "wait", wait)
         monkeypatch.setattr(network.socket, "create_connection", nobody)
-        source._stay_connected()
+        source.stay_connected()
         assert waits == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0]
 
 

@@ -25,7 +25,7 @@ from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from ..fusion.placing import with_tool
 from ..live import network
-from ..live.address import LISTENERS, NETWORK, OF_A_RUN, Address
+from ..live.address import LISTENERS, NETWORK, OF_A_RUN, POSES, Address
 from ..live.estimator import LiveEstimator
 from ..live.health import Health
 from ..live.network import UdpSender
@@ -108,7 +108,7 @@ def run(
         remotes = [
             _opened(one, listed.get(one), known, stack, notify, listen=listen, allow=allow, ros_args=ros_args)
             for one in sources
-            if one.kind in (*NETWORK, *OF_A_RUN)
+            if one.kind in (*NETWORK, *OF_A_RUN, POSES)
         ]
         remote = Several(remotes) if len(remotes) > 1 else next(iter(remotes), None)
         ros = next((one for one in remotes if isinstance(one, Ros2Source)), None)
@@ -183,6 +183,10 @@ def _opened(
     Raises:
         PumafuseError: The source cannot be opened.
     """
+    if address.kind == POSES:
+        from ..live.openigtlink import OpenIgtLinkSource
+
+        return OpenIgtLinkSource(address, config, notify)
     if listed is None:
         return network.source(address, listen, allow, notify)
     if address.kind == "rtde":

@@ -374,7 +374,8 @@ def live(
     SOURCE is stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, or a recorded run: replay:RUN?speed=4
     (speed=max: as fast as it can be). It is topics of a running ROS 2, as a run.toml names them: ros2:run.toml; then
     estimates go to topics, and --ros-args is as everywhere in ROS. Or it is the controller of a robot of Universal
-    Robots: rtde:run.toml?host=HOST. Of the network there may be several, with stamps of one clock.
+    Robots, rtde:run.toml?host=HOST, or a tracker's server of OpenIGTLink, igtl://HOST. Of the network there may be
+    several, with stamps of one clock.
 
     One JSON object a line, in s and mm (of angles degrees). In: {"t": 12.345, "command": {"x": 570.0}} and {"t": 12.35,
     "sensor": "tracker", "x": 569.7}. Out: {"t": ..., "x": {"position_mm": ..., "sd_mm": ..., "velocity_mm_s": ...}}.

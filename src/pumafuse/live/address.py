@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
-from typing import TypeAlias
+from typing import TypeAlias, TypedDict
 from urllib.parse import urlsplit
 
 from ..errors import ConfigError
@@ -17,13 +17,14 @@ SocketAddress: TypeAlias = tuple[socket.AddressFamily, tuple[str, int]]
 Allowed: TypeAlias = Callable[[str], bool]  # whether a sender's host is accepted
 
 LISTENERS = ("udp", "tcp-listen")
-NETWORK = (*LISTENERS, "tcp")
+NETWORK = (*LISTENERS, "tcp")  # of lines
+POSES = "igtl"  # a server that speaks OpenIGTLink
 OF_A_RUN = ("ros2", "rtde")  # what comes is read by a run.toml
-_RTDE = 30004  # the controller's port
+_RTDE, _IGTL = 30004, 18944  # the ports of a controller, and of a server of poses
 _LOOPBACK = "127.0.0.1"
 _SOURCES = (
     "stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, ros2:run.toml, rtde:run.toml?host=HOST,"
-    " replay:RUN, replay:RUN?speed=4 (or max)"
+    " igtl://HOST, igtl://HOST:PORT?time=received, replay:RUN, replay:RUN?speed=4 (or max)"
 )
 
 
@@ -32,11 +33,12 @@ class Address:
     """A source as the command line names it.
 
     Attributes:
-        kind: ``stdin``, ``replay``, ``ros2``, ``rtde``, ``udp``, ``tcp-listen`` or ``tcp``.
+        kind: ``stdin``, ``replay``, ``ros2``, ``rtde``, ``igtl``, ``udp``, ``tcp-listen`` or ``tcp``.
         path: Of the run to replay, or of a ``run.toml`` that names topics or columns.
         speed: Seconds of the run in one second; infinite: as fast as it can be.
         host: Of a network source, empty where none is given.
         port: Of a network source.
+        on_receipt: Whether poses are stamped when they are received.
     """
 
     kind: str
@@ -44,6 +46,7 @@ class Address:
     speed: float = 1.0
     host: str = ""
     port: int = 0
+    on_receipt: bool = False
 
     @staticmethod
     def parse(text: str) -> Address:
@@ -61,6 +64,8 @@ class Address:
             return Address("ros2", rest)
         if kind == "rtde" and rest:
             return _rtde(text, rest)
+        if kind == POSES and rest.startswith("//"):
+            return _poses(text, rest)
         if kind in NETWORK and rest.startswith("//"):
             return _network_address(text, f"source '{text}'")
         raise ConfigError(f"no source '{text}'; there are: {_SOURCES}")
@@ -69,6 +74,11 @@ class Address:
     def text(self) -> str:
         """A network source as it is written."""
         return f"{self.kind}://{host_port(self.host, self.port)}"
+
+
+class _Place(TypedDict):
+    host: str
+    port: int
 
 
 def host_port(host: str, port: int) -> str:
@@ -153,11 +163,24 @@ def _rtde(text: str, rest: str) -> Address:
     expected = f"source '{text}': expected rtde:run.toml?host=HOST or HOST:PORT, the address of the robot's controller"
     if not path or name != "host" or not place:
         raise ConfigError(expected)
+    return Address("rtde", path, **_server(place, _RTDE, expected))
+
+
+def _poses(text: str, rest: str) -> Address:
+    place, question, option = rest.removeprefix("//").partition("?")
+    expected = f"source '{text}': expected igtl://HOST or igtl://HOST:PORT, and ?time=received for times of receipt"
+    if not place or (question and option != "time=received"):
+        raise ConfigError(expected)
+    return Address(POSES, **_server(place, _IGTL, expected), on_receipt=bool(question))
+
+
+def _server(place: str, port: int, expected: str) -> _Place:
+    """Host and port of HOST or HOST:PORT."""
     try:
-        address = _network_address(f"tcp://{place}" if ":" in place else f"tcp://{place}:{_RTDE}", "")
+        found = _network_address(f"tcp://{place}" if ":" in place else f"tcp://{place}:{port}", "")
     except ConfigError:
         raise ConfigError(expected) from None
-    return Address("rtde", path, host=address.host, port=address.port)
+    return {"host": found.host, "port": found.port}
 
 
 def _network_address(text: str, where: str) -> Address:

@@ -1,7 +1,7 @@
-"""Sources of lines on the network, over UDP and TCP, and estimates sent as datagrams.
+"""Sources on the network, over UDP and TCP, and estimates sent as datagrams.
 
-Datagrams wait in a :mod:`.backlog`; those that the system dropped before are counted, too. A TCP sender that is too
-fast is slowed down: its connection is not read any more.
+Datagrams wait in a :mod:`.backlog`; those that the system dropped before are counted, too. A TCP sender of lines that
+is too fast is slowed down: its connection is not read any more.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable
-from typing import Generic, TypeAlias, TypeVar
+from collections.abc import Callable, Iterable
+from typing import TypeAlias
 
 from ..errors import RunError
 from .address import Address, Allowed, SocketAddress, host_port, listener, receiver
@@ -28,6 +28,7 @@ from .wire import Event, Lines
 _LARGEST = 65_536  # bytes of a datagram, or of a piece of a connection
 _MOST_RECEIVED = 1024  # datagrams that are read from the socket at once
 _MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
+_EVENT = 500  # bytes of an event, about
 _COMMAND = b'"command"'  # in a datagram with a command
 _RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
@@ -135,27 +136,24 @@ class UdpListener:
         return self._backlog.dropped + self._dropped_before
 
 
-T = TypeVar("T", bytes, Event)
-
-
-class _Tcp(Generic[T]):
-    """Connections, each read by a thread, whose lines or events are put together in the order in which they come."""
+class _Tcp:
+    """Connections, each read by a thread, whose lines are put together in the order in which they come."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._pieces = queue.Queue[list[T]](_MOST_PIECES)
+        self._pieces = queue.Queue[list[bytes]](_MOST_PIECES)
 
-    def get(self) -> list[T]:
+    def get(self) -> list[bytes]:
         """Some of one connection; none after a tenth of a second without any."""
         try:
             return self._pieces.get(timeout=QUIET)
         except queue.Empty:
             return []
 
-    def stop(self) -> list[T]:
+    def stop(self) -> list[bytes]:
         """What has come and was not given yet; the connections end with the process."""
         self._log = RateLimitedLog(lambda _: None)  # a thread that writes while the process ends would stop it
-        found: list[T] = []
+        found: list[bytes] = []
         with contextlib.suppress(queue.Empty):
             for _ in range(_MOST_PIECES + _MOST_CONNECTIONS):  # and one that each thread holds; a flood has no end
                 found += self._pieces.get(timeout=_HANDED_OVER)
@@ -186,7 +184,7 @@ def _read_lines(
     return some
 
 
-class TcpListener(_Tcp[bytes]):
+class TcpListener(_Tcp):
     """Lines from all who connect."""
 
     def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
@@ -252,59 +250,132 @@ class TcpListener(_Tcp[bytes]):
         self._log.write("gone", f"the connection from {peer} has ended")
 
 
-class Client(_Tcp[T]):
-    """What a server sends, to which the connection is made again whenever it ends."""
+class Connection:
+    """A connection to a server, made again whenever it ends.
 
-    def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
-        """Prepare; :meth:`start` connects."""
-        super().__init__(notify)
-        self._address, self._name = address, address.text
-        self._made, self._connected = 0, False
+    Attributes:
+        name: The server's address.
+        log: Takes sentences, until :meth:`stop`.
+    """
+
+    def __init__(self, address: Address, read: Callable[[socket.socket], bool], notify: Callable[[str], None]) -> None:
+        """Prepare; :meth:`start` connects.
+
+        Args:
+            address: Of the server.
+            read: Reads a connection to its end, and closes it; whether there was anything.
+            notify: Takes a sentence for the log.
+        """
+        self.name, self.log = address.text, RateLimitedLog(notify)
+        self._place, self._read = (address.host, address.port), read
+        self._made, self._open = 0, False
         self._stopped = threading.Event()
 
     def start(self) -> None:
         """Begin to connect."""
-        _in_a_thread(self._stay_connected)
+        _in_a_thread(self.stay_connected)
 
-    def stop(self) -> list[T]:
-        """What has come and was not given yet; no connection is made any more."""
+    def stop(self) -> None:
+        """Make no connection any more, and be silent; one that is open ends with the process."""
         self._stopped.set()
-        return super().stop()
+        self.log = RateLimitedLog(lambda _: None)  # a thread that writes while the process ends would stop it
 
     def summary(self) -> str:
         """How often the connection was made, and whether it is there."""
-        return f"{self._name}: connections made: {self._made}, {'open' if self._connected else 'none open'}"
+        return f"{self.name}: connections made: {self._made}, {'open' if self._open else 'none open'}"
 
-    def _read(self, connection: socket.socket) -> bool:
-        """Read a connection to its end, and close it; whether there was anything."""
-        raise NotImplementedError
-
-    def _stay_connected(self) -> None:
+    def stay_connected(self) -> None:
         """Connect and read, again and again, with waits that double as long as nothing comes."""
         wait = _FIRST_WAIT
         while not self._stopped.is_set():
             try:
-                connection = socket.create_connection((self._address.host, self._address.port), _PATIENCE)
+                connection = socket.create_connection(self._place, _PATIENCE)
             except (OSError, UnicodeError) as error:
                 reason = getattr(error, "strerror", None) or "no answer"
-                self._log.write("unreachable", f"{self._name}: cannot be reached: {reason}; tried again in {wait:g} s")
+                self.log.write("unreachable", f"{self.name}: cannot be reached: {reason}; tried again in {wait:g} s")
             else:
                 connection.settimeout(None)
-                self._made, self._connected = self._made + 1, True
-                self._log.write("connected", f"{self._name}: connected")
+                self._made, self._open = self._made + 1, True
+                self.log.write("connected", f"{self.name}: connected")
                 if self._read(connection):
                     wait = _FIRST_WAIT
-                self._connected = False
-                self._log.write("ended", f"{self._name}: the connection has ended; made again in {wait:g} s")
+                self._open = False
+                self.log.write("ended", f"{self.name}: the connection has ended; made again in {wait:g} s")
             self._stopped.wait(wait)
             wait = min(2.0 * wait, _LONGEST_WAIT)
 
 
-class TcpClient(Client[bytes]):
+class TcpClient(_Tcp):
     """Lines from a server."""
 
+    def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
+        """Prepare; :meth:`start` connects."""
+        super().__init__(notify)
+        self._connection = Connection(address, lambda one: _read_lines(one, self._pieces.put), notify)
+
+    def start(self) -> None:
+        """Begin to connect."""
+        self._connection.start()
+
+    def summary(self) -> str:
+        """How often the connection was made, and whether it is there."""
+        return self._connection.summary()
+
+    def stop(self) -> list[bytes]:
+        """What has come and was not given yet; no connection is made any more."""
+        self._connection.stop()
+        return super().stop()
+
+
+class EventClient:
+    """Events of a server that does not speak in lines; what comes faster than it is taken in waits in a backlog."""
+
+    def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
+        """Prepare; :meth:`start` connects."""
+        self._connection = Connection(address, self._read, notify)
+        self._backlog = Backlog[Event]("events", self._connection.log, lambda event: not event.sensor, lambda _: _EVENT)
+        self._backlog.name = self._name = self._connection.name
+        self._came = threading.Condition()
+
+    def start(self) -> None:
+        """Begin to connect."""
+        self._connection.start()
+
+    def get(self) -> list[Event]:
+        """Some events in the order in which they came; none after a tenth of a second without any."""
+        with self._came:
+            if not self._backlog:
+                self._came.wait(QUIET)
+            self._backlog.keep_up(time.monotonic())
+            return self._backlog.take(_MOST_AT_ONCE)
+
+    def stop(self) -> list[Event]:
+        """The events that have come and were not given yet; no connection is made any more."""
+        self._connection.stop()
+        with self._came:
+            return self._backlog.take(MOST)
+
+    def summary(self) -> str:
+        """How often the connection was made, how many events came, and how many were lost."""
+        waited = self._backlog
+        text = f"{self._connection.summary()}; {waited.received} events, {waited.dropped} lost"
+        return f"{text}, {waited.shed} shed" if waited.shed else text
+
+    def _put(self, events: Iterable[Event]) -> None:
+        """Let events wait until they are taken in."""
+        now = time.monotonic()
+        with self._came:
+            for event in events:
+                self._backlog.append(now, event)
+            self._came.notify()
+
+    def _say(self, about: str, text: str) -> None:
+        """A sentence for the log, not too often about one thing."""
+        self._connection.log.write(about, f"{self._name}: {text}")
+
     def _read(self, connection: socket.socket) -> bool:
-        return _read_lines(connection, self._pieces.put)
+        """Read a connection to its end, and close it; whether there was anything."""
+        raise NotImplementedError
 
 
 Source: TypeAlias = UdpListener | TcpListener | TcpClient

@@ -21,8 +21,7 @@ from ..logs.columns import LOG_TIME
 from ..logs.manifest import Manifest
 from .address import Address
 from .messages import Reader
-from .network import Client, keep_alive
-from .wire import Event
+from .network import EventClient, keep_alive
 
 _HEAD = struct.Struct(">HB")  # bytes of a package, and its type
 _VERSION, _OUTPUTS, _BEGIN, _DATA, _TEXT = b"VOSUM"  # types of packages
@@ -62,8 +61,8 @@ class _Recipe(NamedTuple):
         return SimpleNamespace(**dict(zip(self.columns, self.layout.unpack_from(body, 1), strict=True)))
 
 
-class RtdeSource(Client[Event]):
-    """Events of a robot, to which the connection is made again whenever it ends."""
+class RtdeSource(EventClient):
+    """Events of a robot."""
 
     def __init__(self, address: Address, listed: Manifest, rate: float, notify: Callable[[str], None]) -> None:
         """Prepare; :meth:`start` connects.
@@ -101,11 +100,10 @@ class RtdeSource(Client[Event]):
                     received = time.time_ns()
                     if kind == _DATA and body[:1] == bytes([recipe.number]):
                         row = recipe.row(body)
-                        events = [event for one in self._readers for event in one.events(row, received)]
+                        self._put([event for one in self._readers for event in one.events(row, received)])
                         some = True
-                        self._pieces.put(events)
             except (_Refused, ConfigError, struct.error) as error:
-                self._log.write("refused", f"{self._name}: {error}")
+                self._say("refused", str(error))
         return some
 
     def _agree(self, connection: socket.socket, packages: Iterator[tuple[int, bytes]]) -> _Recipe:

@@ -1,0 +1,183 @@
+"""OpenIGTLink as a source of events: poses of devices, as servers of trackers (PLUS, 3D Slicer, MITK) send them.
+
+A message is a header of 58 bytes and a body, in big endian; lengths are in mm (`protocol
+<https://github.com/openigtlink/OpenIGTLink/tree/master/Documents/Protocol>`_). A device is the sensor of its name; the
+device ``command`` tells where the arm is sent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..fusion.config import FusionConfig
+from ..logs.frames import CARTESIAN
+from ..units import MM
+from .address import Address
+from .network import EventClient, keep_alive
+from .tool import ORIENTATION, takes_orientation
+from .wire import Event
+
+_HEAD = struct.Struct(">H12s20sIIQQ")  # version, type, device, seconds and their fraction, bytes of the body, checksum
+_EXTENDED = struct.Struct(">HHI")  # from version 2 on: bytes of this header, of the metadata's index, and of its texts
+_KEY = struct.Struct(">HHI")  # of a metadatum: bytes of its key, encoding, bytes of its value
+_POINT, _QUATERNION, _MATRIX = struct.Struct(">3f"), struct.Struct(">7f"), struct.Struct(">12f")
+_POSES = {"TRANSFORM": (_MATRIX,), "POSITION": (_POINT, _QUATERNION), "QTRANS": (_QUATERNION,)}  # of one device
+_LISTS = {"TDATA": _MATRIX, "QTDATA": _QUATERNION}  # of several: name, kind, an unused byte, pose
+_NAME = struct.Struct(">20sBx")
+_LARGEST = 1 << 16  # bytes of a message of poses
+_COMMAND = "command"  # the device
+_STATUS, _SEEN = "TransformStatus", "OK"  # a metadatum: whether the tracker sees the device
+
+
+class _Refused(Exception):  # noqa: N818 - what a server does, and never leaves this module
+    """The server sends what is no OpenIGTLink; the text says what."""
+
+
+class _Message(NamedTuple):
+    """A message whose header has been read."""
+
+    kind: str
+    device: str
+    stamp: int  # ns
+    content: bytes
+    seen: bool
+
+
+class OpenIgtLinkSource(EventClient):
+    """Events of a server of poses."""
+
+    def __init__(self, address: Address, config: FusionConfig, notify: Callable[[str], None]) -> None:
+        """Prepare; :meth:`start` connects.
+
+        Args:
+            address: Of the server, and whether rows are stamped when they are received.
+            config: Says what rows may give: x, y, z as far as these are axes, and an orientation of a tool that turns.
+            notify: Takes a sentence for the log.
+        """
+        super().__init__(address, notify)
+        in_space = config.frame is not None or any(sensor.is_placed for sensor in config.sensors.values())
+        self._axes = [in_space or axis in config.arm.axes for axis in CARTESIAN]
+        self._turns, self._on_receipt = takes_orientation(config), address.on_receipt
+
+    def _read(self, connection: socket.socket) -> bool:
+        some = False
+        with connection, contextlib.suppress(OSError):
+            keep_alive(connection)
+            try:
+                for message in _messages(connection.makefile("rb")):
+                    self._put(list(self._events(message)))
+                    some = True
+            except (_Refused, struct.error) as error:
+                self._say("refused", f"no OpenIGTLink: {error}")
+        return some
+
+    def _events(self, message: _Message) -> Iterator[Event]:
+        """The event of each device of a message.
+
+        Raises:
+            struct.error: Its body is too short.
+        """
+        stamp = time.time_ns() if self._on_receipt or not message.stamp else message.stamp
+        for device, pose in _poses(message):
+            values = self._values(pose if message.seen else [math.nan] * len(pose))
+            yield Event(stamp, "" if device == _COMMAND else device, values)
+
+    def _values(self, pose: list[float]) -> dict[str, Any]:
+        """The values of a pose: a point and perhaps a quaternion, or the columns of a rotation matrix and a point."""
+        point = pose[-3:] if len(pose) == 12 else pose[:3]
+        values: dict[str, Any] = {
+            axis: value / MM for axis, value, told in zip(CARTESIAN, point, self._axes, strict=True) if told
+        }
+        turned = _quaternion(pose) if self._turns and len(pose) > 3 and all(map(math.isfinite, pose)) else None
+        if turned is not None:
+            values[ORIENTATION] = turned
+        return values
+
+
+def _quaternion(pose: list[float]) -> tuple[float, ...] | None:
+    """The quaternion x, y, z, w of a pose, of a matrix that of the rotation nearest to it; None where it has none."""
+    if len(pose) == 7:
+        return tuple(pose[3:])
+    try:
+        return tuple(Rotation.from_matrix(np.reshape(pose[:9], (3, 3)).T).as_quat().tolist())
+    except ValueError:  # a mirror, or no turn at all
+        return None
+
+
+def _messages(stream: BinaryIO) -> Iterator[_Message]:
+    """The messages of poses, until the connection ends; others, as images, are passed over.
+
+    Raises:
+        _Refused: It is no OpenIGTLink.
+    """
+    with stream:
+        while len(head := stream.read(_HEAD.size)) == _HEAD.size:
+            version, kind, device, seconds, fraction, size, _ = _HEAD.unpack(head)
+            if version not in (1, 2, 3):
+                raise _Refused(f"a header of version {version}")
+            name = _text(kind)
+            if name not in _POSES and name not in _LISTS:
+                _pass_over(stream, size)
+                continue
+            if size > _LARGEST:
+                raise _Refused(f"a {name} of {size} bytes")
+            body = stream.read(size)
+            if len(body) < size:
+                return
+            stamp = seconds * 10**9 + (fraction * 10**9 >> 32)
+            content, seen = (body, True) if version == 1 else _without_metadata(body)
+            yield _Message(name, _text(device), stamp, content, seen)
+
+
+def _pass_over(stream: BinaryIO, size: int) -> None:
+    """Read so many bytes, as there are, without keeping them."""
+    while size > 0 and (piece := stream.read(min(size, _LARGEST))):
+        size -= len(piece)
+
+
+def _without_metadata(body: bytes) -> tuple[bytes, bool]:
+    """The content of a body of version 2 or later, and whether its metadata say that the device is seen.
+
+    Raises:
+        struct.error: It is too short.
+    """
+    before, index, texts = _EXTENDED.unpack_from(body)
+    end = len(body) - index - texts
+    seen, at = True, end + index
+    for number in range(max(index - 2, 0) // _KEY.size):
+        of_key, _, of_value = _KEY.unpack_from(body, end + 2 + number * _KEY.size)
+        key, value = body[at : at + of_key], body[at + of_key : at + of_key + of_value]
+        at += of_key + of_value
+        seen = seen and (_text(key) != _STATUS or _text(value) == _SEEN)
+    return body[before:end], seen
+
+
+def _poses(message: _Message) -> Iterator[tuple[str, list[float]]]:
+    """Each device of a message and the numbers of its pose.
+
+    Raises:
+        struct.error: The content has not that many bytes.
+    """
+    if (layout := _LISTS.get(message.kind)) is not None:
+        one = _NAME.size + layout.size
+        for at in range(0, len(message.content), one):
+            name, _ = _NAME.unpack_from(message.content, at)
+            yield _text(name), list(layout.unpack_from(message.content, at + _NAME.size))
+        return
+    layouts = _POSES[message.kind]
+    fits = next((one for one in layouts if one.size == len(message.content)), layouts[-1])
+    yield message.device, list(fits.unpack(message.content))
+
+
+def _text(field: bytes) -> str:
+    """A text of a field that is filled with zeros."""
+    return field.partition(b"\0")[0].decode("utf-8", "replace").strip()
