@@ -35,6 +35,8 @@ def events_of(run: pf.Run) -> list[Event]:
         columns = {axis: value.tolist() for axis, value in source.values.items()}
         if source.orientation is not None:
             columns["orientation"] = source.orientation.tolist()
+        if len(source.noise):
+            columns["noise"] = source.noise.tolist()
         for row, stamp in enumerate(source.stamp.tolist()):
             if stamp != NO_STAMP:
                 values = {axis: column[row] for axis, column in columns.items() if column[row] == column[row]}
@@ -201,7 +203,8 @@ def any_stream(draw: st.DrawFn) -> tuple[pf.FusionConfig, pf.Run, int]:
         when = np.sort(rng.integers(stamp[0] - 200 * MS, stamp[-1] + 500 * MS, rows)) // grid * grid
         value = (-0.5 if name == "range" else 0.5) + rng.normal(0.0, 3e-3, rows)
         value[rng.random(rows) < 0.05] = np.nan
-        measured[name] = (when, {"radial": value, "vertical": value[::-1].copy()})
+        noise = {"noise": rng.choice([0.5, 1.0, 4.0], rows)} if draw(st.booleans()) else {}
+        measured[name] = (when, {"radial": value, "vertical": value[::-1].copy(), **noise})
     start = draw(st.sampled_from([{}, {"radial": 0.5}, dict.fromkeys(command, 0.49)]))
     return config, pf.Run.from_arrays(stamp, command, measured, start=start), draw(st.integers(0, 2**32))
 

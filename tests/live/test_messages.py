@@ -73,6 +73,8 @@ def assert_equal(path: Path) -> pf.Run:
         if source.orientation is not None and source.joints is None:
             turned = [event.values.get("orientation", (math.nan,) * 4) for event in mine]
             assert np.array_equal(turned, source.orientation, equal_nan=True)
+        if len(source.noise):
+            assert [event.values["noise"] for event in mine] == source.noise.tolist()
     return run
 
 
@@ -103,6 +105,25 @@ def test_transforms_of_many_frames(tmp_path: Path) -> None:
         written(tmp_path, f"[command]\n{entry.format('goal')}[sensors.eye]\n{entry.format('seen')}", sent)
     )
     assert np.isnan(run.sensors["eye"].orientation).any()
+
+
+def test_covariances_row_by_row(tmp_path: Path) -> None:
+    """A pose's own variance scales its noise; one of 0, which is unknown, does not."""
+    kind, sent = "geometry_msgs/msg/PoseWithCovarianceStamped", list[Sent]()
+    for k, place in enumerate(MOTION):
+        at, covariance = START + STEP * k, np.zeros(36)
+        covariance[0] = (0.0, 1e-6, 9e-6)[k % 3]
+        pose = {
+            "pose": {"position": xyz(place), "orientation": quaternion(0.01 * k)},
+            "covariance": covariance.tolist(),
+        }
+        for topic, ns in (("/goal", at), ("/seen", at + 3_000_000)):
+            sent.append((topic, kind, ns, {"header": header(ns), "pose": pose}))
+    entry = 'topic = "{}"\ntime = "header.stamp"\npose = "pose.pose"\n'
+    noise = 'noise = { variance = "pose.covariance[0]", typical = 1e-6 }\n'
+    run = f"[command]\n{entry.format('/goal')}[sensors.eye]\n{entry.format('/seen')}{noise}"
+    read = assert_equal(written(tmp_path, run, sent))
+    assert read.sensors["eye"].noise == pytest.approx(np.resize([1.0, 1.0, 3.0], 200))
 
 
 def test_angles_that_go_on_over_a_turn(tmp_path: Path) -> None:

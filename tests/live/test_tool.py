@@ -70,8 +70,8 @@ def seen(sensor: pf.Sensor, at: np.ndarray, turned: Rotation, rng: np.random.Gen
     return point + rng.normal(0.0, 1e-4, point.shape), noise * (stands.inv() * turned * on_tool)
 
 
-def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 6.0) -> pf.Run:
-    """A run of commands and of all sensors, of which the tracker tells no orientation."""
+def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 6.0, noisy: bool = False) -> pf.Run:
+    """A run of commands and of all sensors, of which the tracker tells no orientation; ``noisy``: some rows more."""
     rng, lag = np.random.default_rng(8), 0.086
     given = np.sort(
         np.arange(0, round(seconds * 1e9), 28_000_000) + rng.integers(0, 3_000_000, round(seconds / 0.028) + 1)
@@ -84,11 +84,12 @@ def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 6.0) -> pf.Run:
         sensor = config.sensors[name]
         point, oriented = seen(sensor, *pose(np.maximum(stamp / 1e9 - sensor.latency - lag, 0.0)), rng)
         values = dict(zip("xyz", point.T, strict=True))
+        values |= {"noise": rng.choice([1.0, 1.0, 5.0], len(stamp))} if noisy else {}
         sensors[name] = stamp, values if name == "tracker" else values | {"orientation": oriented.as_quat()}
     return pf.Run.from_arrays(given, command, sensors)
 
 
-RUN = run_of()
+RUN, NOISY = run_of(), run_of(noisy=True)
 KNOWN = with_tool(CONFIG, RUN)
 
 
@@ -105,18 +106,23 @@ FRAMED = msgspec.structs.replace(
 )
 
 
+ALL_RUNS = pytest.mark.parametrize("run", [RUN, NOISY], ids=["even", "noisy"])
+
+
+@ALL_RUNS
 @pytest.mark.parametrize("longest", [0.0, 1.2])
-def test_in_a_frame_of_the_arm(longest: float) -> None:
+def test_in_a_frame_of_the_arm(longest: float, run: pf.Run) -> None:
     """What sensors and commands tell in x, y, z becomes the arm's tangential, radial and vertical, as offline."""
-    offline, live = pf.fuse(RUN, FRAMED), pf.LiveEstimator(FRAMED)
-    assert differences(live, delayed(events_of(RUN), longest, seed=2), offline, longest + 0.25) == []
+    offline, live = pf.fuse(run, FRAMED), pf.LiveEstimator(FRAMED)
+    assert differences(live, delayed(events_of(run), longest, seed=2), offline, longest + 0.25) == []
 
 
+@ALL_RUNS
 @pytest.mark.parametrize("longest", [0.0, 1.2])
-def test_in_any_order(longest: float) -> None:
+def test_in_any_order(longest: float, run: pf.Run) -> None:
     """Each event up to 1.2 s late, a tenth twice: the offline estimates, also of what the commands place."""
-    offline, live = pf.fuse(RUN, KNOWN), pf.LiveEstimator(KNOWN)
-    expected = fused_in_any_order(RUN, offline, live, longest)
+    offline, live = pf.fuse(run, KNOWN), pf.LiveEstimator(KNOWN)
+    expected = fused_in_any_order(run, offline, live, longest)
     for sensor in ("mocap", "tracker", "camera"):
         assert expected[sensor]["fused"] > 400
         assert expected[sensor]["rejected"] < 40
@@ -140,7 +146,7 @@ def lines_of(run: pf.Run) -> list[bytes]:
     found = []
     for stamp, sensor, values in events_of(run):
         body = {
-            "q" if axis == "orientation" else axis: value if axis == "orientation" else value * 1e3
+            "q" if axis == "orientation" else axis: value if axis in ("orientation", "noise") else value * 1e3
             for axis, value in values.items()
         }
         found.append(
@@ -149,11 +155,12 @@ def lines_of(run: pf.Run) -> list[bytes]:
     return found
 
 
-def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
+@ALL_RUNS
+def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path, run: pf.Run) -> None:
     """Lines with orientations: every estimate that went out is, to the last bit, that of the record as live."""
     recorder = Recorder(tmp_path / "record", KNOWN, {}, lambda _: None)
     live, written = pf.LiveEstimator(KNOWN, event_log=recorder), list[bytes]()
-    Stream(live, written.extend, lambda _: None).take(lines_of(RUN))
+    Stream(live, written.extend, lambda _: None).take(lines_of(run))
     recorder.close(live.sure)
     found = pf.Run.read(tmp_path / "record")
     assert found.notes == ()
@@ -173,7 +180,7 @@ def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
 
 def test_a_replay_is_as_live() -> None:
     """A run that is replayed as a stream, a tenth of its rows without an orientation, gives the estimates of `fuse`."""
-    run = run_of()
+    run = run_of(noisy=True)
     run.sensors["mocap"].orientation[::10] = np.nan
     replay_is_as_live(run, KNOWN)
 

@@ -115,10 +115,13 @@ def written(folder: Path, *, single: bool, damage: Any = None) -> Path:
     for name, (one, arrival) in given.items():
         order = np.argsort(arrival, kind="stable")
         columns = {f"{axis}_m": one[axis][order] for axis in sorted(one.keys() - {"t"})}
-        pq.write_table(pa.table({"time_ns": stamps(one["t"])[order], **columns}), folder / f"{name}.parquet")
+        error = np.resize([0.2, 0.2, 0.7], len(order))
+        table = pa.table({"time_ns": stamps(one["t"])[order], "error_mm": error, **columns})
+        pq.write_table(table, folder / f"{name}.parquet")
         head = name if name in ("command", "reference") else f"sensors.{name}"
         axes = "\n".join(f"{column[0]} = '{column}'" for column in columns)
         lines.append(f"[{head}]\nfile = '{name}.parquet'\ntime = 'time_ns'\n{axes}")
+        lines += ["noise = { sd = 'error_mm', typical = 0.2 }"] if name == "camera" else []
     (folder / "run.toml").write_text("\n".join(lines))
     return folder
 

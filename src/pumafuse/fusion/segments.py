@@ -523,13 +523,15 @@ def _table(source: Source, axes: tuple[str, ...], order: IntArray | slice, numbe
     stamp = source.stamp[order].copy()
     shape = len(stamp), len(axes)
     value, known = np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
-    spread = np.ones(shape if source.spread else (0, len(axes)))
+    spread = np.ones(shape if source.spread or len(source.noise) else (0, len(axes)))
     for axis, column in source.values.items():
         at = axes.index(axis)
         value[:, at] = column[order]
         known[:, at] = np.where(np.isnan(value[:, at]), ABSENT, _FUSED) if source.apart else _FUSED
         if axis in source.spread:
             spread[:, at] = source.spread[axis][order]
+    if len(source.noise):
+        spread *= source.noise[order, None]
     return Events(_valid(stamp, latency), np.full(len(stamp), number, dtype=np.int16), stamp, value, spread, known)
 
 

@@ -31,7 +31,7 @@ from .rate_limit import RateLimitedLog
 from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
 from .screening import NEWS, CommandScreen, HoldWatch, Screened
 from .set_back import SetBack
-from .tool import NO_TOOL, ORIENTATION, Row, axes_of, check_tool, tool_of
+from .tool import NO_TOOL, NOISE, ORIENTATION, Row, axes_of, check_tool, row_noise, tool_of
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
@@ -156,7 +156,8 @@ class LiveEstimator:
             t: Its stamp, float seconds or int nanoseconds; its latency is in the configuration.
             sensor: Its name there.
             **axes: z [m] of each axis it saw; x, y and z with a frame; and ``orientation``, likewise; or all joints. Of
-                a sensor with a frame or a marker all are as it measures them.
+                a sensor with a frame or a marker all are as it measures them. ``noise`` is by what that of the sensor
+                is scaled.
         """
         return self._take(t, str(sensor), axes)
 
@@ -255,7 +256,7 @@ class LiveEstimator:
             sensor: Its name; empty for a command.
             values: As it came.
         """
-        parsed = self._parsed(sensor or None, values)
+        parsed = self._parsed(sensor or None, {name: value for name, value in values.items() if name != NOISE})
         if self._tool is None or not sensor:
             return parsed
         return self._tool.of_tool(sensor, nanoseconds(t), parsed).values
@@ -286,7 +287,7 @@ class LiveEstimator:
         model = live_model(self.config, self._frame_start.start(self._start))
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
         self._tool = tool_of(self.config, self._log)
-        self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled at all
+        self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled, as is known
         self._watch.restart()
         self._screen.restart()
         self._holds.restart()
@@ -538,9 +539,15 @@ class LiveEstimator:
         """Give an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
         window, counts, given, stranger = self._window, self._counts, 0, ""
         new, told = window.value, None
+        noise = 1.0
+        if sensor is not None and not judged and self._spreads:
+            window.spread[:] = self._no_spread
+        if sensor is not None and not judged and NOISE in values:
+            noise, self._spreads = row_noise(values), True
+            values = {name: value for name, value in values.items() if name != NOISE}
         if self._tool is not None and sensor is not None and not judged:
             told = self._tool.of_tool(sensor, stamp, values)
-            values, window.spread[:] = told.values, self._no_spread
+            values = told.values
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
@@ -557,8 +564,10 @@ class LiveEstimator:
         if told is not None and sensor is not None and self._tool is not None:
             for name in told.spread.keys() & self._bits.keys():
                 window.spread[self._bits[name]] = told.spread[name]
-            if told.seen is not None:
-                self._tool.keep(sensor, Row(stamp, told.seen, [*new, *window.spread]), oldest)
+        if noise != 1.0:
+            window.spread[:] = [noise * factor for factor in window.spread]
+        if told is not None and told.seen is not None and sensor is not None and self._tool is not None:
+            self._tool.keep(sensor, Row(stamp, told.seen, [*new, *window.spread], noise), oldest)
         if sensor is not None and not judged:
             held, released = self._held(stamp, sensor, given)
             if released or held:
@@ -572,8 +581,6 @@ class LiveEstimator:
         source = COMMAND if sensor is None else self._sensors[sensor]
         diagnosis.recent.keep(stamp, source, given, new)
         taken = window.add(stamp, source, given, oldest)
-        if self._spreads:
-            window.spread[:] = self._no_spread
         if not taken:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
         codes = bytes(window.outcome)
@@ -660,13 +667,13 @@ class LiveEstimator:
                 for name in values.keys() & self._bits.keys():
                     window.value[self._bits[name]] = values[name]
                 if self.config.frame is not None:
-                    self._turned(row.stamp, sensor, values)
+                    self._turned(row.stamp, sensor, values, row.noise)
                 row.numbers = [*window.value, *window.spread]
             stamps, now = np.array([row.stamp for row in rows]), np.array([row.numbers for row in rows])
             window.amend(self._sensors[sensor], stamps, before, now)
         window.spread[:] = self._no_spread
 
-    def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
+    def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any], noise: float = 1.0) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
         window, given = self._window, 0
         placed = self._frame_start.in_axes(
@@ -675,7 +682,8 @@ class LiveEstimator:
         )
         for name, component in placed.items():
             axis = self._bits[name]
-            window.value[axis], window.spread[axis] = component
+            window.value[axis], spread = component
+            window.spread[axis] = noise * spread
             given |= 1 << axis
         return given
 

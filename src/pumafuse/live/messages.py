@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from ..arrays import FloatArray
 from ..errors import ConfigError
 from ..logs import bags
 from ..logs.columns import LOG_TIME, NAMES, SPLIT_STAMPS, holders, leaf
@@ -21,7 +22,7 @@ from ..logs.manifest import Column, CommandEntry, Orientation, SourceEntry, Time
 from ..logs.recordings import PATH, TRANSFORMS, CommandedPath, begin_of, trajectory_in
 from ..logs.run import PAUSE, Source
 from ..units import ANGLES, LENGTHS, TIMES, divisor, ending
-from .tool import ORIENTATION
+from .tool import NOISE, ORIENTATION
 from .wire import Event
 
 Getter: TypeAlias = Callable[[Any], Any]
@@ -165,6 +166,7 @@ class Reader:
             for axis, columns in (*entry.axes.items(), *entry.joints.items())
         }
         self._turned = None if entry.orientation is None else _turned(entry.orientation, where)
+        self._noise = None if entry.noise is None else getter(entry.noise.column)
         self._commanded, self._turns, self._away = commanded, entry.turns, dict[str, float]()
         self._is_of_paths = PATH in holders(entry.fields)
         if self._is_of_paths:
@@ -238,6 +240,8 @@ class Reader:
             self._commanded.update(known)
         if self._turned is not None and (turned := self._turned(row)) is not None:
             known[ORIENTATION] = turned
+        if self._noise is not None and self.entry.noise is not None:
+            known[NOISE] = self.entry.noise.factor(_number(self._noise, row)).item()
         if known or not self.entry.has_own_rows:
             as_logged = self.name and not self.entry.has_own_rows  # a sensor's row says what it has not, as in a log
             yield Event(self._stamp(row, received), self.name, {**values, **known} if as_logged else known or values)
@@ -285,6 +289,14 @@ class Reader:
         rows = (SimpleNamespace(time_ns=time, name=path.joints, position=at) for time, at in path.rows())
         self._coming = chain(takewhile(lambda row: row.time_ns < begin, left), rows)
         self._next = next(self._coming, None)
+
+
+def _number(get: Getter, row: Any) -> FloatArray:
+    """A number of a row, (); NaN where it has none."""
+    try:
+        return np.array(float(get(row)))
+    except _LACKS:
+        return np.array(math.nan)
 
 
 def _rows(message: Any, whole: bool) -> list[Any] | None:

@@ -29,7 +29,7 @@ from ..toml import text_of
 from ..units import SI, Kind
 from .commands import number
 from .rate_limit import RateLimitedLog
-from .tool import ORIENTATION, takes_orientation
+from .tool import NOISE, ORIENTATION, takes_orientation
 
 _FLUSHED = 0.5  # s between two writes
 _REPORTED_AGAIN = 60.0  # s until a trouble that lasts is reported again
@@ -45,7 +45,7 @@ _QUATERNION = ["qx", "qy", "qz", "qw"]  # columns
 class _Row(NamedTuple):
     stamp: int
     sensor: str | None
-    given: list[str]  # axes with a value, and whether it has an orientation
+    given: list[str]  # axes with a value, and whether it has an orientation and a noise
     line: bytes
 
 
@@ -95,7 +95,7 @@ class Recorder:
         check_writable(folder, force=False, markers=(), ours=lambda _: False)
         folder.mkdir(parents=True, exist_ok=True)
         self._turning = _QUATERNION if turns else []
-        header = ",".join((_TIME, *self._columns.values(), *self._turning)).encode() + b"\n"
+        header = ",".join((_TIME, *self._columns.values(), *self._turning, NOISE)).encode() + b"\n"
         beside = {} if self._robot is None else {ROBOT_FILE: text_of(Path(self._robot.urdf))}
         self._writer = Writer(header, beside)
         self._due, self._reported, self._troubled = 0.0, -math.inf, False
@@ -121,18 +121,21 @@ class Recorder:
         Args:
             stamp: Int ns.
             sensor: None for a command.
-            values: By axis [m or rad], and an orientation.
+            values: By axis [m or rad], an orientation, and by what the noise is scaled.
         """
         cells = {axis: _cell(values[axis]) for axis in self._columns if axis in values}
         turned = [repr(number(one)) for one in values[ORIENTATION]] if ORIENTATION in values else []
+        noise = _cell(values.get(NOISE))
         if not cells and not turned:
             return
-        given = [axis for axis, cell in cells.items() if cell] + [ORIENTATION] * bool(turned)
+        given = [axis for axis, cell in cells.items() if cell] + [ORIENTATION] * bool(turned) + [NOISE] * bool(noise)
         if sensor is None and given and not self._commanded:
             self._commanded, self._due = True, 0.0
         elif not self._commanded and len(self._pending) >= _MOST_BEFORE:
             del self._pending[: _MOST_BEFORE // 2]
-        line = ",".join([cells.get(axis, "") for axis in self._columns] + (turned or [""] * len(self._turning)))
+        line = ",".join(
+            [cells.get(axis, "") for axis in self._columns] + (turned or [""] * len(self._turning)) + [noise]
+        )
         self._pending.append(_Row(stamp, sensor, given, f"{stamp},{line}\n".encode()))
 
     def discard(self, after: int) -> None:
@@ -244,6 +247,7 @@ class Recorder:
                     else {}
                 ),
                 **({ORIENTATION: {"quaternion": self._turning}} if ORIENTATION in seen else {}),
+                **({NOISE: {"sd": NOISE, "typical": 1.0}} if NOISE in seen else {}),
             }
             for sensor, seen in self._seen.items()
             if sensor in listed

@@ -17,7 +17,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.segments import as_commanded
 from ..logs.clock import segments
 from ..logs.run import Run, Source
-from .tool import ORIENTATION
+from .tool import NOISE, ORIENTATION
 from .wire import Event, Lines
 
 QUIET = 0.1  # s without an event after which a source gives an empty list
@@ -74,11 +74,14 @@ def _events(name: str, source: Source) -> Iterator[Event]:
     """The rows of a sensor, or of commands (no name), which give only the axes that they have a value for, if any."""
     columns: list[list[float]] = [value.tolist() for value in source.values.values()]
     turned = [None] * len(source.stamp) if source.orientation is None else source.orientation.tolist()
-    for stamp, orientation, *row in zip(source.stamp.tolist(), turned, *columns, strict=True):
+    noise = source.noise.tolist() or [None] * len(source.stamp)
+    for stamp, orientation, scaled, *row in zip(source.stamp.tolist(), turned, noise, *columns, strict=True):
         every = dict(zip(source.values, row, strict=True))
         values: dict[str, Any] = {axis: value for axis, value in every.items() if name or value == value}
         if orientation is not None and orientation[0] == orientation[0]:
             values[ORIENTATION] = orientation
+        if scaled is not None:
+            values[NOISE] = scaled
         yield Event(math.nan if stamp == NO_STAMP else stamp, name, values or every)
 
 

@@ -22,6 +22,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.placing import Placing, turning_axes
 from ..logs.axes import FAR_TURN, FARTHEST_TURN
 from ..logs.frames import CARTESIAN
+from ..logs.run import NOISE
 from ..logs.screening import lost
 from ..model.arm import ArmModel
 from ..space import rotations
@@ -37,8 +38,14 @@ NO_TOOL = (
 
 
 def axes_of(values: Iterable[str]) -> list[str]:
-    """The names of what an event gives: an orientation is rx, ry and rz."""
-    return [axis for name in values for axis in (TURNING if name == ORIENTATION else (name,))]
+    """The axes that an event gives, under whatever names: an orientation is rx, ry and rz."""
+    return [axis for name in values if name != NOISE for axis in (TURNING if name == ORIENTATION else (name,))]
+
+
+def row_noise(values: Mapping[str, Any]) -> float:
+    """By what a row's noise is scaled; 1 where it does not tell a positive number."""
+    told = number(values.get(NOISE))
+    return told if 0.0 < told < math.inf else 1.0
 
 
 def check_tool(config: FusionConfig, start: Mapping[str, float]) -> None:
@@ -91,11 +98,13 @@ class Row:
         stamp: Int ns.
         seen: What the sensor saw, along the base's axes [m], (3,).
         numbers: Values and spreads as they are in the window, (2 A,).
+        noise: By what that of the row is scaled.
     """
 
     stamp: int
     seen: FloatArray
     numbers: list[float]
+    noise: float
 
 
 class Tool:

@@ -15,10 +15,10 @@ from ..logs.frames import CARTESIAN
 from ..space.rotations import TURNING
 from ..units import MM, SCREEN, Kind
 from .results import LiveEstimate
-from .tool import ORIENTATION
+from .tool import NOISE, ORIENTATION
 
 _LONGEST = 64 * 1024  # bytes of a line
-_NAMES = ("t", "t_ns", "command", "sensor")
+_NAMES = ("t", "t_ns", "command", "sensor", NOISE)
 _QUATERNION = "q"  # x, y, z, w; an arm that does not turn a tool may have an axis of this name
 _KEYS = {  # of an estimate, and their scale
     kind: (f"position_{one.unit}", f"sd_{one.unit}", f"velocity_{one.unit}_s", one.scale)
@@ -67,8 +67,8 @@ class Event(NamedTuple):
     Attributes:
         t: Float seconds or int nanoseconds.
         sensor: Its name, empty for a command.
-        values: By axis or joint [m or rad], and an orientation as a quaternion x, y, z, w; values under unknown names
-            are passed on as they are.
+        values: By axis or joint [m or rad], an orientation as a quaternion x, y, z, w, and of a measurement perhaps by
+            what its noise is scaled; values under unknown names are passed on as they are.
     """
 
     t: float | int
@@ -109,6 +109,7 @@ class LineDecoder:
             ("t_ns", int | None, None),
             ("command", command | None, None),
             ("sensor", str | None, None),
+            (NOISE, float | UnsetType | None, UNSET),
         ]
         self._decoder = msgspec.json.Decoder(msgspec.defstruct("Line", [*head, *fields], **options))
 
@@ -134,9 +135,9 @@ class LineDecoder:
             if rest != line and not rest.startswith(codecs.BOM_UTF8):
                 return self.decode(rest)
             raise BadLine(f"not JSON: {error}") from None
-        t, t_ns, command, sensor, *values = msgspec.structs.astuple(found)
+        t, t_ns, command, sensor, noise, *values = msgspec.structs.astuple(found)
         if command is not None:
-            if sensor is not None or any(value is not UNSET for value in values):
+            if sensor is not None or any(value is not UNSET for value in (noise, *values)):
                 raise BadLine("gives a command and a measurement at once")
             sensor, values = "", [*msgspec.structs.astuple(command)]
         elif not sensor:
@@ -151,6 +152,8 @@ class LineDecoder:
         }
         if isinstance(orientation, tuple):
             by_axis[ORIENTATION] = orientation
+        if noise is not UNSET:
+            by_axis[NOISE] = noise
         return Event(cast(float | int, t if t_ns is None else t_ns), sensor, by_axis | unknown)
 
     def _without_unknown(self, line: bytes) -> tuple[msgspec.Struct, dict[str, Any]]:

@@ -17,7 +17,7 @@ from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..space import rotations
 from ..space.kinematics import Chain
 from ..space.rotations import CONVENTIONS, TURNING
-from ..toml import NotNegative
+from ..toml import NotNegative, Positive
 from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
 from .columns import DAYS, Table, leaf
 from .frames import CARTESIAN, Frame
@@ -152,6 +152,31 @@ class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         return rotations.of_angles(value, self.letters)
 
 
+class RowNoise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A column that tells how noisy each row is, of the position and of the orientation alike.
+
+    Attributes:
+        sd: A column of standard deviations, or of an error.
+        variance: A column of variances in its place.
+        typical: The value in a row whose noise is that of ``fusion.toml``, in the unit of the column.
+    """
+
+    sd: str = ""
+    variance: str = ""
+    typical: Positive
+
+    @property
+    def column(self) -> str:
+        """Whichever there is."""
+        return self.sd or self.variance
+
+    def factor(self, value: FloatArray) -> FloatArray:
+        """By what the noise of rows is scaled; 1 where the column has no positive number, as in ROS what is unknown."""
+        with np.errstate(invalid="ignore"):
+            share = np.where((value > 0.0) & np.isfinite(value), value / self.typical, 1.0)
+        return share if self.sd else np.sqrt(share)
+
+
 class Robot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A serial chain of a URDF, by which joints are a pose.
 
@@ -192,6 +217,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
         axes: For each axis its columns, which are added up.
         orientation: The columns of its orientation.
         joints: The columns of the joints of the ``[robot]``, which are a pose.
+        noise: The column of how noisy each row is; only sensors have one.
     """
 
     file: str
@@ -203,6 +229,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     axes: dict[str, list[Column]]
     orientation: Orientation | None = None
     joints: dict[str, list[Column]] = {}
+    noise: RowNoise | None = None
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -214,7 +241,8 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
         """All its columns and field paths."""
         axes = [column for columns in (*self.axes.values(), *self.joints.values()) for column in columns]
         turning = () if self.orientation is None else self.orientation.columns
-        names = [*self.time.columns, *(column.column for column in axes), *turning]
+        noise = () if self.noise is None else (self.noise.column,)
+        names = [*self.time.columns, *(column.column for column in axes), *turning, *noise]
         return [*names, *(name for one in axes for name in one.where)]
 
     @property
@@ -352,6 +380,8 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         keys["joints"] = _joints(keys["joints"], [*axes, *keys.keys() & {"orientation"}], where, f"{path}.joints")
     if not axes and not keys.keys() & {"orientation", "joints"}:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in x = 'x_mm'")
+    if "noise" in keys:
+        _check_noise(keys["noise"], kind, axes, where, f"{path}.noise")
     if "time" in keys:
         keys["time"] = _time(keys["time"], where, f"{path}.time")
     if "where" in keys:
@@ -399,6 +429,17 @@ def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path:
         raise ConfigError(f"{where}: {path}: the orientation has {twice}, which is an axis of its own, too; give one")
     if any(column.get("where") for columns in axes.values() for column in columns):
         raise ConfigError(f"{where}: {path}: axes with rows of their own have no orientation")
+
+
+def _check_noise(given: Any, kind: type[SourceEntry], axes: dict[str, list[Any]], where: str, path: str) -> None:
+    """Refuse a noise of rows that says too much or too little, or that is of no sensor."""
+    one = toml.struct(given, RowNoise, where, path)
+    if bool(one.sd) == bool(one.variance):
+        raise ConfigError(f"{where}: {path}: expected one of sd = 'error_mm' and variance = 'pose.covariance[0]'")
+    if kind is not SourceEntry:
+        raise ConfigError(f"{where}: {path}: only rows of sensors have a noise")
+    if any(column.get("where") for columns in axes.values() for column in columns):
+        raise ConfigError(f"{where}: {path}: axes with rows of their own have no noise of each row")
 
 
 def _joints(given: Any, beside: Iterable[str], where: str, path: str) -> dict[str, Any]:

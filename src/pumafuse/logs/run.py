@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 Clock = Literal["stamps", "regular"]
 REFERENCE = "reference"  # the name of a run's reference among its sensors
+NOISE = "noise"  # what arrays and events call how noisy a row is
 
 _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
 _OUT_OF_ORDER_NS = 1_000_000_000  # by which rows are out of order without a word
@@ -59,6 +60,7 @@ class Source:
             the source tells none. :func:`pumafuse.logs.axes.in_axes` makes axes of it.
         stray: Rows of commands of which a value is left out, as nobody sent it, (rows,); (0,) where none is.
         joints: Where the joints are of which x, y, z and the orientation are the pose; None where none are told.
+        noise: By what a sensor's noise is scaled in each row, on all axes, (rows,); (0,) where by nothing.
     """
 
     stamp: TimeArray
@@ -70,6 +72,7 @@ class Source:
     orientation: FloatArray | None = None
     stray: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     joints: Joints | None = None
+    noise: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def sd_of(self, axis: str) -> float:
         """Standard deviation of the noise of a reference on one axis [m or rad]."""
@@ -250,9 +253,9 @@ class Source:
         stray = self.stray[chosen] if len(self.stray) else self.stray
         turned = None if self.orientation is None else self.orientation[chosen]
         joints = None if self.joints is None else Joints(self.joints.chain, self.joints.values[chosen])
-        return replace(
-            self, stamp=self.stamp[chosen], values=values, spread=spread, stray=stray, orientation=turned, joints=joints
-        )
+        noise = self.noise[chosen] if len(self.noise) else self.noise
+        kept = replace(self, stamp=self.stamp[chosen], values=values, spread=spread, orientation=turned, joints=joints)
+        return replace(kept, stray=stray, noise=noise)
 
 
 @dataclass(frozen=True, repr=False)
@@ -419,7 +422,8 @@ class Run:
             time: Stamps of the commands, float seconds or int64 ns, (n,).
             command: u [m or rad] for each axis, (n,). Of a tool that turns also its ``orientation``, quaternions x, y,
                 z, w, (n, 4), here and in what follows.
-            sensors: For each sensor its stamps (m,) and its values for each axis, (m,).
+            sensors: For each sensor its stamps (m,) and its values for each axis, (m,). A column ``noise`` is by what
+                the sensor's noise is scaled in each row.
             reference: Stamps (k,) and reference positions for each axis, (k,).
             reference_sd: Standard deviation of the reference's own noise, for all axes or for each.
             start: Start level of axes that rest elsewhere than at their first command.
@@ -434,6 +438,8 @@ class Run:
         commands = _from_arrays("command", (time, command), notes)
         streams = {name: _from_arrays(name, arrays, notes) for name, arrays in (sensors or {}).items()}
         scored = None if reference is None else replace(_from_arrays(REFERENCE, reference, notes), sd=reference_sd)
+        if len(commands.noise) or (scored is not None and len(scored.noise)):
+            raise RunError("noise: only rows of sensors have one")
         return Run(name, commands, streams, scored, dict(start or {}), clock, frame, notes=tuple(notes))
 
 
@@ -527,7 +533,7 @@ def _from_arrays(label: str, arrays: Any, notes: list[str]) -> Source:
     try:
         stamp = _stamps(np.array(time))
         columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
-        turned = columns.pop("orientation", None)
+        turned, noise = columns.pop("orientation", None), columns.get(NOISE, np.zeros(0))
     except (ValueError, TypeError, OverflowError) as error:
         raise RunError(
             f"{label}: stamps are int ns, float seconds or datetime64, values are numbers: {error}"
@@ -541,8 +547,10 @@ def _from_arrays(label: str, arrays: Any, notes: list[str]) -> Source:
         raise RunError(f"{label}: orientation has shape {turned.shape}; a quaternion x, y, z, w a stamp is needed")
     if (not columns and turned is None) or not len(stamp):
         raise RunError(f"{label}: no values")
+    if columns.pop(NOISE, None) is not None and not (noise > 0.0).all():
+        raise RunError(f"{label}: noise is by what that of each row is scaled: a positive number a stamp is needed")
     oriented = None if turned is None else rotations.of_quaternions(turned)
-    source = Source(stamp, columns, label, orientation=oriented)
+    source = Source(stamp, columns, label, orientation=oriented, noise=noise)
     _note_standing_clock(notes, source, "give stamps as fine as the rows")
     return source
 
@@ -610,6 +618,8 @@ def of_tables(
         if known is not None:
             (zoned if known else naive).append(name)
         found = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units, entry.orientation)
+        if entry.noise is not None:
+            found = replace(found, noise=entry.noise.factor(read[entry.rows].plain(entry.noise.column)[0]))
         if chain is not None and entry.joints:
             found = _posed(found, read[entry.rows], entry.joints, chain, units)
         if entry.entity:

@@ -12,9 +12,18 @@ from .. import toml
 from ..errors import RunError
 from ..units import SCREEN, Screen, seconds
 from . import tables
-from .run import Run, Source
+from .run import NOISE, Run, Source
 
-_KEYS = ("file", "topic", "entity", "where", "time", "start", "clock")  # of a source in run.toml; others are axes
+_KEYS = (
+    "file",
+    "topic",
+    "entity",
+    "where",
+    "time",
+    "start",
+    "clock",
+    NOISE,
+)  # of a source in run.toml; others are axes
 _TAKEN = ("commands", "truth", "trials", "samples", "path")
 
 
@@ -83,6 +92,10 @@ def _entry(run: Run, source: Source, file: str, folder: Path) -> dict[str, Any]:
         f"{axis}_{screen.unit}": pa.array(np.round(source.values[axis] * screen.scale, 6), from_pandas=True)
         for axis, screen in screens.items()
     }
+    if len(source.noise):
+        columns[NOISE] = pa.array(source.noise)
     stamp = pa.array(seconds(source.stamp), from_pandas=True)
     tables.write(pa.table({"time_s": stamp, **columns}), folder / file)
-    return {"file": file, "time": "time_s", **{axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}}
+    noise = {NOISE: {"sd": NOISE, "typical": 1.0}} if len(source.noise) else {}
+    named = {axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}
+    return {"file": file, "time": "time_s", **named, **noise}
