@@ -144,21 +144,37 @@ def test_what_an_arm_leaves_is_found(number: int, kind: str) -> None:
 
 
 @pytest.mark.parametrize("believed", [False, True])
-def test_noise_is_believed_to_be_nine_tenths_of_what_second_differences_show(believed: bool) -> None:
+def test_noise_is_believed_to_be_what_second_differences_show_where_the_arm_is_calm(believed: bool) -> None:
     """Within a factor of 1.9: log-posteriors are the likelihood less half the square of that, at a maximum."""
     one, arm = recording(3), Arm(0.05, 0.08)
     measured = Measured([one], T, ["a"])
-    left = one.value - response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
-    shown = np.median(np.abs(np.diff(left, 2))) / (0.6745 * np.sqrt(6.0))
+    path = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+    ways = np.ptp(np.lib.stride_tricks.sliding_window_view(path, 3), axis=1)
+    calm = ways <= np.quantile(ways, 1.0 / 3.0)
+    shown = np.median(np.abs(np.diff(one.value - path, 2))[calm]) / (0.6745 * np.sqrt(6.0))
 
     def posterior(rest: Rest) -> float:
-        x = np.log(rest.sd[0] / (0.9 * shown)) / np.log(1.9)
+        x = np.log(rest.sd[0] / shown) / np.log(1.9)
         return float(measured.weighed([arm], rest)[0][0]) - 0.5 * x**2 * believed
 
     for rest, log in rests(measured, arm, 0.04, [1e-6], believed):
         assert log == pytest.approx(posterior(rest), abs=1e-3)
         beside = [posterior(replace(rest, sd=rest.sd * by)) for by in (0.7, 1.4)]
         assert max(beside) < log + 0.05
+
+
+def test_jitter_is_told_where_the_arm_is_calm() -> None:
+    """An arm that is off by 20 mm at random while it moves, half of the time, seen with 2 mm."""
+    rng, one = np.random.default_rng(2), recording(3)
+    time = np.arange(0, 20 * 10**9, 10**7)
+    moving = np.sin(time / 2e9) > 0.0
+    command = np.cumsum(np.where(moving, 1e-3, 0.0))
+    swing = one._replace(given=time, command=command, start=0.0, time=time, source=np.zeros(len(time), np.int64))
+    arm = Arm(0.0, 1e-3)
+    path = response(arm.model, T, arm.delay, time, command, 0.0, time)
+    value = path + rng.normal(0.0, np.where(moving, 0.02, 2e-3))
+    seen = swing._replace(value=value, weight=np.ones(len(time)))
+    assert Measured([seen], T, ["a"]).jitter(arm)[0] == pytest.approx(2e-3, rel=0.15)
 
 
 def test_jitter_is_white_noise_beside_a_smooth_motion() -> None:

@@ -207,7 +207,7 @@ def test_a_scale_and_a_constant_gain_are_not_identifiable_apart() -> None:
 
 
 def test_the_prior_of_a_noise_can_be_turned_off() -> None:
-    """A camera of 0.3 mm: without the prior as it is, with it a little nearer to 0.9 of what second differences show.
+    """A camera of 0.3 mm: without the prior as it is, with it nearer to what second differences show where it is calm.
 
     Both as `tune` takes them; the summary says which it was.
     """

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from .arms import BENDS, SHOWN, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
+from .arms import BENDS, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
 from .bends import Bent, bent_arm
 from .parameters import QUICKEST, RECOVERY, RECOVERY_PRIOR
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
@@ -163,7 +163,7 @@ class ArmSearch:
     @property
     def likely_noise(self) -> dict[str, float]:
         """The white noise that each sensor is believed to have [m]."""
-        found = SHOWN * self._measured.jitter(self._best(self._fits).arm)
+        found = self._measured.jitter(self._best(self._fits).arm)
         return dict(zip(self.sensors, found.tolist(), strict=True))
 
     @property

@@ -24,9 +24,10 @@ from .steps import bounded_step
 _NOISE = np.dtype(
     [(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")]
 )
-# A sensor's noise is believed to be so much of what second differences show, since arms jerk, too; and that within a
-# factor of some 2: the sd of its logarithm. Chosen so that error bars of benchmarks/real.py and tests hold.
-SHOWN, BELIEF = 0.9, math.log(1.9)
+# A sensor's noise is believed to be what second differences show where the arm is calm, as arms jerk, within a factor
+# of some 2: the sd of its logarithm, and the share of the rows. Chosen so that error bars of benchmarks/real.py and
+# tests hold; there a quarter to a half of the rows and factors of 1.5 to 1.9 say the same.
+BELIEF, _CALM = math.log(1.9), 1.0 / 3.0
 _LATEST, _PERIODS = 0.6, 5.0  # s, or update periods: the longest dead time
 _FAR = 30.0  # times all that is measured: where an offset may begin
 _WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
@@ -256,16 +257,18 @@ class Measured:
         return Rest(np.full(len(self.sensors), sd))
 
     def jitter(self, arm: Arm) -> FloatArray:
-        """White noise of each sensor [m], (s,), by second differences of what an arm leaves."""
+        """White noise of each sensor [m], (s,), by second differences of what an arm leaves where it is calm."""
         found = np.full(len(self.sensors), float(self.white(arm).sd[0]))
-        left = self.residuals(arm)
+        moved = self.responses(arm)
         for number in range(len(found)):
-            parts = [
-                np.abs(np.diff(one[(part.source == number) & (part.weight > 0.0)], 2))
-                for one, part in zip(left, self.recordings, strict=True)
-            ]
-            if len(bends := np.concatenate(parts)):
-                found[number] = max(float(np.median(bends)) / _BEND, _SMALLEST)
+            mine = [(one.source == number) & (one.weight > 0.0) for one in self.recordings]
+            paths = [path[rows] for path, rows in zip(moved, mine, strict=True) if rows.sum() > 2]
+            seen = [one.value[rows] for one, rows in zip(self.recordings, mine, strict=True) if rows.sum() > 2]
+            if paths:
+                bends = np.concatenate([np.abs(np.diff(z - r, 2)) for z, r in zip(seen, paths, strict=True)])
+                ways = np.concatenate([np.ptp([r[:-2], r[1:-1], r[2:]], axis=0) for r in paths])
+                calm = ways <= np.quantile(ways, _CALM)
+                found[number] = max(float(np.median(bends[calm])) / _BEND, _SMALLEST)
         return found
 
     def gated(self, arm: Arm, rest: Rest, gate: float) -> Measured:
@@ -518,7 +521,7 @@ def rests(
     spread = max(float(np.std(np.concatenate([one[0] for one in left]))), 1e-7)
     sensors = [(max(one, _SDS[0]), _SDS[1]) for one in least]
     white = np.clip(measured.jitter(arm), *np.transpose(sensors))
-    s, means = len(white), np.log(np.maximum(SHOWN * white, least))
+    s, means = len(white), np.log(np.maximum(white, least))
     for smoothness in (0.0, 1.5, 0.5):
         begin, bounds = [0.1 * spread], [*sensors, _WALKS]
         if smoothness:

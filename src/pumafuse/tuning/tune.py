@@ -317,11 +317,22 @@ class Pipeline:
             self.notes.append("nothing more likely was found than the configuration as given, which is kept")
 
     def result(self) -> FusionConfig:
-        """The best configuration: gates as given, numbers rounded, and 0 for a noise at its lower bound."""
+        """The best configuration: gates as given, numbers rounded, and 0 for a noise at its lower bound.
+
+        A maximum may lie where a gate just takes a row: numbers that leave it by being rounded keep their digits.
+        """
+        found, exact = self._written(rounded), self._written(float)
+        lost = (
+            _evaluated(one.likelihood, exact).total - _evaluated(one.likelihood, found).total for one in self.stages
+        )
+        return exact if any(one > _NOTHING for one in lost) else found
+
+    def _written(self, number: Callable[[float], float]) -> FusionConfig:
+        """The best configuration with the numbers as they are to be written."""
         best = with_gates(self.best, self.config)
         for one in (one for stage in self.stages for one in stage.free if one.given(best) is not None):
             none = one.vanishes and one.at_bound(best) == "lower"
-            best = one.put(best, 0.0 if none else one.clipped(rounded(one.get(best))))
+            best = one.put(best, 0.0 if none else one.clipped(number(one.get(best))))
         return best
 
 
