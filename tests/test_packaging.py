@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tarfile
+import tomllib
 import venv
 import zipfile
 from importlib.metadata import distribution, requires, version
@@ -50,6 +51,12 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "build", "--no-isolation", "--sdist", "--wheel", "--outdir", folder)
     return next(folder.glob("*.whl")), next(folder.glob("*.tar.gz"))
+
+
+def test_the_citation_is_of_this_version() -> None:
+    """That of pyproject.toml, which is the only other place that says it."""
+    project, citation = ((ROOT / name).read_text() for name in ("pyproject.toml", "CITATION.cff"))
+    assert f"\nversion: {tomllib.loads(project)['project']['version']}\n" in citation
 
 
 @pytest.mark.long
