@@ -88,6 +88,15 @@ def test_a_shared_delay_weighs_the_axes_by_what_they_know() -> None:
     assert together[1] - together[0] == pytest.approx(2.0 * 1.96 * 1e-3 / math.sqrt(1.25), rel=0.02)
 
 
+def test_a_dead_time_that_may_be_shared_is_a_mixture() -> None:
+    """One to three that it is an axis's own: the ends solve ¾ Φ of both axes + ¼ Φ of its own = 2.5 % and 97.5 %."""
+    wide, narrow = AxisPosterior([branch(0.083, 4e-3)]), AxisPosterior([branch(0.080, 1e-3)])
+    ends = wide.mixture([narrow], 0.75).quantiles("delay", lambda _: True)
+    middle, sd = (0.083 / 16.0 + 0.080) / (1.0 / 16.0 + 1.0), 1e-3 / math.sqrt(1.0 + 1.0 / 16.0)
+    below = [0.75 * norm.cdf(end, middle, sd) + 0.25 * norm.cdf(end, 0.083, 4e-3) for end in ends]
+    assert below == pytest.approx([0.025, 0.975], abs=3e-3)
+
+
 def test_the_simplest_of_the_likely_models_is_taken() -> None:
     """A model that is a fifth as likely as the best is preferred where it has fewer numbers, a less likely one not."""
 

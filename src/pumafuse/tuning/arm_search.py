@@ -30,6 +30,7 @@ from .posterior import (
     Model,
     Quantity,
     chosen_model,
+    own_worth,
     shared_delay,
     sharing,
 )
@@ -438,11 +439,13 @@ def chosen_arms(
     known = {axis: one.posterior for axis, one in searched.items() if axis in delayed}
     shares = list(known) if one_delay else sharing(known)
     delay, found = shared_delay([known[axis] for axis in shares]) if shares else None, dict[str, Chosen]()
+    worth = {} if one_delay else own_worth(known, shares)
     for axis, search in searched.items():
-        mine = axis in shares
-        mixture = search.posterior.mixture([known[one] for one in shares if mine and one != axis])
-        model = chosen_model(mixture)
-        found[axis] = Chosen(search.arm(model, delay if mine else None), model, mixture, mine)
+        mine, posterior = axis in shares, search.posterior
+        others = [known[one] for one in shares if mine and one != axis]
+        model = chosen_model(posterior.mixture(others))
+        likely = posterior.mixture(others, 1.0 / (1.0 + math.exp(worth[axis])) if mine and worth else 1.0)
+        found[axis] = Chosen(search.arm(model, delay if mine else None), model, likely, mine)
     return found, delay
 
 

@@ -153,14 +153,20 @@ class AxisPosterior:
             found = np.logaddexp(found, np.max(each, axis=0))
         return found
 
-    def mixture(self, others: Iterable[AxisPosterior] = ()) -> Mixture:
-        """The mixture, with the log-density of the dead time by other axes that share it."""
+    def mixture(self, others: Iterable[AxisPosterior] = (), sharing: float = 1.0) -> Mixture:
+        """The mixture, with what other axes say of the dead time, so far as it is likely that they share it.
+
+        Args:
+            others: The other axes.
+            sharing: The probability that they do.
+        """
         parts = [self._points(branch) for branch in self.branches]
         delay = np.concatenate([part.delay for part in parts])
-        logs = np.concatenate([part.weight for part in parts]) + sum(one.log_density(delay) for one in others)
-        weight = np.exp(logs - logs.max())
+        own = np.concatenate([part.weight for part in parts])
+        shared = own + sum(one.log_density(delay) for one in others)
+        found, alone = (np.exp(logs - logs.max()) for logs in (shared, own))
         return Mixture(
-            weight / weight.sum(),
+            sharing * found / found.sum() + (1.0 - sharing) * alone / alone.sum(),
             np.concatenate([part.model for part in parts]),
             delay,
             {name: np.concatenate([part.mean[name] for part in parts]) for name in QUANTITIES},
