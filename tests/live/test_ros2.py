@@ -357,7 +357,7 @@ def test_from_a_bag_to_the_node_nothing_is_edited(tmp_path: Path, start: Callabl
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
     line = next(one for one in done.stdout.splitlines() if one.startswith("or as a node of ROS 2: "))
     assert line.split()[-4:] == ["live", f"ros2:{tmp_path}/mine/run.toml", "-c", f"{tmp_path}/mine/fusion.toml"]
-    node, begin = start(tmp_path / "mine"), time.time_ns() + STARTS + BEFORE_NS
+    node, begin = start(tmp_path / "mine"), time.time_ns() + 3 * STARTS + BEFORE_NS  # beside other long tests
     sent, where = moved(begin, 8.0, 1.0)
     joints = [one for one in publish(tmp_path, sent) if one["topic"] == "joints"]
     log = node.end()
