@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+from pumafuse.tuning.arm_search import chosen_arms
 from pumafuse.tuning.arms import Arm
 from pumafuse.tuning.posterior import (
     MODELS,
@@ -95,6 +98,18 @@ def test_a_dead_time_that_may_be_shared_is_a_mixture() -> None:
     middle, sd = (0.083 / 16.0 + 0.080) / (1.0 / 16.0 + 1.0), 1e-3 / math.sqrt(1.0 + 1.0 / 16.0)
     below = [0.75 * norm.cdf(end, middle, sd) + 0.25 * norm.cdf(end, 0.083, 4e-3) for end in ends]
     assert below == pytest.approx([0.025, 0.975], abs=3e-3)
+
+
+def test_an_axis_that_knows_little_has_the_interval_of_those_it_shares_with() -> None:
+    """Log-odds of sharing of 3.9: a fiftieth that the dead time is its own moves the ends by little."""
+    known = {"a": AxisPosterior([branch(0.080, 1e-4)]), "b": AxisPosterior([branch(0.0805, 4e-3)])}
+    searched: dict[str, Any] = {
+        axis: SimpleNamespace(posterior=one, arm=lambda *_: Arm(0.08, 0.02)) for axis, one in known.items()
+    }
+    found, _ = chosen_arms(searched, known)
+    low, high = found["b"].mixture.quantiles("delay", lambda _: True)
+    assert own_worth(known, ["a", "b"])["b"] == pytest.approx(-3.9, abs=0.1)
+    assert 2.0 * 1.96e-4 < high - low + 1e-5 < 2.0 * 3e-4
 
 
 def test_the_simplest_of_the_likely_models_is_taken() -> None:
