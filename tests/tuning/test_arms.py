@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -186,3 +188,22 @@ def test_jitter_is_white_noise_beside_a_smooth_motion() -> None:
     still = recording(1)._replace(time=time, value=value, source=source, weight=np.ones(count))
     still = still._replace(command=np.full(100, 0.3))
     assert Measured([still], T, ["a", "b"]).jitter(Arm(0.0, 0.1)) == pytest.approx([1e-4, 1e-3], rel=0.1)
+
+
+def test_threads_change_no_weight() -> None:
+    """Axes are searched in threads: what others do with memory in the meantime changes no bit of a weight."""
+    rest, arms = RESTS[2], [arm._replace(gain=1.0) for arm in ARMS]
+
+    def weights(seed: int) -> list[bytes]:
+        measured = Measured([recording(seed)], T, ["eye"])
+        return [measured.weighed(arms, rest)[0].tobytes() for _ in range(1500)]
+
+    alone = [weights(seed)[0] for seed in range(3)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            together = list(pool.map(weights, range(3)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert [set(each) for each in together] == [{one} for one in alone]

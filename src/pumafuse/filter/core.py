@@ -130,7 +130,7 @@ library = _loaded()
 
 
 def at(array: np.ndarray) -> int:
-    """Where an array begins in memory; it must lie there as a whole."""
+    """Where an array begins in memory; it must lie there as a whole, and have a name for as long as that is used."""
     assert array.flags.c_contiguous
     return array.ctypes.data
 

@@ -319,10 +319,10 @@ class Measured:
         for one in self.recordings:
             white, log = self._white(one, rest, self._columns(one))
             own, log_determinant = own + white @ white.T, log_determinant + log
-            found, variance = np.empty_like(products), self._variance(one, rest)
+            found, noise, variance = np.empty_like(products), self._noise(rest), self._variance(one, rest)
             records["start"] = one.start
             library.pf_weigh(
-                at(self._noise(rest)), len(one.time), at(one.time), at(variance), c, at(white), len(one.given),
+                at(noise), len(one.time), at(one.time), at(variance), c, at(white), len(one.given),
                 at(one.given), at(one.command), len(arms), at(records), at(found),
             )  # fmt: skip
             products += found
