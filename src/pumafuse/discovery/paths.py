@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,7 @@ _RIDGES = 10.0 ** np.arange(-5.5, 0.1, 0.5)  # of the largest singular value; pr
 _ROWS_A_KNOT = (2, 3, 5, 8, 16, 32, 64, 128)
 _FEWEST_KNOTS = 6
 _CLIP = 10.0
+ASIDE = 1e-3  # s, beside an instant, for speeds
 
 
 def _placed(knots: FloatArray, coefficients: FloatArray) -> FloatArray:
@@ -62,22 +64,33 @@ class Shrunk:
     freedom: float
 
 
-def shrunk(X: FloatArray, z: FloatArray, penalty: float | None = None) -> Shrunk:
-    """Least squares with a ridge; None: that with the least generalised cross-validation error.
+class Products(NamedTuple):
+    """Products of columns without means, (k, k), of these with what they are to explain, (k,), and its square.
 
-    Args:
-        X: Design, (n, k), whose columns have no mean.
-        z: What it is to explain, (n,), likewise.
-        penalty: The ridge.
+    Of how many rows they are, too.
     """
-    power, V = np.linalg.eigh(X.T @ X)
+
+    square: FloatArray
+    score: FloatArray
+    power: float
+    rows: int
+
+    @classmethod
+    def of(cls, X: FloatArray, z: FloatArray) -> Products:
+        """Those of a design, (n, k), and what it is to explain, (n,)."""
+        return cls(X.T @ X, X.T @ z, float(z @ z), len(z))
+
+
+def shrunk(products: Products, penalty: float | None = None) -> Shrunk:
+    """Least squares with a ridge; None: that with the least generalised cross-validation error."""
+    power, V = np.linalg.eigh(products.square)
     power = np.maximum(power, 0.0)
-    b = V.T @ (X.T @ z)
+    b = V.T @ products.score
     ridges = _RIDGES * math.sqrt(max(float(power[-1]), 1e-300)) if penalty is None else np.array([penalty])
     share = 1.0 / (power + ridges[:, None] ** 2)
     freedom = (power * share).sum(axis=1)
-    rest = float(z @ z) - (b**2 * (2.0 * share - power * share**2)).sum(axis=1)
-    best = int(np.argmin(rest / np.maximum(len(z) - 2.0 - freedom, 1.0) ** 2))
+    rest = products.power - (b**2 * (2.0 * share - power * share**2)).sum(axis=1)
+    best = int(np.argmin(rest / np.maximum(products.rows - 2.0 - freedom, 1.0) ** 2))
     return Shrunk(V @ (share[best] * b), float(ridges[best]), float(freedom[best]))
 
 
@@ -100,6 +113,10 @@ class Residue:
     def __call__(self, at: FloatArray) -> FloatArray:
         """Its value at instants [s], (n,)."""
         return np.zeros(len(at)) if self.spline is None else self.spline(np.clip(at, self.begin, self.end))
+
+    def slope(self, at: FloatArray) -> FloatArray:
+        """How fast it changes at instants [s], (n,)."""
+        return (self(at + ASIDE) - self(at - ASIDE)) / (2.0 * ASIDE)
 
 
 def residue(s: FloatArray, rest: FloatArray, freedom: float) -> Residue:
@@ -180,7 +197,7 @@ def _explained(
     """Responses, their coefficients, and what they leave of a sensor, (n,)."""
     basis = _responses(*command, knots)
     X = basis(s)
-    found = shrunk(X - X.mean(axis=0), z - z.mean())
+    found = shrunk(Products.of(X - X.mean(axis=0), z - z.mean()))
     return basis, found, z - X @ found.coefficients
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -20,7 +21,20 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..logs.run import Run, Source
 from ..units import MS
 from .following import following, isolated, known
-from .paths import Path, Residue, Shrunk, clipped_rms, interpolated, path, residue, robust_sd, shrunk
+from .paths import (
+    ASIDE,
+    Basis,
+    Path,
+    Products,
+    Residue,
+    Shrunk,
+    clipped_rms,
+    interpolated,
+    path,
+    residue,
+    robust_sd,
+    shrunk,
+)
 
 _FOLLOWS = 0.5  # correlation of changes below which two sensors do not see one motion
 _FEWEST = 40  # rows of a sensor from which its latency is looked for
@@ -30,7 +44,6 @@ _STILL = 20  # rows of one value, of which none is used
 _PAUSE = 5.0  # mean intervals, over which a path by a sensor does not go on
 _ROUNDS, _FITTED, _CLOSE = 20, 3, 1e-5  # at the most; in which the noise is fitted anew; s
 _FARTHEST = 0.03  # s, by which a round moves the latency
-_ASIDE = 1e-3  # s, beside an instant, for speeds
 _BETTER = 0.98  # of what a smooth path leaves of the second sensor: one through all rows of the first must leave less
 _BEYOND = 3.0  # sds from which a row counts less (Huber)
 _PIECES = 20  # of the motion
@@ -161,6 +174,22 @@ def noise(command: Source, source: Source, axis: str, lag: float) -> float:
 # ---- rows -----------------------------------------------------------------------------------------------------------
 
 
+class _Design(NamedTuple):
+    """Responses at instants, without their means, how fast they change [1/s], (n, k), and their products, (k, k)."""
+
+    responses: FloatArray
+    slopes: FloatArray
+    square: FloatArray
+
+
+def _design(basis: Basis, at: FloatArray) -> _Design:
+    """The responses at instants [s], (n,)."""
+    responses = basis(at)
+    responses -= responses.mean(axis=0)
+    slopes = (basis(at + ASIDE) - basis(at - ASIDE)) / (2.0 * ASIDE)
+    return _Design(responses, slopes, responses.T @ responses)
+
+
 @dataclass(frozen=True)
 class _Axis:
     """What two sensors tell of an axis; the denser one is the first [s, m or rad], and the path is by it."""
@@ -173,6 +202,11 @@ class _Axis:
     z2: FloatArray
     lag: float
     slope: float
+
+    @cached_property
+    def first(self) -> _Design:
+        """Of the first sensor's rows, whatever the latency."""
+        return _design(self.path.basis, self.s)
 
     def between(self, begin: float, end: float) -> _Axis:
         """Its rows between two stamps of the second sensor [s]."""
@@ -273,7 +307,7 @@ class _Linear:
     """An axis about a latency, its n rows those of the first sensor before those of the second."""
 
     axis: _Axis
-    time: FloatArray  # when each row was valid [s], (n,)
+    at: FloatArray  # when the rows of the second were valid [s]
     columns: FloatArray  # responses, levels of both, position, less the speed, and what is left, weighted, (n, k + 5)
     rest: FloatArray  # what is left of each row [sd], (n,)
     speed: FloatArray  # of what it tells [sd/s], (n,)
@@ -288,41 +322,42 @@ class _Linear:
 
 def _linear(axis: _Axis, noise: _Noise, latency: float, fitted: bool) -> _Linear:
     """An axis about a latency; ``fitted``: the noise is fitted anew."""
-    n1, n2 = len(axis.s), len(axis.x)
-    at = axis.x - latency
-    X1, X2 = axis.path.basis(axis.s), axis.path.basis(at)
-    y1, y2 = axis.z1 - noise.left(axis.s), axis.z2 - noise.scale * noise.left(at)
-    X = np.vstack([(X1 - X1.mean(0)) / noise.sd1, noise.scale * (X2 - X2.mean(0)) / noise.sd2])
-    z = np.concatenate([(y1 - y1.mean()) / noise.sd1, (y2 - y2.mean()) / noise.sd2])
-    found = shrunk(X, z, None if fitted else noise.penalty)
-    coefficients = found.coefficients
-    rest1 = y1 - X1 @ coefficients
-    rest2 = y2 - noise.scale * (X2 @ coefficients)
+    n1, n2, at = len(axis.s), len(axis.x), axis.x - latency
+    one, two = axis.first, _design(axis.path.basis, at)
+    left1, left2 = noise.left(axis.s), noise.left(at)
+    y1, y2 = axis.z1 - left1, axis.z2 - noise.scale * left2
+    y1, y2 = y1 - y1.mean(), y2 - y2.mean()
+    weight1, weight2 = 1.0 / noise.sd1**2, noise.scale / noise.sd2**2
+    products = Products(
+        weight1 * one.square + weight2 * noise.scale * two.square,
+        weight1 * (y1 @ one.responses) + weight2 * (y2 @ two.responses),
+        weight1 * float(y1 @ y1) + float(y2 @ y2) / noise.sd2**2,
+        n1 + n2,
+    )
+    found = shrunk(products, None if fitted else noise.penalty)
+    coefficients, k = found.coefficients, len(found.coefficients)
+    moved1, moved2 = one.responses @ coefficients, two.responses @ coefficients
+    rest1, rest2 = y1 - moved1, y2 - noise.scale * moved2
     rest1, rest2 = rest1 - np.median(rest1), rest2 - np.median(rest2)
-
-    def position(time: FloatArray) -> FloatArray:
-        return axis.path.basis(time) @ coefficients + noise.left(time)
-
-    time, k = np.concatenate([axis.s, at]), X.shape[1]
-    sd = np.repeat([noise.sd1, noise.sd2], [n1, n2])
-    rest = np.concatenate([rest1, rest2]) / sd
-    speed = (position(time + _ASIDE) - position(time - _ASIDE)) / (2.0 * _ASIDE) / sd
-    speed[n1:] *= noise.scale
+    rest = np.concatenate([rest1 / noise.sd1, rest2 / noise.sd2])
+    speed1 = one.slopes @ coefficients + noise.left.slope(axis.s)
+    speed2 = noise.scale * (two.slopes @ coefficients + noise.left.slope(at))
+    speed = np.concatenate([speed1 / noise.sd1, speed2 / noise.sd2])
     columns = np.zeros((n1 + n2, k + 5))
-    columns[:n1, :k], columns[n1:, :k] = X1 / noise.sd1, noise.scale * X2 / noise.sd2
+    columns[:n1, :k], columns[n1:, :k] = one.responses / noise.sd1, noise.scale / noise.sd2 * two.responses
     columns[:n1, k], columns[n1:, k + 1] = 1.0 / noise.sd1, 1.0 / noise.sd2
-    columns[n1:, k + 2], columns[n1:, k + 3], columns[:, k + 4] = position(at) / noise.sd2, -speed[n1:], rest
+    columns[n1:, k + 2], columns[n1:, k + 3], columns[:, k + 4] = (moved2 + left2) / noise.sd2, -speed[n1:], rest
     columns *= np.sqrt(np.minimum(1.0, _BEYOND / np.maximum(np.abs(rest), 1e-300)))[:, None]  # Huber's weights
     used = found.freedom * n1 / (n1 + n2)
     sd2 = clipped_rms(rest2) * math.sqrt(n2 / max(n2 - 2.0 - found.freedom + used, 1.0))
     noise = replace(noise, sd2=max(sd2, floor := 1e-9 * float(np.ptp(axis.z2))), penalty=found.penalty)
     if fitted:
-        whole1, whole2 = rest1 + noise.left(axis.s), rest2 + noise.scale * noise.left(at)
+        whole1, whole2 = rest1 + left1, rest2 + noise.scale * left2
         smooth, through = residue(axis.s, whole1, used), interpolated(axis.s, whole1)
         sd1 = clipped_rms(whole1 - smooth(axis.s)) * math.sqrt(n1 / max(n1 - 1.0 - used - smooth.freedom, 1.0))
         off = [clipped_rms(whole2 - noise.scale * one(at)) for one in (smooth, through)]
         noise = replace(noise, sd1=max(sd1, floor), left=through if off[1] < _BETTER * off[0] else smooth)
-    return _Linear(axis, time, columns, rest, speed, found, noise)
+    return _Linear(axis, at, columns, rest, speed, found, noise)
 
 
 class _Fit(NamedTuple):
@@ -362,15 +397,17 @@ def _fit(axes: Sequence[_Axis], latency: float) -> _Fit | None:
 
 def _grams(lines: Sequence[_Linear]) -> list[FloatArray]:
     """For each axis the products of its columns over pieces that tell as much about the latency, (pieces, k+5, k+5)."""
-    time = np.concatenate([one.time[len(one.axis.s) :] for one in lines])
+    time = np.concatenate([one.at for one in lines])
     order = np.argsort(time)
     told = np.cumsum(np.concatenate([one.late(False)[1] ** 2 for one in lines])[order])
     edges = np.interp(np.arange(1, _PIECES) / _PIECES, told / told[-1], time[order])
 
     def of(line: _Linear) -> FloatArray:
-        order = np.argsort(line.time)
-        rows = np.split(line.columns[order], np.searchsorted(line.time[order], edges))
-        return np.array([some.T @ some for some in rows])
+        both = zip(np.split(line.columns, [len(line.axis.s)]), (line.axis.s, line.at), strict=True)
+        first, second = (
+            np.array([some.T @ some for some in np.split(rows, np.searchsorted(when, edges))]) for rows, when in both
+        )
+        return first + second
 
     return [of(line) for line in lines]
 
