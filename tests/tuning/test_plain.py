@@ -16,7 +16,7 @@ from pumafuse.model.arm import AxisModel, Gain
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.arms import Arm, Measured, Recording
 from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.plain import Doubt, PlainArm, doubts, plain_arm, with_plain_arm
+from pumafuse.tuning.plain import Doubt, PlainArm, doubts, off, plain_arm, with_plain_arm
 from pumafuse.tuning.summary import FittedLag, with_doubts
 from tuning_runs import quietly, replaced, scenario
 
@@ -105,8 +105,8 @@ def test_one_command_says_the_lag_of_an_arm_with_a_dead_band(tmp_path: Path) -> 
 def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_that_of_least_squares() -> None:
     """80 (78 to 82) ms by the likelihood and 50 to 60 ms by least squares are 50 to 82; an open end stays open."""
     config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config
-    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), 0.055, 1e-3, Measured([], T, []))
-    doubted = {axis: Doubt(arm, off=2e-3) for axis in config.arm.axes}
+    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), 0.9e-3, 0.055, 1e-3, Measured([], T, []))
+    doubted = {axis: Doubt(arm, off=1.5e-3, lag=0.08) for axis in config.arm.axes}
     first, *others = config.arm.axes
     lags = {first: FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(78.0, 82.0))}
     found = with_doubts(lags, doubted, config, config)
@@ -114,7 +114,51 @@ def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_t
     assert found[others[0]].lag_ms_ci95 == (50.0, 60.0)
     lags = {first: FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(None, 82.0))}
     assert with_doubts(lags, doubted, config, config)[first].lag_ms_ci95 == (None, 82.0)
-    assert [Doubt(arm, off).refutes for off in (3.9e-3, 4.1e-3)] == [False, True]
+    worse = [Doubt(arm, off, lag=0.08).refutes for off in (1.2e-3, 1.7e-3, 1.9e-3)]  # than 1 mm, and than twice 0.9 mm
+    assert worse == [False, False, True]
+    poor = arm._replace(off=3e-3)  # four times as far off as the delayed command, whatever least squares do
+    assert [Doubt(poor, off, lag=0.08).refutes for off in (3.9e-3, 4.1e-3)] == [False, True]
+
+
+def steps(rest: float, lag: float) -> Recording:
+    """Steps every ``rest`` [s] by an arm of first order, at rest most of the time, by an encoder without noise."""
+    rng = np.random.default_rng(2)
+    given = np.arange(0, round(400.0 * 1e9), round(T * 1e9))
+    level = rng.uniform(0.2, 0.8, 1 + int(400.0 / rest))
+    command = level[(given / 1e9 / rest).astype(int)]
+    time = np.arange(0, given[-1], round(0.1 * 1e9))
+    moved = Measured([Recording(given, command, command[0], time, np.zeros(len(time)), np.zeros(len(time), np.int64),
+                                np.ones(len(time)))], T, ["eye"]).responses(Arm(0.5 * lag, 0.5 * lag))[0]  # fmt: skip
+    return Recording(given, command, command[0], time, moved, np.zeros(len(time), np.int64), np.ones(len(time)))
+
+
+def test_an_axis_that_mostly_rests_is_judged_where_it_moves() -> None:
+    """Of steps every 20 s the rows in motion are no outliers, and an arm that is late by half as much is refuted."""
+    found = found_in(steps(20.0, 0.3))
+    assert found is not None
+    assert found.arm.total == pytest.approx(0.3, abs=1e-3)
+    assert found.measured.count == len(steps(20.0, 0.3).time)
+    sooner = off(found.measured, Arm(0.075, 0.075))
+    assert sooner > 0.02  # m; at rest it is right to a micrometre
+    assert Doubt(found, sooner, 0.15).refutes
+
+
+def test_a_lag_that_least_squares_exclude_is_said_and_its_interval_covers_both() -> None:
+    """Also of an arm that predicts about as well; a little outside nothing is said. Play makes it no doubt."""
+    config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config
+    axis = next(iter(config.arm.axes))
+    lag = config.arm.lag_of(axis)
+    plain = found_in(motion(0.5 * lag, 0.5 * lag, 1.0))
+    assert plain is not None
+    for share, said in ((1.05, False), (1.5, True)):
+        low, high = share * lag, share * lag + 0.01
+        one = plain._replace(arm=Arm(low, 0.005), lag_ci95=(low, high), delayed_off=np.inf)
+        doubt = doubts({axis: one}, config)[axis]
+        assert not doubt.is_worse
+        assert (f"lag of {1e3 * lag:.4g} ms, least squares" in doubt.sentence(config, axis)) is said
+        with_play = replaced(config.arm.axes[axis], play=1e-3)
+        bent = replaced(config, arm=replaced(config.arm, axes={**config.arm.axes, axis: with_play}))
+        assert doubts({axis: one}, bent) == {}
 
 
 def test_no_lag_is_told_of_a_sensor_that_measures_something_else(tmp_path: Path) -> None:

@@ -79,7 +79,10 @@ _VELOCITIES = names.words_in("Twist TwistStamped TwistWithCovariance TwistWithCo
 _SPEEDS = names.words_in("velocity velocities vel speed twist")  # why columns are no positions
 _ARE_VELOCITIES, _UNDECODED = "velocities, no positions", "its messages cannot be decoded"
 _OF_FRAME = ["header", "child_frame_id", "transform"]  # of a transform
-_PX4 = "PX4"  # whose numbers are in SI units
+_PX4 = "PX4"  # whose numbers are in SI units; of its hundred topics those have positions that are called so:
+_PX4_TOPICS = names.words_in("position attitude odometry trajectory pose gimbal joint joints angle angles servo")
+_PX4_OTHERS = names.words_in("gps global estimator status rates triplet sensor selector")  # and by none of these
+_PX4_PLACE = re.compile(r"position\[([012])\]")
 _CHILD = "child_frame_id"
 _BASES = names.words_in("base world map odom root origin")  # words of frames that stand still
 _TOOLS = names.words_in("tool tcp ee eef effector flange hand gripper")
@@ -375,11 +378,17 @@ def _signal(
         return f"always {known[0]:g}"
     kind = _RADIANS[0] if joint else place.type.rpartition("/")[2]
     sliding = kind in _RADIANS and names.has_word(joint or path, names.SLIDING)
-    metres = kind in _METRES or sliding or _ECHOED.match(path) or (kind == _PX4 and not names.is_turning(path))
+    metres = kind in _METRES or sliding or _ECHOED.match(path)
     of_type = "m" if metres else "rad" if kind in _RADIANS or path.startswith(f"{PATH}.") else ""
     unit = names.unit_of(path) or names.unit_of(place.topic or place.entity)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
     axis = joint or names.axis_of(_called(_ECHO.sub("", path), where), labels)
+    if kind == _PX4:
+        place_of = _PX4_PLACE.fullmatch(path)
+        axis = "xyz"[int(place_of[1])] if place_of else axis
+        if axis not in CARTESIAN and not names.is_turning(axis):
+            return "neither x, y, z nor an angle by its name"
+        of_type, basis = ("m" if axis in CARTESIAN else "rad"), "type"
     return Signal(path, axis, unit or of_type, basis, values, where=where)
 
 
@@ -653,6 +662,10 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
 def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
     """A table; of several runs in it the first, of a sensor's rows those that it calls valid; of tf each frame."""
     read = partial(tables.read, path, growing=True, topic=topic)
+    px4 = path.suffix == ".ulg"
+    if px4 and (not names.has_word(topic, _PX4_TOPICS) or names.has_word(topic, _PX4_OTHERS)):
+        yield Part(path, topic, type=_PX4, notes=("no positions, by its name",))
+        return
     if path.suffix == ".parquet":
         with tables.one_line(path):
             fields = _likeliest([one.name for one in papq.read_schema(path) if "binary" not in str(one.type)])  # images
@@ -668,7 +681,7 @@ def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
         where, rows = {**where, **valid}, table.rows
         table = tables.chosen(table, valid)
         notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
-    type_ = _PX4 if path.suffix == ".ulg" else ""
+    type_ = _PX4 if px4 else ""
     for place, rows in _by_frame(table, Part(path, topic, where=where, type=type_, notes=tuple(notes))):
         yield _part(rows, place, _labels(path), rate)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -36,6 +37,7 @@ _SHARE, _SMALLEST = 0.98, 1e-7  # of the measurements that least squares are of;
 _BEND = 0.6745 * math.sqrt(6.0)  # median of a second difference of white noise, in its standard deviations
 _FEW = 3  # outliers in a row
 _HARMLESS = 0.02  # of the range that is measured
+_SLOW, _FASTEST = 0.1, 0.99  # of the speed that so many rows do not exceed: slower is at rest
 _SETTLED = 2.6  # s, after which an arm has forgotten earlier commands
 _CLOSE = 0.01  # log-likelihood: what is expected to gain less is no step
 _STEPS = 12  # of Gauss and Newton, at most
@@ -222,6 +224,16 @@ class Measured:
         """Other recordings of the same axis by the same sensors."""
         return Measured(recordings, self.period, self.sensors, self._known)
 
+    @cached_property
+    def moving(self) -> BoolArray:
+        """Which of the measurements that count are of an axis in motion: a tenth of its fastest or more, (n,)."""
+        parts = list[BoolArray]()
+        for one in self.recordings:
+            value = one.value[one.weight > 0.0]
+            way = np.abs(np.gradient(value)) if len(value) > 1 else np.zeros(len(value))
+            parts.append(way >= _SLOW * np.quantile(way, _FASTEST) if way.any() else way == 0.0)
+        return np.concatenate(parts)
+
     def left(self, arm: Arm) -> FloatArray:
         """What an arm leaves of the measurements that count, of each recording about its mean [m]."""
         parts = [
@@ -237,17 +249,22 @@ class Measured:
         return sum(float(np.var(one.value) * len(one.value)) for one in self.recordings if len(one.value))
 
     def without_far_from(self, arm: Arm, times: float) -> Measured:
-        """Without measurements so many times as far off an arm as half of them are.
+        """Without measurements so many times as far off an arm as half of them are: those in motion, and those at rest.
 
-        What is nearer than a small part of the motion does no harm: half of them may be of an axis at rest.
+        What is nearer than a small part of the motion does no harm.
         """
-        apart = [np.abs(one - np.median(one)) if len(one) else one for one in self.residuals(arm)]
-        limit = max(times * float(np.median(np.concatenate(apart))), _HARMLESS * self.range)
-        parts = [
-            one._replace(weight=np.where(far <= limit, one.weight, 0.0))
-            for one, far in zip(self.recordings, apart, strict=True)
-        ]
-        return self.of(parts)
+        left = np.abs(np.concatenate([one - np.median(one) if len(one) else one for one in self.residuals(arm)]))
+        moving = self.of([one._replace(weight=np.ones(len(one.time))) for one in self.recordings]).moving
+        limit = np.full(len(left), _HARMLESS * self.range)
+        for some in (moving, ~moving):
+            limit[some] = np.maximum(limit[some], times * np.median(left[some]) if some.any() else 0.0)
+        near = np.split(left <= limit, np.cumsum([len(one.time) for one in self.recordings])[:-1])
+        return self.of(
+            [
+                one._replace(weight=np.where(kept, one.weight, 0.0))
+                for one, kept in zip(self.recordings, near, strict=True)
+            ]
+        )
 
     def white(self, arm: Arm) -> Rest:
         """All that an arm leaves as noise of the sensors: for least squares."""

@@ -42,7 +42,7 @@ from .parameters import (
     with_rest,
     with_shared_delay,
 )
-from .plain import Doubt, doubts, with_plain_arm
+from .plain import LONGEST, Doubt, doubts, with_plain_arm
 from .posterior import Model, Quantity
 
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
@@ -271,7 +271,10 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     found = dict(zip(moving, in_threads(lambda axis: _search(likelihood, axis), moving), strict=True))
     lost = [axis for axis, search in found.items() if search.plain is None]
     config, lags = _arm(likelihood.config, {axis: found[axis] for axis in moving if axis not in lost}, trusted)
-    for axis, one in doubts({axis: search.plain for axis, search in found.items()}, config).items():
+    if endless := [axis for axis, one in lags.items() if one.lag > LONGEST]:
+        lost += endless
+        config, lags = _arm(likelihood.config, {axis: found[axis] for axis in moving if axis not in lost}, trusted)
+    for axis, one in doubts({axis: found[axis].plain for axis in lags}, config).items():
         lags[axis] = _doubted(lags[axis], one, one.sentence(config, axis))
         if one.refutes:
             config = with_plain_arm(config, axis, one.plain.arm)
@@ -509,7 +512,7 @@ def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
     arm, (low, high) = doubt.plain.arm, doubt.plain.lag_ci95
     if not doubt.refutes:
         both = min(low, lag.lag_ci95[0]), max(high, lag.lag_ci95[1])
-        return msgspec.structs.replace(lag, lag_ci95=both, notes=[sentence, *lag.notes])
+        return msgspec.structs.replace(lag, lag_ci95=both, notes=[*filter(None, [sentence]), *lag.notes])
     return AxisLag(  # which does not know its parts
         sensor=lag.sensor,
         lag=arm.total,

@@ -32,7 +32,9 @@ _ANYHOW = 1.0  # times what it leaves, from which it follows whatever chance wou
 _CHANCE = 3.84  # of χ² with one degree of freedom, 95 %
 _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
 _MOST = 0.8  # of the measurements: how far these are off is not decided by single commands that were never sent
-_DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced
+_DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced,
+_WORSE = 2.0  # and where it is so many times as far off as that of least squares
+_NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow: it is said
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
 
 
@@ -43,13 +45,15 @@ class PlainArm(NamedTuple):
         arm: The arm.
         lag_ci95: The lags [s] that leave no more than chance beyond the least, of so many measurements as have errors
             of their own.
+        off: How far it is off where the axis moves [m]; four fifths of the measurements are nearer.
         delayed: By how much the command alone is to be delayed to leave the least [s].
-        delayed_off: How far that is off [m]; four fifths of the measurements are nearer.
+        delayed_off: How far that is off.
         measured: What was looked at, without outliers.
     """
 
     arm: Arm
     lag_ci95: tuple[float, float]
+    off: float
     delayed: float
     delayed_off: float
     measured: Measured
@@ -61,9 +65,9 @@ def delays(measured: Measured) -> FloatArray:
 
 
 def off(measured: Measured, arm: Arm) -> float:
-    """How far an arm without noise is off [m]: four fifths of the measurements are nearer."""
+    """How far an arm without noise is off where the axis moves [m]: four fifths of the measurements are nearer."""
     apart = measured.left(arm)
-    return float(np.quantile(np.abs(apart - np.median(apart)), _MOST)) if len(apart) else 0.0
+    return float(np.quantile(np.abs(apart - np.median(apart))[measured.moving], _MOST)) if len(apart) else 0.0
 
 
 def independent(left: FloatArray) -> float:
@@ -102,7 +106,8 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     commands = [Arm(delay, float(LAGS[0])) for delay in late]
     delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
     ends = [*allowed, delayed.total]
-    return PlainArm(arm, (float(min(ends)), float(max(ends))), delayed.total, off(measured, delayed), measured)
+    between = float(min(ends)), float(max(ends))
+    return PlainArm(arm, between, off(measured, arm), delayed.total, off(measured, delayed), measured)
 
 
 def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list[Arm]:
@@ -113,41 +118,63 @@ def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list
 
 
 class Doubt(NamedTuple):
-    """That an axis's arm predicts worse than the commands do when they are delayed.
+    """That an axis's arm predicts worse than the commands do when they are delayed, or is of a lag that they exclude.
 
     Attributes:
         plain: That of least squares.
-        off: How far the axis's own is off [m]; four fifths of the measurements are nearer.
+        off: How far the axis's own is off where it moves [m]; four fifths of the measurements are nearer.
+        lag: Its own [s].
     """
 
     plain: PlainArm
     off: float
+    lag: float
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether it predicts worse than the delayed command."""
+        return self.off > _DOUBTED * self.plain.delayed_off
 
     @property
     def refutes(self) -> bool:
         """Whether it is so much worse that the arm of least squares is to take its place."""
-        return self.off > _REFUTED * self.plain.delayed_off
+        return self.is_worse and self.off > min(_REFUTED * self.plain.delayed_off, _WORSE * self.plain.off)
 
     def sentence(self, config: FusionConfig, axis: str) -> str:
-        """What to know of it, under the configuration that is doubted."""
-        screen = config.arm.screen_of(axis)
+        """What to know of it, under the configuration that is doubted; empty where that is little."""
+        screen, (low, high) = config.arm.screen_of(axis), self.plain.lag_ci95
         then = "The arm is that of least squares instead" if self.refutes else "The interval of its lag covers both"
+        if self.is_worse:
+            what = (
+                "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
+                f" {self.lag * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
+                f" commands {self.plain.delayed * MS:.0f} ms later are {self.plain.delayed_off * screen.scale:.3g}"
+            )
+        elif max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total:
+            what = (
+                f"the likelihood says a lag of {self.lag * MS:.4g} ms, least squares, which have no model of noise,"
+                f" {self.plain.arm.total * MS:.4g} ({low * MS:.4g} to {high * MS:.4g})"
+            )
+        else:
+            return ""
         return (
-            "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
-            f" {config.arm.lag_of(axis) * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off, the commands"
-            f" {self.plain.delayed * MS:.0f} ms later are {self.plain.delayed_off * screen.scale:.3g}. {then}. The"
-            " cause may be play, a limit of the speed, a sensor that repeats old values, or too little motion"
+            f"{what}. {then}. The cause may be play, a limit of the speed, a sensor that repeats old values, or too"
+            " little motion"
         )
 
 
 def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[str, Doubt]:
-    """The arms of a configuration that predict worse than the delayed command, by axis."""
+    """The arms of a configuration that predict worse than the delayed command, or lag otherwise, by axis.
+
+    Play, a fastest speed and a gain of the speed make a lag another one with each motion: then it is not compared.
+    """
     found: dict[str, Doubt] = {}
     for axis, one in plain.items():
         if one is not None:
-            far = off(one.measured, Arm.of(config.arm.axes[axis], config.arm.delay_of(axis)))
-            if far > _DOUBTED * one.delayed_off:
-                found[axis] = Doubt(one, far)
+            mine, (low, high) = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis)), one.lag_ci95
+            doubt = Doubt(one, off(one.measured, mine), mine.total)
+            if doubt.is_worse or not (low <= mine.total <= high or mine.play or mine.max_speed or mine.slope):
+                found[axis] = doubt
     return found
 
 

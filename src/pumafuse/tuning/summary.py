@@ -177,8 +177,8 @@ def with_doubts(
 ) -> dict[str, FittedLag]:
     """The lags with intervals that cover what least squares says of a doubted arm, and those of replaced arms."""
     found = dict(lags)
-    for axis, (plain, _) in doubts.items():
-        low, high = (end * MS for end in plain.lag_ci95)
+    for axis, doubt in doubts.items():
+        low, high = (end * MS for end in doubt.plain.lag_ci95)
         if (one := found.get(axis)) is None:
             lag = after.arm.lag_of(axis) * MS
             found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag, lag_ms_ci95=(low, high))

@@ -144,7 +144,8 @@ def tune(
     try:
         validation = _fitted_and_validated(pipeline, config, until, validate)
         found = pipeline.doubts() if "noise" in kinds else {}
-        doubted = [f"{axis}: {one.sentence(pipeline.result(), axis)}" for axis, one in found.items()]
+        sentences = {axis: one.sentence(pipeline.result(), axis) for axis, one in found.items()}
+        doubted = [f"{axis}: {sentence}" for axis, sentence in sentences.items() if sentence]
         if refuted := [axis for axis, one in found.items() if one.refutes]:
             held, start = [*fixed, *(f"axes.{axis}" for axis in refuted)], config
             for axis in refuted:
