@@ -113,6 +113,21 @@ def test_zeros_of_a_sensor_that_lost_its_target_are_not_followed() -> None:
         np.testing.assert_array_equal(zeros[axis].position, nothing[axis].position)
 
 
+def test_an_orientation_without_noise_is_not_used_for_the_marker_either() -> None:
+    """An attitude that is 12° off its positions, and has no sd_deg: the commands say how the tool is turned."""
+    run = pose_run()[0]
+    camera = run.sensors["camera"]
+    turned = Rotation.from_rotvec([0.0, 12.0, 0.0], degrees=True) * Rotation.from_quat(camera.orientation)
+    without = {key: value for key, value in CAMERA.items() if key != "sd_deg"} | PLACE
+    wrong, none = (
+        pf.fuse(replace(run, sensors={"camera": replace(camera, orientation=told)}), config(camera=without))
+        for told in (turned.as_quat(), None)
+    )
+    for axis in AXES:
+        np.testing.assert_array_equal(wrong[axis].position, none[axis].position)
+        np.testing.assert_array_equal(wrong[axis].position_sd, none[axis].position_sd)
+
+
 @pytest.mark.parametrize("degrees", [-180.0, -35.0, -25.0, 0.0, 25.0, 35.0])
 def test_a_sensor_by_which_the_tool_is_turned_as_no_arm_is_is_refused(degrees: float) -> None:
     """Beyond 30 degrees from where it is commanded to be for most of the run: with that angle, and what to give."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -107,6 +108,22 @@ FRAMED = msgspec.structs.replace(
 
 
 ALL_RUNS = pytest.mark.parametrize("run", [RUN, NOISY], ids=["even", "noisy"])
+
+
+def test_an_orientation_without_noise_is_not_used_live_either() -> None:
+    """Of a sensor without a deviation of its attitude: a replay is as live, and as without it."""
+    lengths = {axis: SD[axis] for axis in "xyz"}
+    mocap = msgspec.structs.replace(CONFIG.sensors["mocap"], sd=lengths)
+    config = msgspec.structs.replace(KNOWN, sensors={**KNOWN.sensors, "mocap": mocap})
+    replay_is_as_live(RUN, config)
+    source = without_attitude(RUN)
+    some, none = (pf.fuse(run, config, mode="as-live") for run in (RUN, source))
+    np.testing.assert_array_equal(some["x"].position, none["x"].position)
+
+
+def without_attitude(run: pf.Run) -> pf.Run:
+    """The run without what the mocap tells of orientations."""
+    return replace(run, sensors={**run.sensors, "mocap": replace(run.sensors["mocap"], orientation=None)})
 
 
 @ALL_RUNS

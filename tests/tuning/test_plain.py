@@ -137,7 +137,7 @@ def test_an_axis_that_mostly_rests_is_judged_where_it_moves() -> None:
     found = found_in(steps(20.0, 0.3))
     assert found is not None
     assert found.arm.total == pytest.approx(0.3, abs=1e-3)
-    assert found.measured.count == len(steps(20.0, 0.3).time)
+    assert found.measured.count == sum(len(one.time) for one in found.measured.recordings)
     sooner = off(found.measured, Arm(0.075, 0.075))
     assert sooner > 0.02  # m; at rest it is right to a micrometre
     assert Doubt(found, sooner, 0.15).refutes
@@ -147,12 +147,14 @@ def test_a_lag_that_least_squares_exclude_is_said_and_its_interval_covers_both()
     """Also of an arm that predicts about as well; a little outside nothing is said. Play makes it no doubt."""
     config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config
     axis = next(iter(config.arm.axes))
+    steady = replaced(config.arm.axes[axis], gain=pf.Gain(slope=0.0, intercept=1.0))
+    config = replaced(config, arm=replaced(config.arm, axes={**config.arm.axes, axis: steady}))
     lag = config.arm.lag_of(axis)
     plain = found_in(motion(0.5 * lag, 0.5 * lag, 1.0))
     assert plain is not None
     for share, said in ((1.05, False), (1.5, True)):
         low, high = share * lag, share * lag + 0.01
-        one = plain._replace(arm=Arm(low, 0.005), lag_ci95=(low, high), delayed_off=np.inf)
+        one = plain._replace(arm=Arm(low, 0.005), lag_ci95=(low, high), delayed=high, delayed_off=np.inf)
         doubt = doubts({axis: one}, config)[axis]
         assert not doubt.is_worse
         assert (f"lag of {1e3 * lag:.4g} ms, least squares" in doubt.sentence(config, axis)) is said

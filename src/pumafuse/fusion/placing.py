@@ -78,10 +78,13 @@ class Placing:
 
     Attributes:
         has_marker: Whether the tool's orientation is needed to know where it is.
+        is_oriented: Whether the orientation that it tells is used: not without any noise of it, where the commands tell
+            one. Some attitudes do not belong to their positions.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: Sensor, arm: ArmModel) -> None:
         """Take where the sensor stands, what it sees, and its noise."""
+        self.is_oriented = sensor.sd_of(TURNING[0]) is not None or not set(TURNING) <= set(arm.axes)
         frame, marker = sensor.frame or _HERE, sensor.marker or _HERE
         self._at, self._turn = np.array(frame.at), rotations.of_vectors(np.array([frame.rotation]))
         self._marker, self._back = np.array([marker.at]), rotations.of_vectors(-np.array([marker.rotation]))
@@ -119,7 +122,8 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
     """What a sensor in a frame of its own tells of the tool."""
     if not set(CARTESIAN) <= source.values.keys():
         raise RunError(f"{source.label_for(name)}: has a frame or a marker, so that it must give x, y and z")
-    placing, told, spread = Placing(config.sensors[name]), source.orientation, dict(source.spread)
+    placing, spread = Placing(config.sensors[name], config.arm), dict(source.spread)
+    told = source.orientation if placing.is_oriented else None
     measured = np.column_stack([source.values[axis] for axis in CARTESIAN])
     point = placing.seen(measured)
     oriented = None if told is None else np.where(lost(measured)[:, None], np.nan, placing.oriented(told))

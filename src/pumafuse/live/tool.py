@@ -57,7 +57,7 @@ def check_tool(config: FusionConfig, start: Mapping[str, float]) -> None:
     turns = set(TURNING) <= set(config.arm.axes)
     if turns and config.tool is None:
         for name, sensor in config.sensors.items():
-            if sensor.is_placed and Placing(sensor).has_marker:
+            if sensor.is_placed and Placing(sensor, config.arm).has_marker:
                 raise ConfigError(f"sensors.{name}.marker: {NO_TOOL}")
     if config.tool is not None and (named := [axis for axis in TURNING if axis in start]):
         raise ConfigError(f"start: {named[0]}: a tool that turns starts at its first commanded orientation")
@@ -115,7 +115,7 @@ class Tool:
         self._log, arm = log, config.arm
         turns = set(TURNING) <= set(arm.axes)
         self._reference = np.array(config.tool.reference) if turns and config.tool is not None else None
-        self._placings = {name: Placing(sensor) for name, sensor in config.sensors.items() if sensor.is_placed}
+        self._placings = {name: Placing(one, arm) for name, one in config.sensors.items() if one.is_placed}
         self._takes_orientation = takes_orientation(config)
         self._latency = {name: round(config.sensors[name].latency * 1e9) for name in self._placings}
         self._rows: dict[str, list[Row]] = {}
@@ -169,6 +169,7 @@ class Tool:
         oriented: FloatArray | None = found.pop(ORIENTATION, None)
         placing, seen = self._placings.get(sensor), None
         if placing is not None:
+            oriented = oriented if placing.is_oriented else None
             measured = np.array([[number(values.get(axis)) for axis in CARTESIAN]])
             point = placing.seen(measured)
             if oriented is not None:

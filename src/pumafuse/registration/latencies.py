@@ -49,19 +49,19 @@ def latencies_of(
 def _in_base(run: Run, name: str, config: FusionConfig) -> Motion:
     """What a placed sensor sees, where it is in the base's frame."""
     seen = measured(run.sensors[name]).valid()
-    return seen._replace(position=Placing(config.sensors[name]).seen(seen.position))
+    return seen._replace(position=Placing(config.sensors[name], config.arm).seen(seen.position))
 
 
 def _of_point(run: Run, name: str, found: Registration, config: FusionConfig, point: str) -> Motion:
     """What a placed sensor tells of the point that another one sees, and how the tool is turned, if that is told."""
-    seen, placing = _in_base(run, name, config), Placing(config.sensors[name])
+    seen, placing = _in_base(run, name, config), Placing(config.sensors[name], config.arm)
     if seen.quaternion is not None and found.rms_rotation is not None:
         turned = placing.oriented(seen.quaternion)
     else:
         turned = _commanded(run, seen.time, found)
     if turned is None:
         return seen._replace(quaternion=None)
-    lever = Placing(config.sensors[point]).lever(turned) - placing.lever(turned)
+    lever = Placing(config.sensors[point], config.arm).lever(turned) - placing.lever(turned)
     return Motion(seen.time, seen.position + lever, turned)
 
 

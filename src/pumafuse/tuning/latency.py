@@ -509,7 +509,7 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
 
 def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
     """The lag of an axis with an interval that covers what least squares says, or that of least squares instead."""
-    arm, (low, high) = doubt.plain.arm, doubt.plain.lag_ci95
+    arm, (low, high) = doubt.plain.arm, doubt.lag_ci95
     if not doubt.refutes:
         both = min(low, lag.lag_ci95[0]), max(high, lag.lag_ci95[1])
         return msgspec.structs.replace(lag, lag_ci95=both, notes=[*filter(None, [sentence]), *lag.notes])

@@ -103,11 +103,16 @@ def plain_arm(measured: Measured) -> PlainArm | None:
         return None
     most = 0.5 * (power * _CHANCE / number + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
-    commands = [Arm(delay, float(LAGS[0])) for delay in late]
-    delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
-    ends = [*allowed, delayed.total]
-    between = float(min(ends)), float(max(ends))
+    delayed = _delayed(measured, late, rest)
+    delayed = _delayed(measured, np.maximum(delayed.delay + _BESIDE / 3.0, 0.0).tolist(), rest)
+    between = float(min(allowed)), float(max(allowed))
     return PlainArm(arm, between, off(measured, arm), delayed.total, off(measured, delayed), measured)
+
+
+def _delayed(measured: Measured, late: list[float], rest: Rest) -> Arm:
+    """The command alone at the delay [s] that leaves the least squares."""
+    commands = [Arm(delay, float(LAGS[0])) for delay in late]
+    return commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
 
 
 def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list[Arm]:
@@ -131,6 +136,12 @@ class Doubt(NamedTuple):
     lag: float
 
     @property
+    def lag_ci95(self) -> tuple[float, float]:
+        """The lags [s] that least squares allow, and that of the delayed command where it predicts better."""
+        (low, high), delayed = self.plain.lag_ci95, self.plain.delayed
+        return (min(low, delayed), max(high, delayed)) if self.is_worse else (low, high)
+
+    @property
     def is_worse(self) -> bool:
         """Whether it predicts worse than the delayed command."""
         return self.off > _DOUBTED * self.plain.delayed_off
@@ -142,7 +153,7 @@ class Doubt(NamedTuple):
 
     def sentence(self, config: FusionConfig, axis: str) -> str:
         """What to know of it, under the configuration that is doubted; empty where that is little."""
-        screen, (low, high) = config.arm.screen_of(axis), self.plain.lag_ci95
+        screen, (low, high) = config.arm.screen_of(axis), self.lag_ci95
         then = "The arm is that of least squares instead" if self.refutes else "The interval of its lag covers both"
         if self.is_worse:
             what = (
@@ -171,9 +182,10 @@ def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[s
     found: dict[str, Doubt] = {}
     for axis, one in plain.items():
         if one is not None:
-            mine, (low, high) = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis)), one.lag_ci95
-            doubt = Doubt(one, off(one.measured, mine), mine.total)
-            if doubt.is_worse or not (low <= mine.total <= high or mine.play or mine.max_speed or mine.slope):
+            mine = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
+            doubt, ends = Doubt(one, off(one.measured, mine), mine.total), (*one.lag_ci95, one.delayed)
+            allowed = min(ends) <= mine.total <= max(ends)
+            if doubt.is_worse or not (allowed or mine.play or mine.max_speed or mine.slope):
                 found[axis] = doubt
     return found
 

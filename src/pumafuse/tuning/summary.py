@@ -178,7 +178,7 @@ def with_doubts(
     """The lags with intervals that cover what least squares says of a doubted arm, and those of replaced arms."""
     found = dict(lags)
     for axis, doubt in doubts.items():
-        low, high = (end * MS for end in doubt.plain.lag_ci95)
+        low, high = (end * MS for end in doubt.lag_ci95)
         if (one := found.get(axis)) is None:
             lag = after.arm.lag_of(axis) * MS
             found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag, lag_ms_ci95=(low, high))
