@@ -30,6 +30,7 @@ from pumafuse.discovery.survey import Survey, survey
 from pumafuse.errors import RunError
 from pumafuse.space.kinematics import Chain
 from pumafuse.units import wraps
+from px4_files import write_ulg
 from refusals import one_line
 
 START = 1_790_000_000  # s
@@ -1196,3 +1197,68 @@ def test_rows_out_of_order_have_a_clock(tmp_path: Path, share: float) -> None:
     write(tmp_path / "commands.csv", {"t_s": 1e3 * u[:, 1], "x_mm": 1e3 * u[:, 0]})
     with pytest.raises(RunError, match="which numbers are the commands"):
         survey(tmp_path)
+
+
+def test_of_a_log_of_px4_topics_of_positions_count(tmp_path: Path) -> None:
+    """What sticks, estimators and magnetometers say is no motion in metres, however alike it moves."""
+    t, u, s, z = recorded()
+    xyz = "float x;float y;float z"
+    topics = {
+        "manual_control_setpoint": (xyz, t, path(t + 0.05)),
+        "estimator_innovations": ("float[3] gps_hpos", t, path(t - 0.05)),
+        "vehicle_magnetometer": ("float[3] magnetometer_ga", t, 0.4 + path(t - 0.15)),
+        "trajectory_setpoint": ("float[3] position;float[3] velocity", t, np.hstack([u, np.gradient(u, axis=0)])),
+        "vehicle_local_position": (f"{xyz};float dist_bottom;float eph", s, np.column_stack([z, z[:, 2] + 1.0, s])),
+    }
+    found = survey(write_ulg(tmp_path / "flight.ulg", topics))
+    assert found.roles is not None
+    assert found.roles.command.part.label == "trajectory_setpoint"
+    assert [one.part.label for one in found.roles.sensors] == ["vehicle_local_position"]
+    assert found.run.axes == ("x", "y", "z")
+    assert {one.unit for some in found.roles.command.axes.values() for one in some} == {"m"}
+    for one in found.relations.values():
+        assert one.lag == pytest.approx(LAG, abs=0.003)
+
+
+def test_fingers_are_joints(tmp_path: Path) -> None:
+    """An index finger and a turning thumb beside a word of a role; a column that counts is none."""
+    t, u, z = recorded_at_once()
+    columns = {"t_s": t, "frame_index": np.arange(len(t)) // 3}
+    for name, place in (("ring", 0), ("index", 1), ("thumb_rotation", 2)):
+        columns |= {f"wish.target.{name}": u[:, place], f"hand.actual.{name}": z[:, place]}
+    write(tmp_path / "hand.csv", columns)
+    found = survey(tmp_path / "hand.csv")
+    assert len(found.run.axes) == 3
+    assert {axis.rpartition("_")[2] for axis in found.run.axes} == {"ring", "index", "rotation"}
+
+
+def test_the_same_axes_under_another_word_are_another_sensor(tmp_path: Path) -> None:
+    """What the robot itself tells and a tracker in the columns of one table: one beside the other, each as it is."""
+    t, u, z = recorded_at_once()
+    columns = {"t_s": t}
+    for place, axis in enumerate("xyz"):
+        columns |= {f"{axis}_goal_m": u[:, place], f"{axis}_m": z[:, place], f"{axis}_data_m": z[:, place] + 1e-3}
+    write(tmp_path / "flight.csv", columns | {"battery_m": np.sin(7.1 * t)})
+    found = survey(tmp_path / "flight.csv")
+    assert found.roles is not None
+    assert sorted(one.axes["x"][0].column for one in found.roles.sensors) == ["x_data_m", "x_m"]
+    (left,) = [why for one, why in found.roles.left_out if "battery" in one.axes]
+    assert "none moves alike" in left
+
+
+def test_joints_at_rest_do_not_hide_the_one_that_moves(tmp_path: Path) -> None:
+    """Six of seven stick: their encoders toggle by a step while the commands creep. Names without a word say whose."""
+    rng = np.random.default_rng(5)
+    t = 0.02 * np.arange(1500)
+    u = 1e-3 * np.cumsum(rng.normal(size=(1500, 7)), axis=0)
+    u[:, 6] = 0.5 * np.sin(0.9 * t) + 0.2 * np.sin(2.3 * t)
+    z = 4e-4 * rng.integers(0, 2, (1500, 7)).astype(float)
+    z[:, 6] = np.interp(t - 0.08, t, u[:, 6])
+    np.savez(tmp_path / "arm.npz", time=t, p=z, p_cmd=u)
+    found = survey(tmp_path / "arm.npz")
+    assert found.run.axes == ("joint6",)
+    ((_, one),) = found.relations.items()
+    assert one.lag == pytest.approx(0.08, abs=0.012)
+    np.savez(tmp_path / "other.npz", time=t, flux=z, p_cmd=u)  # of another name most axes have to follow
+    with pytest.raises(RunError, match=r"follows the commands on 1 of \d axes"):
+        survey(tmp_path / "other.npz")

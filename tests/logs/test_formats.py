@@ -23,6 +23,7 @@ from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.survey import survey
 from pumafuse.errors import PumafuseError, RunError
 from pumafuse.logs import formats, tables
+from px4_files import write_ulg
 from refusals import one_line
 
 LAG = 0.09  # s
@@ -92,21 +93,9 @@ def xlsx(folder: Path) -> Path:
 
 
 def ulg(folder: Path) -> Path:
-    """A log of PX4, by its format: a message of definitions for each topic, then rows."""
-    fields = "uint64_t timestamp;float[2] joint"
-
-    def message(kind: str, body: bytes) -> bytes:
-        return struct.pack("<HB", len(body), ord(kind)) + body
-
-    said, seen = "position_setpoint", "position_measured"
-    parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message("B", bytes(40))]
-    parts += [message("F", f"{name}:{fields};".encode()) for name in (said, seen)]
-    parts += [message("A", struct.pack("<BH", 0, n) + name.encode()) for n, name in enumerate((said, seen))]
-    for n, time, values in ((0, TIME, TOLD), (1, LATER, SEEN)):
-        rows = zip(time, values.tolist(), strict=True)
-        parts += [message("D", struct.pack("<HQff", n, 5_000_000 + round(t * 1e6), *at)) for t, at in rows]
-    (folder / "log.ulg").write_bytes(b"".join(parts))
-    return folder / "log.ulg"
+    """A log of PX4."""
+    topics = {"position_setpoint": ("float[2] joint", TIME, TOLD), "position_measured": ("float[2] joint", LATER, SEEN)}
+    return write_ulg(folder / "log.ulg", topics)
 
 
 @pytest.mark.parametrize("write", [npz, mat, records, columns, xlsx, ulg])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -58,6 +59,7 @@ def run(
     for name in found.run.sensors:
         if by := early(found, name):
             raise RunError(f"{log}: {too_early(name, max(by.values()))}; `pumafuse init {log}` writes one")
+    found = replace(found, run=found.run.between(*part))  # so that latencies are those of the part
     arm, begins = guess(found)
     texts, here = drafts(found, arm, begins, output), Path()
     recorded = described(drafts(found, arm, begins, here)["run.toml"], here).between(*part)

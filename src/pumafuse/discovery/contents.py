@@ -258,7 +258,7 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
             times.append(path)
         elif path in counts:
             left_out[path] = "rises evenly: a count or a clock"
-        elif why := names.no_position(name) or names.no_position(names.label_of(path, listed) or ""):
+        elif why := names.no_position(name) or names.no_position(_labelled(path, listed)):
             left_out[name] = why
         elif len(signals) == _MOST_COLUMNS:
             left_out[name] = f"more than {_MOST_COLUMNS} columns"
@@ -354,6 +354,12 @@ def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
         if pc.mean(pc.not_equal(column[1:], column[:-1])).as_py() > _IN_TURNS:
             return [{name: key} for key in keys]
     return [{}]
+
+
+def _labelled(path: str, listed: list[str]) -> str:
+    """An element of a list by what the log calls it, behind the list's own name; empty where it does not."""
+    label = names.label_of(path, listed)
+    return "" if label is None else f"{leaf(path).partition('[')[0]}_{label}"
 
 
 def _called(column: str, where: Mapping[str, Any]) -> str:

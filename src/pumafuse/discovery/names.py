@@ -54,8 +54,9 @@ _NO_POSITIONS = words_in(
     " mode scaling bits temperature temperatures temp quality confidence covariance orientation rotation quaternion"
     " quat twist index id seq sequence count status valid std sd sigma latency duration error header stamp nanosec"
     " layout frame done reward task episode tick time timestamp reset lat lon latitude"
-    " longitude"
+    " longitude var variance yawspeed rollspeed pitchspeed good innov"
 )
+_FINGERS = words_in("index rotation")  # of a hand: beside words of roles, at the end, these are joints
 _SPREADS = words_in("std sd sigma error covariance")  # in the unit of a position, and none
 _CHANGES = words_in("delta relative rel incremental increment diff")
 # Words that are something else only without a number and without a unit: ax1 and az_deg are axes.
@@ -174,6 +175,8 @@ def no_position(column: str) -> str | None:
     found = [one.rstrip(_DIGITS) for one in found]
     whats = [one for one in found if one in (_SPREADS if known else _NO_POSITIONS)]
     if whats == ["current"] and not _POSITIONS.isdisjoint(found):
+        return None
+    if len(whats) == 1 and found[-1] in _FINGERS and role_words(column):
         return None
     of_unit = f"in {unit.strip('_').replace('_', '/')}" if unit is not None and kind is None else None
     return next(iter(whats), "in °C or °/s" if "°" in column and not known else of_unit)

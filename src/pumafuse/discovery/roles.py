@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from itertools import count
+from typing import TypeAlias
 
 import numpy as np
 from msgspec import structs
@@ -14,6 +15,7 @@ from msgspec import structs
 from ..arrays import NO_STAMP
 from ..errors import RunError, printable
 from ..logs.axes import FARTHEST_TURN
+from ..logs.columns import leaf
 from ..logs.frames import CARTESIAN
 from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
@@ -38,6 +40,7 @@ _MOST_APART = 40  # axes of a table that is taken apart by their names
 _MOST_LISTED = 8  # columns in an error
 _NUMBERED = re.compile(r"joint\d+|position")
 _AXIS_WORD = re.compile(r"[xyz]|\d+|")
+_Group: TypeAlias = tuple[str, str, str, bool]  # words of roles, list, copy, whether they are desired values
 
 
 @dataclass(frozen=True)
@@ -178,14 +181,16 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             continue
         matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
         if stream.role is None and axes:
-            late = _follows(command, matched)
+            late, otherwise = _follows(command, matched)
             matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
             why_not = (
-                "neither its name nor its motion says what it is: it does not follow the commands, or moves before"
-                " them; if it measures their axes, say so in run.toml"
+                f"neither its name nor its motion says what it is: {otherwise}; if it measures their axes, say so in"
+                " run.toml"
             )
         if axes and matched.role:
             kept.append(matched)
+            if others := {axis: some for axis, some in stream.axes.items() if some not in axes.values()}:
+                left_out.append((replace(stream, axes=others), "no command is called so, and none moves alike"))
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
     command, *kept = _in_order([command, *kept], left_out)
@@ -295,7 +300,7 @@ def _streams(part: Part) -> list[Stream]:
     """The columns of a part, those apart whose names say that they are something else, or another list."""
     if part.clock is None:
         return []
-    groups: dict[tuple[str, str, str, bool], list[Signal]] = {}
+    groups: dict[_Group, list[Signal]] = {}
     beside = {names.last(one) for one in (*(signal.column for signal in part.signals), *part.left_out)}
     for signal in part.signals:
         called = _joined(names.role_words(signal.name))
@@ -303,6 +308,7 @@ def _streams(part: Part) -> list[Stream]:
         if copy or measured:
             signal = replace(signal, axis=names.axis_of(measured or signal.column.removesuffix(copy), []))
         groups.setdefault((called, listed, copy, bool(measured)), []).append(signal)
+    groups = {key: some for one in groups.items() for key, some in _seen_twice(*one)}
     roles = Counter(key for key, *_ in groups)
     of_file, of_columns = names.role_of(part.stem), {names.column_role(one[0].name) for one in groups.values()}
     of_file = None if len(groups) > 1 and of_file in of_columns else of_file  # then it is what these columns are
@@ -326,6 +332,28 @@ def _streams(part: Part) -> list[Stream]:
             attitude = next((one for one in part.attitudes if key == _joined(one.role_words)), None)
         found.append(Stream(name or "log", role, why, part, axes, attitude))  # pyright: ignore[reportArgumentType]
     return found
+
+
+def _seen_twice(key: _Group, signals: Sequence[Signal]) -> Iterator[tuple[_Group, list[Signal]]]:
+    """A group of columns, those apart that are axes of others under another word: ``x_poses`` beside ``x``."""
+    by_words = dict[tuple[str, ...], list[Signal]]()
+    for one in signals:
+        silent = [word for word in names.words(leaf(one.column)) if word not in names.words(one.axis)]
+        by_words.setdefault(tuple(silent), []).append(one)
+    first = max(by_words.values(), key=len)
+    axes = {one.axis for one in first}
+    apart = {
+        words: some
+        for words, some in by_words.items()
+        if some is not first
+        and words
+        and len(some) > 1
+        and {one.axis for one in some} <= axes
+        and names.PARTS.isdisjoint(words)
+    }
+    yield key, [one for one in signals if not any(one in some for some in apart.values())]
+    for words, some in apart.items():
+        yield (key[0], _joined(words), *key[2:]), some
 
 
 def _joined(words: Iterable[str]) -> str:
@@ -449,20 +477,42 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]
     return round(count, 1), late
 
 
-def _follows(command: Stream, stream: Stream) -> str:
-    """By how much a stream that nothing names follows the commands, in words; empty if it does not.
+def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
+    """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not.
 
-    Positions do on most axes, later, and all with one gain; torques and currents do not. In a frame of its own its
-    speed does.
+    Positions do on most axes, later, and all with one gain; torques and currents do not. Of those that are called as
+    the commands are without a word of these, ``q`` beside ``q_cmd``, an axis is enough: joints may rest. In a frame of
+    its own its speed does.
     """
     found = _relations(command, stream)
-    behind = [one for one in found if one.correlation >= _SAME and -_AT_ONCE < one.lag < LATEST]
-    gains = [one.slope for one in behind]
-    if len(behind) > len(found) / 2 and max(gains) < _GAINS * min(gains):
-        return f"{float(np.median([one.lag for one in behind])) * 1e3:.0f} ms late"
+    alike = [one for one in found if one.correlation >= _SAME]
+    behind = [one for one in alike if -_AT_ONCE < one.lag < LATEST]
+    gains, fewest = [one.slope for one in behind], 0.0 if _is_namesake(command, stream) else len(found) / 2
+    if len(behind) > fewest and max(gains) < _GAINS * min(gains):
+        return f"{float(np.median([one.lag for one in behind])) * 1e3:.0f} ms late", ""
     speeds = speeds_follow(command.source, stream.source)
-    is_late = speeds is not None and speeds.correlation >= _SAME and -_AT_ONCE < speeds.lag < LATEST
-    return f"{speeds.lag * 1e3:.0f} ms late, by its speed" if speeds and is_late else ""
+    if speeds is not None and speeds.correlation >= _SAME and -_AT_ONCE < speeds.lag < LATEST:
+        return f"{speeds.lag * 1e3:.0f} ms late, by its speed", ""
+    most = max((one.correlation for one in found), default=0.0)
+    if not alike:
+        return "", f"it does not follow the commands (correlation {most:+.2f} at most)"
+    if len(behind) < len(alike):
+        early = float(np.median([-one.lag for one in alike if one not in behind]))
+        when = f"{early * 1e3:.0f} ms before" if early > 0.0 else f"{-early:.1f} s behind"
+        return "", f"it does not follow the commands: it moves {when} them"
+    few = f"it follows the commands on {len(behind)} of {len(found)} axes"
+    return "", few if len(behind) <= fewest else f"{few}, but by {min(gains):.3g} to {max(gains):.3g} times as far"
+
+
+def _is_namesake(command: Stream, stream: Stream) -> bool:
+    """Whether columns are called as those of the commands without a word of these: ``q[0]`` beside ``q_cmd[0]``."""
+
+    def called(signals: Sequence[Signal]) -> list[str]:
+        return [word for word in names.words(signals[0].name) if word not in names.role_words(signals[0].name)]
+
+    shared = stream.axes.keys() & command.axes.keys()
+    names_of = [(called(stream.axes[axis]), called(command.axes[axis])) for axis in shared]
+    return bool(names_of) and all(one == other for one, other in names_of)
 
 
 def _copies(command: Stream, stream: Stream) -> bool:

@@ -103,16 +103,10 @@ def plain_arm(measured: Measured) -> PlainArm | None:
         return None
     most = 0.5 * (power * _CHANCE / number + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
-    delayed = _delayed(measured, late, rest)
-    delayed = _delayed(measured, np.maximum(delayed.delay + _BESIDE / 3.0, 0.0).tolist(), rest)
+    commands = [Arm(delay, float(LAGS[0])) for delay in late]
+    delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
     between = float(min(allowed)), float(max(allowed))
     return PlainArm(arm, between, off(measured, arm), delayed.total, off(measured, delayed), measured)
-
-
-def _delayed(measured: Measured, late: list[float], rest: Rest) -> Arm:
-    """The command alone at the delay [s] that leaves the least squares."""
-    commands = [Arm(delay, float(LAGS[0])) for delay in late]
-    return commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
 
 
 def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list[Arm]:
