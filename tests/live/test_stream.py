@@ -64,6 +64,28 @@ def test_silence_goes_on_by_the_wall_clock() -> None:
     assert times == sorted(set(times))
 
 
+def test_a_command_that_jumps_ahead_has_an_estimate_once_the_next_has_too() -> None:
+    """One stamp that is 10 s ahead is taken back: no estimate of then, no word of missing commands. A pause goes on."""
+
+    def moving(first: int, last: int) -> bytes:
+        return b"".join(line(step * 0.028, radial=570.0 + 0.02 * step) for step in range(first, last))
+
+    both = Both()
+    both.feed(moving(0, 400))
+    before = len(both.estimates)
+    both.feed(line(21.2, radial=578.0))
+    assert len(both.estimates) == before
+    both.feed(moving(400, 1500))
+    assert [round(found["t"] / 0.028, 6) for found in both.estimates] == list(range(1500))
+    assert [sentence for sentence in both.said if "taken back" not in sentence] == []
+    paused = Both()
+    paused.feed(moving(0, 100) + line(13.0, radial=572.0) + line(13.028, radial=572.0))
+    assert [found["t"] for found in paused.estimates[-2:]] == [13.0, 13.028]
+    paused.feed(line(23.0, radial=572.0))
+    paused.end()  # what nothing contradicts any more
+    assert paused.estimates[-1]["t"] == 23.0
+
+
 def test_a_wild_stamp_makes_no_grid() -> None:
     """A measurement half an hour ahead does not let the grid run half an hour ahead."""
     both = Both(rate=100.0)

@@ -97,6 +97,10 @@ class CommandWatch:
         """Begin anew by another clock."""
         self._recent = []
 
+    def forget(self, after: int) -> None:
+        """Take back all that is stamped after an instant [ns]."""
+        self._recent = [one for one in self._recent if one[0] <= after]
+
     def limits(self, commands: Commands) -> None:
         """Say when the latest commands leave what the arm model is valid for."""
         arm = self._arm

@@ -474,6 +474,7 @@ class LiveEstimator:
         self._counts.forget(self._window, after)
         self._window.forget(after)
         self._commands.forget(after)
+        self._watch.forget(after)
         self._diagnosis.recent.forget(after)
         if self._tool is not None:
             self._place_again(self._tool.forget(after))

@@ -67,6 +67,7 @@ class Stream:
         self._step = None if rate is None else 1e9 / rate
         self._grid: tuple[int, int] | None = None  # the segment, and where its grid begins [ns]
         self._due = 0
+        self._asked: list[int] = []  # where commands came of which the estimate is not written yet [ns]
         self._with_ns = False  # whether the stream gives its time in ns
         self._out: list[bytes] = []
         self._log = RateLimitedLog(notify)
@@ -109,7 +110,9 @@ class Stream:
             became = f"{result.reason} ({result.outcome.word})"
             self._log.write(f"{who} {result.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")
         if self._step is None and not sensor and (waits or result.outcome is Outcome.FUSED):
-            self._send(live.estimate(nanoseconds(t)))
+            self._asked.append(nanoseconds(t))
+        if self._asked and live.sure is not None:
+            self._at_commands(live.sure)
 
     def idle(self, now: int) -> None:
         """Go on with the grid until ``now`` [ns] of the stream's own time, as nothing has come for a while."""
@@ -121,7 +124,16 @@ class Stream:
         """Write the estimates until the last event: no more will come."""
         if self._step is not None and self.live.sure is not None:
             self._on_grid(self.live.sure + 1)
+        self._at_commands(self.live.newest or 0)
         self.flush()
+
+    def _at_commands(self, until: int) -> None:
+        """Estimate where commands came, up to an instant [ns]; what has jumped ahead waits, and may be taken back."""
+        asked, newest = self._asked, self.live.newest or 0
+        self._asked = [at for at in asked if until < at <= newest]
+        for at in asked:
+            if at <= until:
+                self._send(self.live.estimate(at))
 
     def flush(self) -> None:
         """Write the estimates that are ready."""
