@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from importlib.resources import files
 
@@ -68,14 +69,15 @@ def test_a_command_that_jumps_ahead_has_an_estimate_once_the_next_has_too() -> N
     """One stamp that is 10 s ahead is taken back: no estimate of then, no word of missing commands. A pause goes on."""
 
     def moving(first: int, last: int) -> bytes:
-        return b"".join(line(step * 0.028, radial=570.0 + 0.02 * step) for step in range(first, last))
+        steps = ((step, 570.0 + 20.0 * math.sin(0.02 * step)) for step in range(first, last))
+        return b"".join(line(step * 0.028, radial=radial) for step, radial in steps)
 
     both = Both()
-    both.feed(moving(0, 400))
+    both.feed(moving(0, 900))
     before = len(both.estimates)
-    both.feed(line(21.2, radial=578.0))
+    both.feed(line(35.2, radial=553.0))
     assert len(both.estimates) == before
-    both.feed(moving(400, 1500))
+    both.feed(moving(900, 1500))
     assert [round(found["t"] / 0.028, 6) for found in both.estimates] == list(range(1500))
     assert [sentence for sentence in both.said if "taken back" not in sentence] == []
     paused = Both()
