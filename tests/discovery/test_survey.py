@@ -1262,3 +1262,22 @@ def test_joints_at_rest_do_not_hide_the_one_that_moves(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", time=t, flux=z, p_cmd=u)  # of another name most axes have to follow
     with pytest.raises(RunError, match=r"follows the commands on 1 of \d axes"):
         survey(tmp_path / "other.npz")
+
+
+def test_of_steps_how_far_an_axis_goes_tells_its_gain(tmp_path: Path) -> None:
+    """Changes over a tenth of a second are cut by steps that take longer: no gear is asked for. Half is."""
+    rng, t = np.random.default_rng(3), 0.1 * np.arange(900)
+    u = rng.choice([0.1, 0.4, 0.8], 90).repeat(10)
+    z = np.interp(t - 0.35, t, u)
+    for gain, asks in ((1.0, False), (0.5, True)):
+        write(tmp_path / "steps.csv", {"t_s": t, "goal_j_rad": u, "encoder_j_rad": gain * z})
+        assert any("times as far as commanded" in one for one in asked(survey(tmp_path / "steps.csv"))) is asks
+
+
+def test_where_no_column_leads_they_are_named(tmp_path: Path) -> None:
+    """Whoever is to write run.toml sees what there is."""
+    rng, t = np.random.default_rng(4), 0.02 * np.arange(500)
+    noise = {name: np.cumsum(rng.normal(size=500)) for name in ("r", "y", "w1", "w2")}
+    write(tmp_path / "log.csv", {"t_s": t, **noise})
+    with pytest.raises(RunError, match=r"log\.csv: r, y, w1, w2"):
+        survey(tmp_path / "log.csv")

@@ -66,7 +66,7 @@ _LONGEST_WAIT = 3.0  # packets, that a row waits: of rows that come in bursts by
 _ROUNDED, _FLOAT32 = 1.5e-6, 1.2e-7  # s, of stamps in us; share, of stamps in float32
 _ALIKE_SPANS = 1.2  # factor between the spans that two clocks of a table tell
 _METRES = names.words_in(
-    "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage"
+    "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage tfMessage"
 )
 _ECHO = re.compile(r"^field\.(transforms0\.)?")
 _ECHOED = re.compile(r"field\..*(position|translation|point)\.[xyz]$")  # of a message by `rostopic echo -p`: in m, too
@@ -798,7 +798,7 @@ def _unread(topic: Topic) -> str:
 
 def _wanted(topic: Topic) -> list[str]:
     """The fields of a topic that may be positions or their stamps."""
-    if topic.type.endswith("/TFMessage"):
+    if topic.type.lower().endswith("/tfmessage"):  # of the first ROS: tf/tfMessage
         return _OF_FRAME
     several, times = any("points[1]" in name for name in topic.fields), (topic.first or 0, topic.last or 0)
     streamed = not several and times[1] - times[0] < _STREAM_NS * (topic.count - 1)

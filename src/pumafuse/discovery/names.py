@@ -24,7 +24,7 @@ _ROLES: dict[Role, frozenset[str]] = {
     "reference": words_in("truth reference ref ground gt groundtruth"),
     "command": words_in(
         "command commands commanded cmd goal goals target targets desired des demand demanded setpoint setpoints set sp"
-        " soll sol planned action control ctrl input inputs com wanted reqd requested"
+        " soll sol planned action actions control ctrl input inputs com wanted reqd requested"
     ),
     "sensor": _DEVICES
     | words_in(

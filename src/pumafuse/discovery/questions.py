@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import printable
 from ..logs.frames import CARTESIAN
+from ..logs.run import Source
 from ..units import MS
 from .following import LATEST
 from .guesses import SensorGuess
@@ -90,7 +91,7 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
                 most = " or more" if one.lag >= LATEST else ""
                 late = f"{one.lag * MS:.0f} ms{most} late"
                 yield f"{name} is {late} on {axis}, as hardly an arm is: is its clock another one?"
-            if not _is_one(size):
+            if not _is_one(size) and not _is_one(_reach(run.measured[name], axis) / _reach(run.command, axis)):
                 unit = (
                     "is its unit right" if not 1.0 / _OTHER_UNIT < size < _OTHER_UNIT else "is that its gear, or a unit"
                 )
@@ -116,6 +117,12 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
 def _is_one(gain: float) -> bool:
     """Whether a gain is about 1, whatever its sign."""
     return 1.0 / _ABOUT_ONE < abs(gain) < _ABOUT_ONE
+
+
+def _reach(source: Source, axis: str) -> float:
+    """How far an axis goes, outliers apart [m or rad]: of steps, which a span cuts, that tells a gain better."""
+    low, high = np.nanquantile(source.values[axis], [0.02, 0.98])
+    return max(float(high - low), 1e-12)
 
 
 def _sure(doubtful: list[str], else_: str = "a guess") -> str:

@@ -451,7 +451,7 @@ def _command(streams: Sequence[Stream], log: str, advice: str) -> tuple[Stream, 
     followers = {one.name: _followers(one, streams) for one in candidates}
     best = max(candidates, key=lambda one: followers[one.name], default=None)
     if best is None or (not called and not followers[best.name][0]):
-        what = ", ".join(printable(one.part.label) for one in streams)
+        what = "; ".join(f"{printable(one.part.label)}: {', '.join(list(one.axes)[:_MOST_LISTED])}" for one in streams)
         raise RunError(
             f"{log}: which numbers are the commands? None is called command, goal, target, desired, setpoint or action,"
             f" and none runs ahead of others ({what}); {advice}say it in run.toml"

@@ -349,6 +349,8 @@ class ArmSearch:
                 width = self._longest if name == "delay" else _LOG_RANGE
                 log -= math.log(width)
                 information[place, place] += 12.0 / width**2
+        if not np.isfinite(information).all():  # an arm that runs off
+            return -math.inf
         if free:
             size = np.sqrt(np.maximum(np.diag(information), 1e-9))
             _, determinant = np.linalg.slogdet(information / np.outer(size, size) + 1e-9 * np.eye(len(free)))

@@ -33,6 +33,7 @@ _CHANCE = 3.84  # of χ² with one degree of freedom, 95 %
 _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
 _MOST = 0.8  # of the measurements: how far these are off is not decided by single commands that were never sent
 _DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced,
+_NOTHING = 1e-3  # of the range that is measured: what is off by less is right, whatever is less off
 _WORSE = 2.0  # and where it is so many times as far off as that of least squares
 _NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow: it is said
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
@@ -137,8 +138,8 @@ class Doubt(NamedTuple):
 
     @property
     def is_worse(self) -> bool:
-        """Whether it predicts worse than the delayed command."""
-        return self.off > _DOUBTED * self.plain.delayed_off
+        """Whether it predicts worse than the delayed command, and by more than matters."""
+        return self.off > max(_DOUBTED * self.plain.delayed_off, _NOTHING * self.plain.measured.range)
 
     @property
     def refutes(self) -> bool:
