@@ -147,9 +147,9 @@ def test_a_cell_beyond_the_first_block_may_be_of_another_kind(
 @pytest.mark.parametrize(
     ("body", "kept", "said"),
     [
-        ("0,1,2\n1,2,3\n2,3", [0, 1], "1 line left out: 2 cells where the header has 3, first in line 4"),
-        ("0,1,2\n1\n2,3,4\n3\n", [0, 2], "2 lines left out: 1 cells where the header has 3, first in line 3"),
-        ("0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], "1 line left out: 4 cells where the header has 3, first in line 3"),
+        ("0,1,2\n1,2,3\n2,3", [0, 1], "1 line left out: 2 cells where the first has 3, first in line 4"),
+        ("0,1,2\n1\n2,3,4\n3\n", [0, 2], "2 lines left out: 1 cells where the first has 3, first in line 3"),
+        ("0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], "1 line left out: 4 cells where the first has 3, first in line 3"),
     ],
 )
 def test_a_torn_line_is_left_out_and_noted(tmp_path: Path, body: str, kept: list[int], said: str) -> None:
@@ -197,7 +197,7 @@ LAYOUTS: dict[str, tuple[str, str]] = {
     ),
     "a message below the header": (
         "t_s,x_mm\nINFO  [node-3] recording started\n" + "".join(f"{t},{x}\n" for t, x in ROWS),
-        "1 line left out: 1 cells where the header has 2, first in line 2",
+        "1 line left out: 1 cells where the first has 2, first in line 2",
     ),
     "settings and units": (
         "Trajectories\n100\nt_s,x_mm\n[s],[mm]\n" + "".join(f"{t},{x}\n" for t, x in ROWS),
@@ -354,7 +354,7 @@ def test_of_a_wide_text_what_is_asked_for_is_read(tmp_path: Path, ending: str) -
 def test_lines_are_counted_from_the_top_of_the_file(tmp_path: Path) -> None:
     """Also where a comment stands above the header."""
     table = csv(tmp_path, "# by hand\nt_s,x_mm\n0,1\n1\n2,3\n")
-    assert table.notes == ("log.csv: 1 line left out: 1 cells where the header has 2, first in line 4",)
+    assert table.notes == ("log.csv: 1 line left out: 1 cells where the first has 2, first in line 4",)
 
 
 @pytest.mark.parametrize("body", ["0,1,2\n1,2,3\n", "0,1,2\n1,h\xf6\n2,3,4\n"])

@@ -428,7 +428,7 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
         layout, note = short
         return parsed(layout), (names and layout.names) or [], [note, *notes]
     note = (
-        f"{path.name}: {counted(len(wrong), 'line')} left out: {wrong[0].actual_columns} cells where the header has"
+        f"{path.name}: {counted(len(wrong), 'line')} left out: {wrong[0].actual_columns} cells where the first has"
         f" {wrong[0].expected_columns}, first in line {wrong[0].number}"
     )
     if table.num_rows == 0:  # not the kind of table that it should be
