@@ -11,6 +11,7 @@ stay as they are:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
@@ -41,6 +42,7 @@ _STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a m
 _PIECES = 20  # of a run, that a model which is right has independent scores in
 _SHIFT = 1e-4  # s, by which a lag is varied
 _SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
+_COUNTED = 0.98  # of the innovations
 _SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
 
 T = TypeVar("T")
@@ -368,6 +370,12 @@ class Likelihood:
             apart = 1.4826 * float(np.median(np.abs(measured - expected)))
             found[axis].append(max(apart / abs(config.sensors[name].scale), _SMALLEST))
         return {axis: min(apart, default=_SMALLEST) for axis, apart in found.items()}
+
+    def innovation(self, config: FusionConfig) -> float:
+        """Root mean square of all innovations [m or rad], whatever their sd, but for the largest fiftieth: outliers."""
+        every = [innovations(one, config).innovation for one in self._segments]
+        squares = np.sort(np.concatenate([one[np.isfinite(one)] ** 2 for one in every]))
+        return float(np.sqrt(squares[: math.ceil(_COUNTED * len(squares))].mean())) if len(squares) else 0.0
 
     def faults(self, config: FusionConfig) -> list[Fault]:
         """Why sensors do not follow the commands, those that do not."""

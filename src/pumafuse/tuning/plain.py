@@ -34,7 +34,6 @@ _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
 _MOST = 0.8  # of the measurements: how far these are off is not decided by single commands that were never sent
 _DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced,
 _NOTHING = 1e-3  # of the range that is measured: what is off by less is right, whatever is less off
-_WORSE = 2.0  # and where it is so many times as far off as that of least squares
 _NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow: it is said
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
 
@@ -46,15 +45,13 @@ class PlainArm(NamedTuple):
         arm: The arm.
         lag_ci95: The lags [s] that leave no more than chance beyond the least, of so many measurements as have errors
             of their own.
-        off: How far it is off where the axis moves [m]; four fifths of the measurements are nearer.
         delayed: By how much the command alone is to be delayed to leave the least [s].
-        delayed_off: How far that is off.
+        delayed_off: How far that is off where the axis moves [m]; four fifths of the measurements are nearer.
         measured: What was looked at, without outliers.
     """
 
     arm: Arm
     lag_ci95: tuple[float, float]
-    off: float
     delayed: float
     delayed_off: float
     measured: Measured
@@ -107,7 +104,7 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     commands = [Arm(delay, float(LAGS[0])) for delay in late]
     delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
     between = float(min(allowed)), float(max(allowed))
-    return PlainArm(arm, between, off(measured, arm), delayed.total, off(measured, delayed), measured)
+    return PlainArm(arm, between, delayed.total, off(measured, delayed), measured)
 
 
 def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list[Arm]:
@@ -124,11 +121,13 @@ class Doubt(NamedTuple):
         plain: That of least squares.
         off: How far the axis's own is off where it moves [m]; four fifths of the measurements are nearer.
         lag: Its own [s].
+        is_beaten: Whether a filter predicts the next measurement better with the arm of least squares in its place.
     """
 
     plain: PlainArm
     off: float
     lag: float
+    is_beaten: bool = False
 
     @property
     def lag_ci95(self) -> tuple[float, float]:
@@ -143,8 +142,8 @@ class Doubt(NamedTuple):
 
     @property
     def refutes(self) -> bool:
-        """Whether it is so much worse that the arm of least squares is to take its place."""
-        return self.is_worse and self.off > min(_REFUTED * self.plain.delayed_off, _WORSE * self.plain.off)
+        """Whether the arm of least squares is to take its place."""
+        return self.is_beaten or (self.is_worse and self.off > _REFUTED * self.plain.delayed_off)
 
     def sentence(self, config: FusionConfig, axis: str) -> str:
         """What to know of it, under the configuration that is doubted; empty where that is little."""
@@ -156,7 +155,7 @@ class Doubt(NamedTuple):
                 f" {self.lag * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
                 f" commands {self.plain.delayed * MS:.0f} ms later are {self.plain.delayed_off * screen.scale:.3g}"
             )
-        elif max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total:
+        elif self.is_beaten or max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total:
             what = (
                 f"the likelihood says a lag of {self.lag * MS:.4g} ms, least squares, which have no model of noise,"
                 f" {self.plain.arm.total * MS:.4g} ({low * MS:.4g} to {high * MS:.4g})"

@@ -42,6 +42,7 @@ from .validation import Check, check
 
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
 _LATE = 0.1  # of a run: measurements that begin later are split for themselves
+_BEATEN = 0.8  # of the innovations, which another arm must leave to take the place of the likeliest
 _NOTHING = 0.01  # log-likelihood by which the configuration as given must be ahead to be kept
 
 Progress: TypeAlias = Callable[[str, float], None]
@@ -307,8 +308,15 @@ class Pipeline:
 
     def doubts(self) -> dict[str, Doubt]:
         """Of the arms that were fitted: see :func:`.plain.doubts`."""
-        arms = {axis: one for stage in self.stages for axis, one in stage.arms.items()}
-        return doubts({axis: one.plain for axis, one in arms.items()}, self.result())
+        arms, config = {axis: one for stage in self.stages for axis, one in stage.arms.items()}, self.result()
+        found = doubts({axis: one.plain for axis, one in arms.items()}, config)
+        return {axis: one._replace(is_beaten=self._is_beaten(axis, one, config)) for axis, one in found.items()}
+
+    def _is_beaten(self, axis: str, doubt: Doubt, config: FusionConfig) -> bool:
+        """Whether the arm of least squares predicts the next measurement better, the noise being as it is."""
+        mine = self.whole.of_axis(axis)
+        instead = with_plain_arm(config, axis, doubt.plain.arm)
+        return mine.innovation(instead) < _BEATEN * mine.innovation(config)
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
