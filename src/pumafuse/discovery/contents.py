@@ -394,7 +394,7 @@ def _signal(
         axis = "xyz"[int(place_of[1])] if place_of else axis
         if axis not in CARTESIAN and not names.is_turning(axis):
             return "neither x, y, z nor an angle by its name"
-        of_type, basis = ("m" if axis in CARTESIAN else "rad"), "type"
+        of_type, basis = "m" if axis in CARTESIAN else "rad", "name" if unit else "type"
     return Signal(path, axis, unit or of_type, basis, values, where=where)
 
 
