@@ -1281,3 +1281,19 @@ def test_where_no_column_leads_they_are_named(tmp_path: Path) -> None:
     write(tmp_path / "log.csv", {"t_s": t, **noise})
     with pytest.raises(RunError, match=r"log\.csv: r, y, w1, w2"):
         survey(tmp_path / "log.csv")
+
+
+def test_files_that_each_are_a_whole_run_are_not_one(tmp_path: Path) -> None:
+    """Three takes of a demonstration in a folder: the first is used, the others are named. A table beside it stays."""
+    for number in range(3):
+        t, u, s, z = recorded(count=600, seed=number)
+        turn = 1.0 - 0.4 * number
+        table = {"t_s": t, "wish_cmd_m": turn * u[:, 0], "wish_state_m": turn * np.interp(t, s, z[:, 0])}
+        write(tmp_path / f"take_{number}.csv", table)
+    write(tmp_path / "tracker.csv", {"t_s": s, "wish_m": z[:, 0]})
+    found = survey(tmp_path)
+    assert found.roles is not None
+    assert found.roles.command.part.label == "take_0.csv"
+    assert sorted(one.part.label for one in found.roles.sensors) == ["take_0.csv", "tracker.csv"]
+    (note,) = [note for part in found.parts for note in part.notes if "a run each" in note]
+    assert note.startswith("2 other files of the same columns") and "take_1.csv" in note

@@ -83,6 +83,7 @@ _PX4 = "PX4"  # whose numbers are in SI units; of its hundred topics those have 
 _PX4_TOPICS = names.words_in("position attitude odometry trajectory pose gimbal joint joints angle angles servo")
 _PX4_OTHERS = names.words_in("gps global estimator status rates triplet sensor selector")  # and by none of these
 _PX4_PLACE = re.compile(r"position\[([012])\]")
+_WHOLE = {"command", "sensor"}  # roles in a table by which it is a run of its own
 _CHILD = "child_frame_id"
 _BASES = names.words_in("base world map odom root origin")  # words of frames that stand still
 _TOOLS = names.words_in("tool tcp ee eef effector flange hand gripper")
@@ -217,7 +218,22 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
             found += [part for name in several for part in _tabled(path, rate, name)]
         if len(found) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
-    return found
+    return _of_one_run(found)
+
+
+def _of_one_run(parts: Sequence[Part]) -> list[Part]:
+    """The parts of a log; of files of the same columns that each hold a whole run the first alone."""
+
+    def columns(part: Part) -> set[str]:
+        return {*part.left_out, *(one.column for one in part.signals)}
+
+    whole = [one for one in parts if {names.column_role(signal.name) for signal in one.signals} >= _WHOLE]
+    again = [one for one in whole if one.file != whole[0].file and columns(one) == columns(whole[0])]
+    if not again:
+        return list(parts)
+    others = f"{counted(len(again), 'other file')} of the same columns left out, a run each: {again[0].label} …"
+    kept = [one for one in parts if one not in again]
+    return [replace(one, notes=(*one.notes, others)) if one is whole[0] else one for one in kept]
 
 
 def _files(log: Path) -> list[Path]:
