@@ -284,6 +284,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
     notes = [*turned, *likelihood.notes, *said]
     notes += [f"{axis}: does not move, or {trusted} does not measure it" for axis in still]
+    notes += [f"{axis}: {one.step}" for axis in lags if (one := found[axis].plain) and one.step]
     notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
     notes += [f"{axis}: {too_early(trusted, by)}" for axis, by in sooner.items()]
     notes += [_SAMPLED.format(one.run.name, step * MS) for one in surveys if (step := interpolation(one))]

@@ -34,8 +34,25 @@ _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
 _MOST = 0.8  # of the measurements: how far these are off is not decided by single commands that were never sent
 _DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced,
 _NOTHING = 1e-3  # of the range that is measured: what is off by less is right, whatever is less off
-_NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow: it is said
+_NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow, or steps: it is said
+_SPLITS, _HALVED = np.linspace(0.1, 0.9, 9), 0.5  # of a run; of the squares, which two lags must leave less than
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
+
+
+class LagStep(NamedTuple):
+    """That an axis is as late until an instant [s after the first command] as ``before``, and then as ``after`` [s]."""
+
+    time: float
+    before: float
+    after: float
+
+    def __str__(self) -> str:
+        """A sentence."""
+        return (
+            f"by least squares the lag is {self.before * MS:.0f} ms until about {self.time:.0f} s and"
+            f" {self.after * MS:.0f} ms from then on, and no one arm explains both: did a latency step? Use parts,"
+            " --to and --from"
+        )
 
 
 class PlainArm(NamedTuple):
@@ -48,6 +65,7 @@ class PlainArm(NamedTuple):
         delayed: By how much the command alone is to be delayed to leave the least [s].
         delayed_off: How far that is off where the axis moves [m]; four fifths of the measurements are nearer.
         measured: What was looked at, without outliers.
+        step: That it is another one in the second part of the run, where that leaves much less.
     """
 
     arm: Arm
@@ -55,6 +73,7 @@ class PlainArm(NamedTuple):
     delayed: float
     delayed_off: float
     measured: Measured
+    step: LagStep | None = None
 
 
 def delays(measured: Measured) -> FloatArray:
@@ -76,6 +95,7 @@ def independent(left: FloatArray) -> float:
 
 def plain_arm(measured: Measured) -> PlainArm | None:
     """The arm that leaves the least squares, without outliers; None where nothing follows the commands."""
+    begin = min((int(one.given[0]) for one in measured.recordings), default=0)
     measured = measured.excerpt(COMMANDS, ROWS)
     if measured.count < 2 * _FEWEST or not any(np.ptp(one.command) > 0.0 for one in measured.recordings):
         return None
@@ -104,7 +124,31 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     commands = [Arm(delay, float(LAGS[0])) for delay in late]
     delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
     between = float(min(allowed)), float(max(allowed))
-    return PlainArm(arm, between, delayed.total, off(measured, delayed), measured)
+    return PlainArm(arm, between, delayed.total, off(measured, delayed), measured, _lag_step(measured, arm, begin))
+
+
+def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
+    """Where another lag in the second part of a run leaves much less than one for all of it; None where none does.
+
+    Args:
+        measured: Of one recording; of several nothing is told.
+        arm: Of all of it.
+        begin: When the first command was given [ns].
+    """
+    if len(measured.recordings) != 1:
+        return None
+    (one,), rest, whole = measured.recordings, measured.white(arm), measured.left(arm)
+    least, found = _HALVED * float(whole @ whole), None
+    for edge in np.quantile(one.time, _SPLITS).tolist():
+        squares, lags = 0.0, list[float]()
+        for mine in (one.time < edge, one.time >= edge):
+            part = measured.of([one._replace(weight=np.where(mine, one.weight, 0.0))])
+            fitted = part.fitted(arm, ["delay", "gain"], rest, _ANY).arm
+            left = part.left(fitted)
+            squares, lags = squares + float(left @ left), [*lags, fitted.total]
+        if squares < least and abs(lags[1] - lags[0]) > _NOTABLE * arm.total:
+            least, found = squares, LagStep((edge - begin) / 1e9, *lags)
+    return found
 
 
 def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list[Arm]:

@@ -168,6 +168,7 @@ def tune(
     lost = [axis for axis, one in arms.items() if one.plain is None or result.arm.lag_of(axis) > LONGEST]
     lags = with_doubts(fitted_lags(free, config, result, around, lost), found, config, result)
     tuned = _with_provenance(result, free, intervals, {} if interrupted else lags, names)
+    doubted += [f"{axis}: {one.plain.step}" for axis, one in arms.items() if one.plain and one.plain.step]
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
