@@ -33,7 +33,7 @@ _CHANCE = 3.84  # of χ² with one degree of freedom, 95 %
 _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
 _MOST = 0.8  # of the measurements: how far these are off is not decided by single commands that were never sent
 _DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced,
-_NOTHING = 1e-3  # of the range that is measured: what is off by less is right, whatever is less off
+_NOTHING = 1e-3  # of the range that is measured: nothing is said of what is off by less
 _NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow, or steps: it is said
 _SPLITS, _HALVED = np.linspace(0.1, 0.9, 9), 0.5  # of a run; of the squares, which two lags must leave less than
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
@@ -181,8 +181,8 @@ class Doubt(NamedTuple):
 
     @property
     def is_worse(self) -> bool:
-        """Whether it predicts worse than the delayed command, and by more than matters."""
-        return self.off > max(_DOUBTED * self.plain.delayed_off, _NOTHING * self.plain.measured.range)
+        """Whether it predicts worse than the delayed command."""
+        return self.off > _DOUBTED * self.plain.delayed_off
 
     @property
     def refutes(self) -> bool:
@@ -193,7 +193,7 @@ class Doubt(NamedTuple):
         """What to know of it, under the configuration that is doubted; empty where that is little."""
         screen, (low, high) = config.arm.screen_of(axis), self.lag_ci95
         then = "The arm is that of least squares instead" if self.refutes else "The interval of its lag covers both"
-        if self.is_worse:
+        if self.is_worse and (self.refutes or self.off > _NOTHING * self.plain.measured.range):
             what = (
                 "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
                 f" {self.lag * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
