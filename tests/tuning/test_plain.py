@@ -209,3 +209,15 @@ def test_a_lag_that_steps_is_said_of_one_sensor_alone() -> None:
     for steady in (one, later, motion(0.02, 0.3, 0.9)):
         plain = found_in(steady)
         assert plain is not None and plain.step is None
+
+
+def test_nothing_is_said_of_what_is_off_by_next_to_nothing() -> None:
+    """Twice as far off as the delayed command: of a thousandth of the range it is said, of half as much it is not."""
+    config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config
+    plain = found_in(motion(0.05, 0.05, 1.0))
+    assert plain is not None
+    for share, said in ((5e-4, False), (2e-3, True)):
+        off_by = share * plain.measured.range
+        doubt = Doubt(plain._replace(delayed_off=0.5 * off_by), off_by, plain.arm.total)
+        assert doubt.is_worse and not doubt.refutes
+        assert bool(doubt.sentence(config, next(iter(config.arm.axes)))) is said

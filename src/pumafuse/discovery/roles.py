@@ -189,7 +189,8 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             )
         if axes and matched.role:
             kept.append(matched)
-            if others := {axis: some for axis, some in stream.axes.items() if some not in axes.values()}:
+            used = {id(some) for some in axes.values()}
+            if others := {axis: some for axis, some in stream.axes.items() if id(some) not in used}:
                 left_out.append((replace(stream, axes=others), "no command is called so, and none moves alike"))
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
@@ -351,7 +352,8 @@ def _seen_twice(key: _Group, signals: Sequence[Signal]) -> Iterator[tuple[_Group
         and {one.axis for one in some} <= axes
         and names.PARTS.isdisjoint(words)
     }
-    yield key, [one for one in signals if not any(one in some for some in apart.values())]
+    taken = {id(one) for some in apart.values() for one in some}
+    yield key, [one for one in signals if id(one) not in taken]
     for words, some in apart.items():
         yield (key[0], _joined(words), *key[2:]), some
 
