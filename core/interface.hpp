@@ -21,9 +21,9 @@ std::vector<Of<Real>> lifted(const In* in, Time count, const std::vector<const I
     Real* to = reinterpret_cast<Real*>(found.data());
     for (std::size_t i = 0; i < count * fields; ++i) {
         to[i] = reinterpret_cast<const double*>(in)[i];
-        if constexpr (std::is_same_v<Real, Dual>)
+        if constexpr (!std::is_same_v<Real, double>)
             for (std::size_t k = 0; k < tangents.size(); ++k)
-                to[i].d[k] = reinterpret_cast<const double*>(tangents[k])[i];
+                to[i].d[k / 2][k % 2] = reinterpret_cast<const double*>(tangents[k])[i];
     }
     return found;
 }
@@ -46,6 +46,7 @@ inline auto sized(const pf_model& model, auto make) {
     int most = 0;
     for (const auto& axis : Filter<64>(model_of<double>(model)).axes) most = std::max(most, axis.noise.size);
     if (most <= 4) return make(Size<4>{});
+    if (most <= 5) return make(Size<5>{});
     if (most <= 6) return make(Size<6>{});
     if (most <= 9) return make(Size<9>{});
     if (most <= 16) return make(Size<16>{});

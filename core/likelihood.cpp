@@ -3,6 +3,22 @@
 
 using namespace pumafuse;
 
+namespace {
+
+constexpr int LANES = 12;  // derivatives that one pass carries at most: as many as an axis mostly has
+
+// Calls `make` with as many lanes as k parameters need, where that is worth a compiler's time: few axes have many states.
+template <int N>
+void with_lanes(Time k, auto make) {
+    if constexpr (N <= 6) {
+        if (k <= 6) return make(std::integral_constant<int, 6>{});
+        if (k <= 10) return make(std::integral_constant<int, 10>{});
+    }
+    make(std::integral_constant<int, LANES>{});
+}
+
+}  // namespace
+
 int pf_linearise(const pf_model* model, const pf_model* tangents, int64_t k, int64_t origin, const pf_events* events,
                  const pf_results* results, double* d_innovation, double* d_variance) {
     const Time stride = events->count * model->axes;
@@ -10,9 +26,11 @@ int pf_linearise(const pf_model* model, const pf_model* tangents, int64_t k, int
         sized(*model, [&]<int N>(Size<N>) {
             for (Time first = 0; first < std::max(k, Time(1)); first += LANES) {
                 const Time lanes = std::min(k - first, Time(LANES));
-                const Filter<N, Dual> filter(model_of<Dual>(*model, tangents + first, lanes));
-                linearise(filter, {*events, results, model->axes}, origin, int(lanes), d_innovation + first * stride,
-                          d_variance + first * stride);
+                with_lanes<N>(lanes, [&]<int L>(std::integral_constant<int, L>) {
+                    const Filter<N, Dual<L>> filter(model_of<Dual<L>>(*model, tangents + first, lanes));
+                    linearise(filter, {*events, results, model->axes}, origin, int(lanes),
+                              d_innovation + first * stride, d_variance + first * stride);
+                });
             }
         });
     });

@@ -56,10 +56,12 @@ void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     std::copy_n(found, 17, step);
 }
 
-void pf_response(const pf_axis* axis, int64_t commands, const int64_t* given, const double* command, int64_t n,
-                 const int64_t* time, double* position) {
-    const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
-    respond(arm, axis->start, std::llround(axis->delay * 1e9), commands, given, command, n, time, position);
+void pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int64_t* given, const double* command,
+                 int64_t n, const int64_t* time, double* position) {
+    for (const auto& one : lifted<Axis, double>(axis, count, {})) {
+        respond(Arm<double>(one), one.start, std::llround(one.delay * 1e9), commands, given, command, n, time, position);
+        position += n;
+    }
 }
 
 void pf_follow(const pf_axis* axis, pf_motion* motion, int64_t commands, const int64_t* given, const double* command,

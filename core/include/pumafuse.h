@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 7              /* of this interface: a program and its library must agree */
+#define PF_VERSION 8              /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -113,10 +113,10 @@ PF_API const char *pf_error(void); /* of the last call of this thread that faile
  * input; what an input that decays from 1 m by exp(-dt/Tr) makes of position and rate, and what is left of it; Phi and
  * Q of a smooth disturbance of variance 1. */
 PF_API void pf_transition(const pf_axis *axis, double dt, double step[17]);
-/* Where an axis goes without noise, relative to its start level [m], at n instants, ascending; commands [m] are given
- * at their instants, ascending. */
-PF_API void pf_response(const pf_axis *axis, int64_t commands, const int64_t *given, const double *command, int64_t n,
-                        const int64_t *time, double *position);
+/* Where each of `count` arms goes without noise, relative to its start level [m], at n instants, ascending; commands [m]
+ * are given at their instants, ascending. position (count, n). */
+PF_API void pf_response(int64_t count, const pf_axis *axis, int64_t commands, const int64_t *given,
+                        const double *command, int64_t n, const int64_t *time, double *position);
 
 /* What an axis without noise does just after a command, relative to its start level: when it acts [ns], the command in
  * force and the step that it was [m], the gain error [m], position [m] and rate [m/s] of the drive, and what the tool is

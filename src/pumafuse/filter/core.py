@@ -20,7 +20,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
 from ..errors import PumafuseError
 from .events import Events, Results
 
-VERSION = 7  # of the interface
+VERSION = 8  # of the interface
 FINEST = 1e-9  # PF_FINEST
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
@@ -83,7 +83,7 @@ _MODES = "filtered", "repeated", "as-live", "smoothed"
 _KINDS = {"p": _POINTER, "n": _INT64, "d": ctypes.c_double, "i": ctypes.c_int, "u": ctypes.c_uint64}
 _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double, int, uint64; v: nothing
     "transition": "vpdp",
-    "response": "vpnppnpp",
+    "response": "vnpnppnpp",
     "follow": "vppnppnpp",
     "whiten": "vpnppnppp",
     "weigh": "vpnppnpnppnpp",

@@ -53,7 +53,7 @@ def response(
     position = np.empty(len(time))
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
     record = record_of(axis, period, delay, start)
-    library.pf_response(at(record), len(given), at(given), at(command), len(time), at(time), at(position))
+    library.pf_response(1, at(record), len(given), at(given), at(command), len(time), at(time), at(position))
     return position
 
 

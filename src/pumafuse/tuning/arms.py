@@ -309,7 +309,7 @@ class Measured:
 
     def responses(self, arm: Arm) -> list[FloatArray]:
         """The response of each recording [m], relative to its start."""
-        return [self._response(one, arm) for one in self.recordings]
+        return [one[0] for one in self._responses([arm])]
 
     def residuals(self, arm: Arm) -> list[FloatArray]:
         """What an arm leaves of each recording [m]."""
@@ -414,7 +414,7 @@ class Measured:
 
     def _sloped(self, arm: Arm, names: Coordinates, rest: Rest) -> tuple[FloatArray, FloatArray, float]:
         """What an arm leaves and how it changes with each coordinate, whitened, without biases; the sum of log S."""
-        moved = [self._derivatives(one, arm, names) for one in self.recordings]
+        moved = self._derivatives(arm, names)
         columns = [
             np.vstack([one.value - rows[0], rows[1:], self._columns(one)[1:]])
             for one, rows in zip(self.recordings, moved, strict=True)
@@ -426,16 +426,16 @@ class Measured:
             left, slopes = left - (left @ basis) @ basis.T, slopes - (slopes @ basis) @ basis.T
         return left[0], slopes, log_determinant
 
-    def _derivatives(self, one: Recording, arm: Arm, names: Coordinates) -> FloatArray:
-        """The response, and how it changes with each coordinate, (1 + k, m)."""
-        here, rows = self._response(one, arm), list[FloatArray]()
-        for name in names:
-            step = _LOG_SHIFT if name in LOGARITHMIC else _SHIFT
-            if name in ("gain", "slope") and self._is_linear(arm):
-                step = 1.0
-            there = arm.moved([name], [arm.coordinate(name) + step])
-            rows.append((self._response(one, there) - here) / step)
-        return np.array([here, *rows])
+    def _derivatives(self, arm: Arm, names: Coordinates) -> list[FloatArray]:
+        """The response of each recording, and how it changes with each coordinate, (1 + k, m)."""
+        steps = [_LOG_SHIFT if name in LOGARITHMIC else _SHIFT for name in names]
+        if self._is_linear(arm):
+            steps = [1.0 if name in ("gain", "slope") else step for name, step in zip(names, steps, strict=True)]
+        beside = [arm.moved([name], [arm.coordinate(name) + step]) for name, step in zip(names, steps, strict=True)]
+        found = self._responses([arm, *beside])
+        for moved in found:
+            moved[1:] = (moved[1:] - moved[0]) / np.array(steps)[:, None]
+        return found
 
     def _is_linear(self, arm: Arm) -> bool:
         return not any(getattr(arm, bend) for bend in BENDS) and (self._known is None or self._known.sag is None)
@@ -446,22 +446,26 @@ class Measured:
             [one.value, *((one.source == other).astype(np.float64) for other in range(1, len(self.sensors)))]
         )
 
-    def _response(self, one: Recording, arm: Arm) -> FloatArray:
-        record, position = self._records([arm], one.start), np.empty(len(one.time))
-        library.pf_response(
-            at(record), len(one.given), at(one.given), at(one.command), len(one.time), at(one.time), at(position)
-        )
-        return position
+    def _responses(self, arms: Sequence[Arm]) -> list[FloatArray]:
+        """The responses of arms, for each recording (n, m)."""
+        records, found = self._records(arms), list[FloatArray]()
+        for one in self.recordings:
+            records["start"] = one.start
+            moved = np.empty((len(arms), len(one.time)))
+            commands = len(one.given), at(one.given), at(one.command)
+            library.pf_response(len(arms), at(records), *commands, len(one.time), at(one.time), at(moved))
+            found.append(moved)
+        return found
 
-    def _records(self, arms: Sequence[Arm], start: float = 0.0) -> Record:
+    def _records(self, arms: Sequence[Arm]) -> Record:
         """Arms as the core takes them, (n,)."""
         found, (delay, lag, damping, recovery, gain, slope, play, max_speed) = (
             np.zeros(len(arms), AXIS),
             np.array(arms).T,
         )
         if self._known is not None:
-            found[:] = record_of(self._known, self.period, 0.0, start)
-        found["period"], found["delay"], found["start"] = self.period, delay, start
+            found[:] = record_of(self._known, self.period, 0.0, 0.0)
+        found["period"], found["delay"] = self.period, delay
         found["time_constant"] = np.where(damping > 0.0, 0.0, lag)
         found["natural_frequency"], found["damping"] = 2.0 * damping / lag, damping
         found["slope"], found["intercept"], found["recovery"] = slope, gain, recovery
