@@ -233,7 +233,7 @@ def test_names_are_text_and_nothing_else() -> None:
     assert not re.search("<[biu]>", text)
 
 
-@pytest.mark.parametrize("after", ["searching", "fitting on the whole run"])
+@pytest.mark.parametrize("after", ["searching", "validating"])
 def test_an_interrupted_tuning_has_a_page_too(after: str) -> None:
     """With what was fitted until then, and without profiles, as it is no maximum."""
     run = recorded("tip", "camera", "a run")

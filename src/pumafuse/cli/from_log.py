@@ -30,7 +30,8 @@ from .tune import end, fitting, show_lags
 
 _STRAYS = 1.5  # times its sd, by which a sensor errs from what is predicted where the arm strays, too
 _BAGS = (".mcap", ".db3")  # which ROS 2 records
-_FITTED: Sequence[Fit] = ("noise", "delay", "plant", "gain")
+_FITTED_ARM: Sequence[Fit] = ("delay", "plant", "gain")  # whose intervals the error bars count
+_FITTED: Sequence[Fit] = ("noise", *_FITTED_ARM)
 
 
 def run(
@@ -68,7 +69,7 @@ def run(
     begun = begun or FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
     begun.sensor_names(sensors)  # before anything is fitted
     with fitting() as progress:
-        fitted = tune(recorded, begun, fit=_FITTED, progress=progress)
+        fitted = tune(recorded, begun, fit=_FITTED, intervals=_FITTED_ARM, progress=progress)
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)
     results.check_fused(est.counts, est.config)
     extras = partial(draw, est=est, recorded=recorded, rrd=rrd, figures=figures)

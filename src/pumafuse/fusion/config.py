@@ -177,7 +177,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """Whether one rejected axis rejects the whole row."""
         if self.gate_rows is not None:
             return self.gate_rows
-        return any(one.kind == "length" for axis, one in arm.axes.items() if self.sd_of(axis) is not None)
+        return any(one.kind == "length" and self.sd_of(axis) is not None for axis, one in arm.axes.items())
 
     def is_biased(self, axis: str) -> bool:
         """Whether it has a bias on one axis, constant or drifting."""

@@ -9,13 +9,13 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import NO_STAMP, CodeArray, FloatArray, TimeArray
-from ..filter.core import Filter, Model, linearise
+from ..filter.core import Filter, Model, Record, linearise
 from ..filter.events import Events, Results
 from ..filter.outcome import Outcome
 from .config import FusionConfig
 from .estimates import AxisEstimate, Bias, Mode
 from .segments import Segment
-from .setup import filter_model
+from .setup import axes_of, filter_model, sensors_of
 
 Engine = Literal["compiled", "filterpy"]
 _NO_TIMES = np.zeros(0, dtype=np.int64)
@@ -131,19 +131,32 @@ def linearised(
     results = _undecided(events)
     results.outcome[place] = outcome
     model = _certain_model(segment, config)
-    ends = [(_certain_model(segment, low), _certain_model(segment, high), width) for low, high, width in beside]
-    d_nu, d_s = linearise(model, [_slope(*each) for each in ends], segment.origin, events, results)
+    tangents = [_slope(segment, config, model, *each) for each in beside]
+    d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
     return results.rows(place), d_nu[:, place], d_s[:, place]
 
 
-def _slope(low: Model, high: Model, width: float) -> Model:
-    """How every number changes from one model to another, ``width`` of a parameter apart."""
+def _slope(
+    segment: Segment, config: FusionConfig, model: Model, low: FusionConfig, high: FusionConfig, width: float
+) -> Model:
+    """How every number of a model changes from one configuration to another, ``width`` of a parameter apart."""
 
     def of(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         change = (b.view(np.float64) - a.view(np.float64)) / width
         return np.nan_to_num(change).view(a.dtype)  # NaN where there is none: no level, no sd
 
-    return Model(*map(of, low, high))
+    ends = [_model_beside(segment, config, model, end) for end in (low, high)]
+    return Model(*(np.zeros_like(a) if a is b else of(a, b) for a, b in zip(*ends, strict=True)))
+
+
+def _model_beside(segment: Segment, config: FusionConfig, model: Model, other: FusionConfig) -> Model:
+    """The same of another configuration; what the two share is as in ``model``, and not computed again."""
+    if other.sensors is not config.sensors:
+        biased = biased_sensors(segment, other)
+        model = Model(model.axis, *sensors_of(other, segment.axes, segment.sensors, biased))
+    if other.arm is config.arm and other.process is config.process and other.start is config.start:
+        return model
+    return model._replace(axis=_certain(axes_of(other, segment.axes, segment.start)))
 
 
 def model_of(segment: Segment, config: FusionConfig) -> Model:
@@ -154,8 +167,12 @@ def model_of(segment: Segment, config: FusionConfig) -> Model:
 def _certain_model(segment: Segment, config: FusionConfig) -> Model:
     """The same without error bars of lag and gain, which depend on the numbers that are fitted and change no ν."""
     model = model_of(segment, config)
-    model.axis["lag_sd"] = model.axis["gain_sd"] = 0.0
-    return model
+    return model._replace(axis=_certain(model.axis))
+
+
+def _certain(axis: Record) -> Record:
+    axis["lag_sd"] = axis["gain_sd"] = 0.0
+    return axis
 
 
 def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:

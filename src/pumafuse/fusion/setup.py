@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..filter.core import AXIS, SENSOR, VIEW, Model
+from ..filter.core import AXIS, SENSOR, VIEW, Model, Record
 from ..filter.response import record_of
 from ..model.arm import AxisModel
 from ..toml import Interval
@@ -33,10 +33,12 @@ def filter_model(
         start: The level u₀ [m] of each axis where it is known.
         biased: For each axis the sensors whose bias is in its state; None: of no sensor.
     """
-    arm, levels = config.arm, start or {}
-    axis, sensor = np.zeros(len(axes), AXIS), np.zeros(len(names), SENSOR)
-    view = np.zeros((len(names), len(axes)), VIEW)
-    view["sd"], view["bias_time"], sensor["scale"] = np.nan, 1.0, 1.0
+    return Model(axes_of(config, axes, start or {}), *sensors_of(config, axes, names, biased))
+
+
+def axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, float]) -> Record:
+    """What the filter knows of axes, (A,), with the level u₀ [m] of each where it is known."""
+    arm, axis = config.arm, np.zeros(len(axes), AXIS)
     for number, name in enumerate(axes):
         process, one = config.process[name], arm.axes[name]
         axis[number] = record_of(one, arm.update_period, arm.delay_of(name), levels.get(name, np.nan))[0]
@@ -47,17 +49,26 @@ def filter_model(
         record["smoothness"] = _SMOOTHNESS[process.disturbance_kind]
         record["offset_sd"] = config.start.offset_sd_of(name)
         record["lag_sd"], record["gain_sd"] = _sd_of(one.lag_ci95, arm.lag_of(name)), _gain_sd_of(one)
+    return axis
+
+
+def sensors_of(
+    config: FusionConfig, axes: Sequence[str], names: Sequence[str], biased: Sequence[Sequence[str]] | None
+) -> tuple[Record, Record]:
+    """What it knows of sensors, (S,), and of what each sees of axes, (S, A), with biases as in :func:`filter_model`."""
+    sensor, view = np.zeros(len(names), SENSOR), np.zeros((len(names), len(axes)), VIEW)
+    view["sd"], view["bias_time"], sensor["scale"] = np.nan, 1.0, 1.0
     for row, name in enumerate(names):
         known = config.sensors.get(name)
         if known is None:
             continue
-        sensor[row] = known.scale, known.latency, known.latency_sd, known.gate, known.gates_rows(arm)
+        sensor[row] = known.scale, known.latency, known.latency_sd, known.gate, known.gates_rows(config.arm)
         for number, one in enumerate(axes):
             sd = known.sd_of(one)
             inside = biased is not None and name in biased[number]
             biases = (known.bias_sd_of(one), known.bias_drift_sd_of(one)) if inside else (0.0, 0.0)
             view[row, number] = np.nan if sd is None else sd, *biases, known.bias_time, turn_of(config, name, one)
-    return Model(axis, sensor, view)
+    return sensor, view
 
 
 def _sd_of(ci95: Interval | None, value: float) -> float:

@@ -127,7 +127,6 @@ class ArmSearch:
         freedom: Freedom,
         least: Sequence[float],
         believed: bool = False,
-        near: ArmSearch | None = None,
     ) -> None:
         """Search.
 
@@ -136,7 +135,6 @@ class ArmSearch:
             freedom: What is to be found.
             least: The least noise of each sensor [m].
             believed: Whether the sensors' noise is believed to be what second differences show.
-            near: What was found on a part of the measurements, to begin from.
         """
         self._measured, self.sensors = measured, measured.sensors
         self._longest = longest_delay(measured.period)
@@ -144,8 +142,7 @@ class ArmSearch:
         self.bent = self._bent(freedom)
         self.freedom = freedom.bent(self.bent)
         self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
-        likewise = near is not None and near.freedom.bends == self.freedom.bends
-        self._fits = near._fits if near is not None and likewise else self._by_least_squares()
+        self._fits = self._by_least_squares()
         still = {model: fit for model, fit in self._fits.items() if model.gain == "static"}
         gain = self._best(still).arm.gain if still else 1.0
         low, high = _USUAL_GAIN

@@ -99,9 +99,14 @@ class _View(NamedTuple):
 
 
 def confidence_intervals(
-    likelihood: Likelihood, best: Point, free: Sequence[Parameter], *, drawn: bool = False
+    likelihood: Likelihood,
+    best: Point,
+    free: Sequence[Parameter],
+    asked: Sequence[Parameter] | None = None,
+    *,
+    drawn: bool = False,
 ) -> dict[str, ConfidenceInterval]:
-    """Compute the 95 % interval of each free parameter, by its key.
+    """Compute the 95 % interval of each free parameter, or of those that are ``asked`` for, by its key.
 
     ``drawn``: with profiles to draw, too, which takes nearly twice as long.
 
@@ -133,7 +138,8 @@ def confidence_intervals(
             profile=Profile(one.key, one.axis, log, values / one.unit, drop),
         )
 
-    return dict(zip([one.key for one in free], in_threads(of, free), strict=True))
+    asked = free if asked is None else asked
+    return dict(zip([one.key for one in asked], in_threads(of, asked), strict=True))
 
 
 def _views(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> Mapping[str | None, _View]:

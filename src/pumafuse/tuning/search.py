@@ -64,7 +64,6 @@ def search(
     arms: Mapping[str, ArmSearch],
     notify: Notify,
     one_delay: bool = False,
-    begun: bool = False,
 ) -> tuple[Point, dict[str, str]]:
     """Find the most likely configuration.
 
@@ -75,7 +74,6 @@ def search(
         arms: What was looked for of each axis's arm.
         notify: Called with each better point.
         one_delay: Whether all axes whose delay is free share one whatever the measurements say.
-        begun: Whether the configuration has the noise that was found on a part of the measurements: one start more.
 
     Returns:
         The best point; and for each axis the reasons for the order of its plant, its gain, its disturbance and whether
@@ -87,8 +85,7 @@ def search(
         if one.fit == "latency":
             config = _nearest_latency(likelihood, config, one, free)
     found = list[Point]()
-    starts = _noise_models(likelihood, config, arms, free)
-    for start in [*starts, config] if begun else starts:
+    for start in _noise_models(likelihood, config, arms, free):
         if found:  # an arm that is likeliest under one noise is near that under another
             start = _with_arm_of(start, found[0].config, free)
         found.append(_maximum(likelihood, start, free, notify))
@@ -105,7 +102,7 @@ def search(
 
 
 def arm_searches(
-    likelihood: Likelihood, config: FusionConfig, free: FreeOf, believed: bool, near: Mapping[str, ArmSearch]
+    likelihood: Likelihood, config: FusionConfig, free: FreeOf, believed: bool, known: Mapping[str, ArmSearch]
 ) -> dict[str, ArmSearch]:
     """The arm of each axis as far as it is free, and what it leaves, by sensors whose latency is known and steady.
 
@@ -114,16 +111,18 @@ def arm_searches(
         config: The configuration as given.
         free: The parameters to vary.
         believed: Whether the sensors' noise is believed to be what second differences show.
-        near: What was found on a part of the measurements, to begin from.
+        known: Those that were searched for already.
     """
     late = {one.sensor for one in free(config) if one.fit == "latency"}
     late |= {name for name, sensor in config.sensors.items() if sensor.latency_sd}
 
     def of(axis: str) -> ArmSearch:
+        if axis in known:
+            return known[axis]
         names = [name for name in likelihood.sensors[axis] if name not in late] or list(likelihood.sensors[axis])
         least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
         measured = likelihood.measured(axis, config, names)
-        return ArmSearch(measured, _freedom(config, free, axis), least, believed, near.get(axis))
+        return ArmSearch(measured, _freedom(config, free, axis), least, believed)
 
     return dict(zip(likelihood.sensors, in_threads(of, list(likelihood.sensors)), strict=True))
 

@@ -98,9 +98,8 @@ def run_stage(
     runs: Sequence[Run],
     config: FusionConfig,
     plan: Plan,
-    until: float | None = None,
     notify: Notify = ignore,
-    near: Stage | None = None,
+    known: Mapping[str, ArmSearch] | None = None,
 ) -> Stage:
     """Fit the parameters of a plan; where a combination is not identifiable, fix one of it and go on.
 
@@ -108,14 +107,13 @@ def run_stage(
         runs: The runs to fit on.
         config: The configuration before.
         plan: What to fit.
-        until: Leave out measurements after that [s after the first command].
         notify: Called with each better point.
-        near: What the same plan gave on a part of the measurements, to begin from; None: begin from ``config``.
+        known: The arms of axes that were searched for already.
 
     Raises:
         PumafuseError: Nothing can be fitted to the measurements.
     """
-    likelihood = likelihood_of(runs, config, plan, until)
+    likelihood = likelihood_of(runs, config, plan)
     excited, fixed = excited_axes(likelihood, config), list[NotIdentifiable]()
     believed: dict[tuple[str, str], float] = {}  # noise of sensors, when arms are known
 
@@ -125,9 +123,6 @@ def run_stage(
         return for_few(likelihood, [one for one in every if _may_vary(one, at, plan, excited)])[0]
 
     start, notes = likelihood.config, list[str]()
-    if near is not None:
-        begun = near.best.config
-        start = with_gates(begun if "bias" in plan.fit else _with_biases_of(begun, config), start)
     own = with_own_delays(start, excited)
     if any(one.fit == "delay" for one in free(own)):
         start = own
@@ -139,12 +134,12 @@ def run_stage(
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
-    arms = arm_searches(likelihood, start, free, plan.sd_prior, near.arms if near else {})
+    arms = arm_searches(likelihood, start, free, plan.sd_prior, known or {})
     searched = {axis: one for axis, one in arms.items() if one.freedom.free}
     if plan.sd_prior:
         believed |= likelihood.scatter
         believed |= {(name, axis): noise for axis, one in arms.items() for name, noise in one.likely_noise.items()}
-    best, orders = search(likelihood, start, free, arms, notify, plan.one_delay, begun=near is not None)
+    best, orders = search(likelihood, start, free, arms, notify, plan.one_delay)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
@@ -164,6 +159,15 @@ def run_stage(
     ]
     notes += few_measurements(likelihood, free(best.config)) + for_few(likelihood, [])[1]
     return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched)
+
+
+def refitted(stage: Stage, runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float) -> FusionConfig:
+    """The numbers of a stage fitted anew to the measurements until then [s after the first command].
+
+    What they are numbers of stays: orders of plants, kinds of gains and of disturbances.
+    """
+    part = likelihood_of(runs, config, plan, until)
+    return maximise_with_gates(part, with_gates(config, part.config), stage.free).config
 
 
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:
@@ -274,13 +278,6 @@ def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str])
                     f" {gains[best_width]:.1f} in log-likelihood"
                 )
     return config, notes
-
-
-def _with_biases_of(config: FusionConfig, other: FusionConfig) -> FusionConfig:
-    """The configuration with the constant biases that another one estimates."""
-    for name, sensor in other.sensors.items():
-        config = changed(config, ("sensors", name, "bias_sd"), sensor.bias_sd)
-    return config
 
 
 def _may_be_biased(config: FusionConfig, name: str, kind: Kind, fixed: Sequence[str]) -> bool:

@@ -40,6 +40,9 @@ def _between(matrix: FloatArray, score: FloatArray, lowest: FloatArray, highest:
     (Hintermüller, Ito & Kunisch, "The primal-dual active set strategy as a semismooth Newton method", SIAM Journal on
     Optimization 13, 2002).
     """
+    delta = np.linalg.solve(matrix, score)
+    if ((lowest <= delta) & (delta <= highest)).all():
+        return delta
     at_low = at_high = np.zeros(len(score), dtype=np.bool_)
     for _ in range(_ACTIVE_SETS):
         free = ~(at_low | at_high)

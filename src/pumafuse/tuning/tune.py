@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Literal, TypeAlias, cast
@@ -19,13 +19,14 @@ from ..fusion.placing import with_tool
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..units import MS
+from .arm_search import ArmSearch
 from .identifiability import FEWEST, TuneError, correlations, excited_axes, least_count
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
 from .plain import LONGEST, Doubt, doubts, with_plain_arm
-from .stage import Plan, Stage, likelihood_of, run_stage
+from .stage import Plan, Stage, likelihood_of, refitted, run_stage
 from .summary import (
     AxisLikelihood,
     FittedLag,
@@ -95,6 +96,7 @@ def tune(
     validate: Run | None = None,
     sd_prior: bool = True,
     share: Iterable[Literal["delay"]] = (),
+    intervals: Iterable[Fit] | None = None,
     profiles: bool = False,
     progress: Progress = lambda _, __: None,
 ) -> Tuning:
@@ -108,12 +110,14 @@ def tune(
             ``drift_mm_rts``).
         trust: An accurate sensor that arm and process noise are fitted on alone. Its latency is believed; of the others
             only noise, latency and scale are fitted then.
-        validate: A run to compare before and after on. For None a single run is fitted on its first two thirds,
-            validated on the last third, and then fitted anew as a whole.
+        validate: A run to compare before and after on. For None the numbers that were found on a single run are fitted
+            anew to its first two thirds, and compared on the last third.
         sd_prior: Whether a sensor's noise is believed to be what second differences of its measurements show, within a
             factor of 2 (log-normal, one standard deviation); else the likelihood alone decides.
         share: ``delay``: all axes share one whatever the measurements say. Else those share one to which an own one is
             not worth its number (Bayesian information criterion).
+        intervals: The kinds of what is fitted that get intervals, which take up to half of the time; None: all. A lag
+            has one anyway.
         profiles: Whether to compute the likelihood along each parameter, too, to draw it and to look for a second
             maximum: that takes about a tenth longer.
         progress: Called with what is being done and the best log-likelihood so far.
@@ -138,12 +142,13 @@ def tune(
     until = None
     if len(runs) == 1 and validate is None and _FITTED_ON * least_count(pipeline.whole) >= FEWEST:
         until = _fitted_until(runs[0])
-    intervals: dict[str, ConfidenceInterval] = {}
+    asked = kinds if intervals is None else kinds_of(intervals)
+    known: dict[str, ConfidenceInterval] = {}
     around: dict[str, Distances] = {}
     validation: list[Check] | None = None
     interrupted = False
     try:
-        validation = _fitted_and_validated(pipeline, config, until, validate)
+        pipeline.fit()
         found = pipeline.doubts() if "noise" in kinds else {}
         sentences = {axis: one.sentence(pipeline.result(), axis) for axis, one in found.items()}
         doubted = [f"{axis}: {sentence}" for axis, sentence in sentences.items() if sentence]
@@ -151,12 +156,19 @@ def tune(
             held, start = [*fixed, *(f"axes.{axis}" for axis in refuted)], config
             for axis in refuted:
                 start = with_plain_arm(start, axis, found[axis].plain.arm)
-            pipeline = Pipeline(runs, start, plans(start, kinds, held, trust, sd_prior, "delay" in share), progress)
-            validation = _fitted_and_validated(pipeline, config, until, validate)
+            again = plans(start, kinds, held, trust, sd_prior, "delay" in share)
+            pipeline = Pipeline(runs, start, again, progress, pipeline.arms_but(refuted))
+            pipeline.fit()
+        if validate is not None:
+            validation = check(validate, config, pipeline.result())
+        elif until is not None:
+            progress("validating", pipeline.log_likelihood)
+            validation = check(runs[0], config, pipeline.fitted_until(until), since=until)
         for stage in pipeline.stages:
             progress("computing intervals", stage.best.log_likelihood)
             around |= lag_intervals(stage.likelihood, stage.best, stage.free)
-            intervals |= confidence_intervals(stage.likelihood, stage.best, stage.free, drawn=profiles)
+            some = [one for one in stage.free if one.fit in asked]
+            known |= confidence_intervals(stage.likelihood, stage.best, stage.free, some, drawn=profiles)
     except KeyboardInterrupt:
         interrupted = True
         pipeline.keep_the_better()
@@ -167,15 +179,15 @@ def tune(
     result, arms = pipeline.result(), {axis: one for stage in stages for axis, one in stage.arms.items()}
     lost = [axis for axis, one in arms.items() if one.plain is None or result.arm.lag_of(axis) > LONGEST]
     lags = with_doubts(fitted_lags(free, config, result, around, lost), found, config, result)
-    tuned = _with_provenance(result, free, intervals, {} if interrupted else lags, names)
+    tuned = _with_provenance(result, free, known, {} if interrupted else lags, names)
     doubted += [f"{axis}: {one.plain.step}" for axis, one in arms.items() if one.plain and one.plain.step]
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
-    known = validate is not None and any(_same(validate, run) for run in runs)
+    seen = validate is not None and any(_same(validate, run) for run in runs)
     notes += _seen_before(config, runs[0] if validate is None else validate, validation)
     notes += latency_questions(tuned, pipeline.whole.share_after_end)
-    notes += _validation_notes(validation, known, interrupted)
+    notes += _validation_notes(validation, seen, interrupted)
     summary = TuningSummary(
         pumafuse=version("pumafuse"),
         runs=names,
@@ -189,7 +201,7 @@ def tune(
         interrupted=interrupted,
         likelihood=_likelihoods(pipeline.whole, config, tuned),
         lags=lags,
-        parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
+        parameters=[fitted(one, config, tuned, known.get(one.key)) for one in free],
         biases=[one for run in runs for one in found_biases(run, tuned)],
         correlations=[one for stage in stages for one in correlations(stage.likelihood, stage.best, stage.free)],
         not_identifiable=[str(one) for stage in stages for one in stage.not_identifiable],
@@ -200,20 +212,7 @@ def tune(
     )
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
-    return Tuning(tuned, config, summary, [one.profile for one in intervals.values()] if profiles else [])
-
-
-def _fitted_and_validated(
-    pipeline: Pipeline, before: FusionConfig, until: float | None, validate: Run | None
-) -> list[Check] | None:
-    """Fit, and compare with the configuration ``before``: on what comes after ``until`` [s], or on another run."""
-    pipeline.fit(until)
-    validation = None
-    if until is not None:
-        validation = check(pipeline.runs[0], before, pipeline.result(), since=until)
-        pipeline.fit(None)
-    pipeline.keep_the_better()
-    return validation if validate is None else check(validate, before, pipeline.result())
+    return Tuning(tuned, config, summary, [one.profile for one in known.values()] if profiles else [])
 
 
 def _check(
@@ -275,37 +274,59 @@ class Pipeline:
         notes: What was noticed, a sentence each.
     """
 
-    def __init__(self, runs: Sequence[Run], config: FusionConfig, plans: Sequence[Plan], progress: Progress) -> None:
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        config: FusionConfig,
+        plans: Sequence[Plan],
+        progress: Progress,
+        known: Sequence[Mapping[str, ArmSearch]] = (),
+    ) -> None:
+        """``known``: of each stage, the arms of axes that were searched for already."""
         self.runs, self.config, self.plans, self.progress = runs, config, plans, progress
+        self._known = known or [{} for _ in plans]
         self.whole = likelihood_of(runs, config, plans[-1])
         self.best = config
         self.stages: list[Stage] = []
         self.notes: list[str] = []
 
-    def fit(self, until: float | None) -> None:
-        """Run every stage on the measurements until then [s after the first command].
-
-        A second fit begins where the first one ended, and counts when it is complete.
+    def fit(self) -> None:
+        """Run every stage; the configuration as given stays where it is more likely.
 
         Raises:
             TuneError: No stage has any free parameter.
         """
-        config, stages, again = self.config, list[Stage](), bool(self.stages)
-        near = self.stages[0] if again else None
+        config, stages = self.config, list[Stage]()
 
         def notify(found: Point) -> None:
-            if not again:
-                self.best, self.stages = found.config, stages
-            self.progress("fitting on the whole run" if again else "searching", found.log_likelihood)
+            self.best, self.stages = found.config, stages
+            self.progress("searching", found.log_likelihood)
 
-        for plan in self.plans:
-            stages.append(run_stage(self.runs, config, plan, until, notify, near))
-            config, near = stages[-1].best.config, None
+        for plan, known in zip(self.plans, self._known, strict=True):
+            stages.append(run_stage(self.runs, config, plan, notify, known))
+            config = stages[-1].best.config
         if not any(stage.free for stage in stages):
             why = [str(one) for stage in stages for one in stage.not_identifiable]
             raise TuneError("; ".join([*why, "everything that could be fitted is fixed: nothing to fit"]))
         self.best, self.stages = config, stages
         self.notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
+        self.keep_the_better()
+
+    def fitted_until(self, until: float) -> FusionConfig:
+        """The result with its numbers fitted anew to the measurements until then [s after the first command]."""
+        config = self.best
+        for plan, stage in zip(self.plans, self.stages, strict=False):  # none where the configuration as given is kept
+            config = refitted(stage, self.runs, config, plan, until)
+        return self._written(config, rounded)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the best configuration."""
+        return _evaluated(self.whole, self.best).total
+
+    def arms_but(self, axes: Collection[str]) -> list[dict[str, ArmSearch]]:
+        """The arms that each stage searched for, but for those of some axes."""
+        return [{axis: one for axis, one in stage.arms.items() if axis not in axes} for stage in self.stages]
 
     def doubts(self) -> dict[str, Doubt]:
         """Of the arms that were fitted: see :func:`.plain.doubts`."""
@@ -331,15 +352,15 @@ class Pipeline:
 
         A maximum may lie where a gate just takes a row: numbers that leave it by being rounded keep their digits.
         """
-        found, exact = self._written(rounded), self._written(float)
+        found, exact = self._written(self.best, rounded), self._written(self.best, float)
         lost = (
             _evaluated(one.likelihood, exact).total - _evaluated(one.likelihood, found).total for one in self.stages
         )
         return exact if any(one > _NOTHING for one in lost) else found
 
-    def _written(self, number: Callable[[float], float]) -> FusionConfig:
-        """The best configuration with the numbers as they are to be written."""
-        best = with_gates(self.best, self.config)
+    def _written(self, config: FusionConfig, number: Callable[[float], float]) -> FusionConfig:
+        """A configuration with the numbers as they are to be written."""
+        best = with_gates(config, self.config)
         for one in (one for stage in self.stages for one in stage.free if one.given(best) is not None):
             none = one.vanishes and one.at_bound(best) == "lower"
             best = one.put(best, 0.0 if none else one.clipped(number(one.get(best))))
