@@ -72,11 +72,12 @@ class Plant {
         else *this = {axis.natural_frequency, axis.damping, decay};
     }
 
-    // A plant of first order has a rate, too, that is always 0: the algebra is the same for both orders. The last
-    // interval is remembered: response and residual share it, and commands come at one interval.
+    // A plant of first order has a rate, too, that is always 0: the algebra is the same for both orders. Some intervals
+    // are remembered: response and residual share them, and what comes regularly has few.
     const Transition<Real>& over(Real t) const {
-        if (!is_zero(t - last)) last = t, remembered = computed(t);
-        return remembered;
+        auto& [last, found] = remembered[std::bit_cast<std::uint64_t>(value_of(t)) * 0x9E3779B97F4A7C15u >> 61];
+        if (!is_zero(t - last)) last = t, found = computed(t);
+        return found;
     }
 
     // Of an interval that will not come again.
@@ -115,8 +116,8 @@ class Plant {
     Real share = 0.0;                  // what a decay that is not close to the poles has of their response
     double fastest = 0.0;              // rad/s
     Real s = 0.0, w = 0.0, b = 0.0;    // sigma, omega^2 and decay in the time u = fastest t
-    mutable Real last = -1.0;          // s
-    mutable Transition<Real> remembered{};
+    struct Remembered { Real interval = -1.0; Transition<Real> transition{}; };
+    mutable std::array<Remembered, 8> remembered{};  // by a hash
     std::array<Free, TERMS> series{};  // coefficients of g / u, g', ∫ g^2 / u^3 and h / u^2
 
     Free free(Real t) const {
