@@ -71,6 +71,24 @@ def test_values_come_in_steps_or_do_not() -> None:
     assert resolution(np.repeat([0.0, 0.1, 0.2], 100)) == 0.0
 
 
+@pytest.mark.parametrize(("count", "digits", "step"), [(0.044, 2, 0.044), (360 / 4096, 3, 360 / 4096), (0.37, 1, 0.37)])
+def test_counts_that_were_rounded_for_a_log_have_the_resolution_of_a_count(
+    count: float, digits: int, step: float
+) -> None:
+    """Steps of 0.04 and 0.05 are of 0.044, in radians too, not none, nor 0.01."""
+    motion = 30.0 * np.sin(0.01 * np.arange(6000)) + 5.0 * np.sin(0.023 * np.arange(6000))
+    logged = np.round(count * np.rint(motion / count), digits)
+    for unit in (1.0, np.pi / 180.0):
+        assert resolution(unit * logged) == pytest.approx(unit * step / np.sqrt(12.0), rel=0.01)
+
+
+def test_what_was_rounded_to_a_digit_has_that_resolution_though_few_values_are_neighbours() -> None:
+    """Where an axis jumps, its smallest step may be of several digits."""
+    logged = np.round(30.0 * np.sin(7.0 * np.arange(40)), 1)
+    steps = np.diff(np.unique(logged))
+    assert resolution(logged) == pytest.approx(0.1 / np.sqrt(12.0), rel=1e-6) and np.median(steps) > 0.5
+
+
 def test_of_a_periodic_motion_the_shortest_lag_counts() -> None:
     """A sine fits at every period, and upside down at every half of one."""
     t = np.arange(0.0, 30.0, 0.01)

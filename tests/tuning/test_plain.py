@@ -186,7 +186,7 @@ def test_an_arm_by_which_a_filter_predicts_better_is_to_take_the_place_of_the_li
     arm = pf.ArmModel(name="servo", update_period=0.1, delay=0.18, axes={"j": axis})
     config = pf.FusionConfig(arm=arm, sensors={"encoder": pf.Sensor(sd=2e-4)})
     pipeline = Pipeline([run], config, plans(config, ["noise", "delay", "plant"], [], None), lambda _, __: None)
-    quietly(lambda: pipeline.fit())
+    quietly(pipeline.fit)
     assert not any(one.refutes or one.sentence(pipeline.result(), "j") for one in pipeline.doubts().values())
     early = replaced(arm, delay=0.05, axes={"j": replaced(axis, plant=pf.FirstOrder(time_constant=0.1))})
     pipeline.best = replaced(config, arm=early, process={"j": pf.Process(maneuver_noise=0.1, maneuver_drift=0.01)})

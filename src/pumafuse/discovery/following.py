@@ -18,6 +18,8 @@ _SPANS = (0.1, 0.5, 2.0, math.inf)
 _MOST, _FEW = 3000, 500  # changes, and for a first look
 _FEWEST = 20
 _WHOLE = 0.01  # from a whole number, of steps
+_ALIKE = 1e-6  # of the smallest step, by which sizes of steps differ at least
+_MANY, _COARSER = 0.25, 0.5  # of all steps, those that are of one count; of a count, the coarsest digit it is seen by
 _OUTLYING = 8.0  # sds
 _APART = 5.0  # times as far off as its neighbours are: at the start or the turn of a motion it is three times
 _ROUNDING = 1e-12  # of a value
@@ -149,12 +151,22 @@ def _resolution(value: FloatArray) -> float:
 
 
 def resolution(value: FloatArray) -> float:
-    """Noise of the steps in which values come, if they do: all are whole multiples of the smallest; else 0."""
+    """Noise of the steps in which values come, if they do: all are whole multiples of one digit; else 0.
+
+    Counts of an encoder that were rounded for a log come in steps of two sizes, a digit apart: many of the smallest are
+    of one count.
+    """
     steps = np.diff(np.unique(value))
+    steps = steps[steps > _ROUNDING * np.abs(value).max(initial=0.0)]
     if len(steps) < _FEWEST:
         return 0.0
-    multiples = steps / steps.min()
-    return _resolution(value) if (np.abs(multiples - np.rint(multiples)) < _WHOLE).all() else 0.0
+    smallest, apart = float(steps.min()), np.diff(np.unique(np.append(steps, 0.0)))
+    digit = float(apart[apart > _ALIKE * smallest].min())
+    multiples = steps / digit
+    if (np.abs(multiples - np.rint(multiples)) > _WHOLE).any():
+        return 0.0
+    counts = steps[steps < smallest + min((1.0 + _WHOLE) * digit, _COARSER * smallest)]
+    return (float(counts.mean()) if len(counts) > _MANY * len(steps) else digit) / math.sqrt(12.0)
 
 
 def isolated(value: FloatArray) -> BoolArray:
