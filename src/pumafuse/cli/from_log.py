@@ -8,11 +8,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import typer
 
 from ..discovery.drafts import drafts
 from ..discovery.guesses import guess
-from ..discovery.survey import early, survey, too_early
+from ..discovery.survey import FOLLOWS, Survey, early, survey, too_early
 from ..errors import RunError
 from ..fusion import results
 from ..fusion.config import FusionConfig
@@ -23,11 +24,15 @@ from ..logs.run import described
 from ..model.arm import ArmModel
 from ..tuning.parameters import Fit
 from ..tuning.tune import tune
+from ..units import MS, SCREEN
 from . import init
 from .fuse import draw, show
 from .register import taken
-from .tune import end, fitting, show_lags
+from .tune import WORSE, end, fitting, show_lags
 
+_SD = 1.4826  # of normal errors, over the median of their sizes
+_STRAYS_FAR = 2.0  # times as far off as the path through the commands: no arm was found
+_NOTHING = 1e-3  # of the range that is measured, by which it is off at least
 _STRAYS = 1.5  # times its sd, by which a sensor errs from what is predicted where the arm strays, too
 _BAGS = (".mcap", ".db3")  # which ROS 2 records
 _FITTED_ARM: Sequence[Fit] = ("delay", "plant", "gain")  # whose intervals the error bars count
@@ -76,7 +81,8 @@ def run(
     summary = results.write(est, output, force, extras, texts["run.toml"])
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
-    for line in _told_by_one(summary, est.config):
+    strays = _off_the_path(found, summary)
+    for line in [*strays, *_told_by_one(summary, est.config)]:
         typer.echo(line)
     for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
         typer.echo(taken(name, 0.0))
@@ -85,6 +91,30 @@ def run(
     if any(one.suffix in _BAGS for one in (log.iterdir() if log.is_dir() else [log])):
         typer.echo(f"or as a node of ROS 2: pumafuse live ros2:{folder}/run.toml -c {folder}/fusion.toml")
     end(fitted.details)
+    if strays:
+        raise typer.Exit(WORSE)
+
+
+def _off_the_path(found: Survey, summary: Summary) -> list[str]:
+    """A sentence on each sensor that the filter predicts much worse than the path through the commands, some time ago.
+
+    The path needs no arm, but it knows the next command: what moves as that is given was commanded earlier.
+    """
+    lines = list[str]()
+    for (name, axis), one in found.relations.items():
+        measured = summary.axes[axis].sensors.get(name)
+        if abs(one.correlation) < FOLLOWS or measured is None or measured.skill is None:
+            continue
+        screen, off = SCREEN[summary.axes[axis].kind], _SD * measured.skill.filter.median
+        least = _NOTHING * float(np.ptp(found.run.sensors[name].values[axis]))
+        if off > max(_STRAYS_FAR * one.misfit, least):
+            lines.append(
+                f"{axis}: {name} is {one.misfit * screen.scale:.3g} {screen.unit} off the path through the commands"
+                f" {one.lag * MS:.0f} ms before, and the filter predicts it to {off * screen.scale:.3g}: no arm was"
+                f" found by which {axis} follows. Were its commands given earlier than they are stamped (shift_s in"
+                " run.toml)?"
+            )
+    return lines
 
 
 def _told_by_one(summary: Summary, config: FusionConfig) -> list[str]:

@@ -28,7 +28,7 @@ PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", ARM_FILE, ROBOT_FILE})
 _HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
 _PAIRS = 3  # of correlated parameters that are shown
-_WORSE, _INTERRUPTED = 3, 130
+WORSE, _INTERRUPTED = 3, 130
 
 
 def run(
@@ -97,7 +97,7 @@ def end(summary: TuningSummary) -> None:
     if summary.interrupted:
         raise typer.Exit(_INTERRUPTED)
     if summary.worse:
-        raise typer.Exit(_WORSE)
+        raise typer.Exit(WORSE)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from ..logs.columns import leaf
 from ..logs.frames import CARTESIAN
 from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
+from ..logs.tables import FIRST
 from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
 from .contents import RANGES, Part, Signal, no_commands, without_clock
@@ -29,6 +30,7 @@ from .orientations import Attitude, in_order
 from .own_frames import speeds_follow
 
 _SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
+_NAMELESS = FIRST.split()[:1]  # of the words that a column is called that has no name
 _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
@@ -514,7 +516,7 @@ def _is_namesake(command: Stream, stream: Stream) -> bool:
 
     shared = stream.axes.keys() & command.axes.keys()
     names_of = [(called(stream.axes[axis]), called(command.axes[axis])) for axis in shared]
-    return bool(names_of) and all(one == other for one, other in names_of)
+    return bool(names_of) and all(one == other and one[:1] != _NAMELESS for one, other in names_of)
 
 
 def _copies(command: Stream, stream: Stream) -> bool:

@@ -40,7 +40,7 @@ def _between(matrix: FloatArray, score: FloatArray, lowest: FloatArray, highest:
     (Hintermüller, Ito & Kunisch, "The primal-dual active set strategy as a semismooth Newton method", SIAM Journal on
     Optimization 13, 2002).
     """
-    delta = np.linalg.solve(matrix, score)
+    delta = np.asarray(np.linalg.solve(matrix, score), dtype=np.float64)
     if ((lowest <= delta) & (delta <= highest)).all():
         return delta
     at_low = at_high = np.zeros(len(score), dtype=np.bool_)
