@@ -193,13 +193,14 @@ class Doubt(NamedTuple):
         """What to know of it, under the configuration that is doubted; empty where that is little."""
         screen, (low, high) = config.arm.screen_of(axis), self.lag_ci95
         then = "The arm is that of least squares instead" if self.refutes else "The interval of its lag covers both"
-        if self.is_worse and (self.refutes or self.off > _NOTHING * self.plain.measured.range):
+        matters = self.off > _NOTHING * self.plain.measured.range
+        if self.is_worse and matters:
             what = (
                 "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
                 f" {self.lag * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
                 f" commands {self.plain.delayed * MS:.0f} ms later are {self.plain.delayed_off * screen.scale:.3g}"
             )
-        elif self.is_beaten or max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total:
+        elif (self.is_beaten and matters) or max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total:
             what = (
                 f"the likelihood says a lag of {self.lag * MS:.4g} ms, least squares, which have no model of noise,"
                 f" {self.plain.arm.total * MS:.4g} ({low * MS:.4g} to {high * MS:.4g})"

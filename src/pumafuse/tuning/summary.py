@@ -181,8 +181,7 @@ def with_doubts(
         low, high = (end * MS for end in doubt.lag_ci95)
         if (one := found.get(axis)) is None:
             lag = after.arm.lag_of(axis) * MS
-            both = min(low, lag), max(high, lag)
-            found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag, lag_ms_ci95=both)
+            found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag, lag_ms_ci95=(low, high))
         else:
             below, above = one.lag_ms_ci95
             ends = None if below is None else min(below, low), None if above is None else max(above, high)
