@@ -814,6 +814,21 @@ def test_torques_and_attitudes_that_move_alike_are_no_sensors(tmp_path: Path) ->
     assert {why for part in found.parts for why in part.left_out.values()} == {"of a quaternion"}
 
 
+def test_columns_without_names_are_called_as_nothing(tmp_path: Path) -> None:
+    """The second column of torques is not that of the commands, nor is a clock in a file of its own a joint."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    torques = np.column_stack([0.05 * z[:, 0], -np.roll(z[:, 1], -40), np.cos(s), np.sin(3.0 * s)])
+    u, z = u + 0.3 * t[:, None], z + 0.3 * s[:, None]  # which a clock is alike
+    for name, time, columns in (("JQ_com", t, u), ("JQ_state", s, z), ("JT", s, torques)):
+        np.savetxt(log / f"{name}.txt", np.column_stack([time, columns]), "%.6f")
+    np.savetxt(log / "ticks.txt", np.column_stack([s, 3.0 + 0.5 * s]), "%.6f")
+    found = survey(log)
+    assert found.roles is not None and [one.name for one in found.roles.sensors] == ["JQ_state"]
+    assert not any("ticks" in one for one in asked(found))
+
+
 @pytest.mark.parametrize("nested", [[["hip", "Knee", "lArmYaw"]], {"axes": {"hip": 0, "Knee": 1, "lArmYaw": 2}}])
 def test_names_of_lerobot_are_found_where_converters_write_them(nested: Any, tmp_path: Path) -> None:
     """A list in a list, or a table of places; in radians, as they are joints."""

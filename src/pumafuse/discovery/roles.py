@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from msgspec import structs
 
-from ..arrays import NO_STAMP
+from ..arrays import NO_STAMP, FloatArray
 from ..errors import RunError, printable
 from ..logs.axes import FARTHEST_TURN
 from ..logs.columns import leaf
@@ -32,6 +32,7 @@ from .own_frames import speeds_follow
 _SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
 _NAMELESS = FIRST.split()[:1]  # of the words that a column is called that has no name
 _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
+_EVEN, _MOSTLY = 0.05, 0.9  # of a step, by which those of a clock differ, as it has digits; of the steps
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
 _NEAR = -0.5, 1.5  # s, from and to which lag a sensor is on the commands' clock
@@ -488,6 +489,8 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     the commands are without a word of these, ``q`` beside ``q_cmd``, an axis is enough: joints may rest. In a frame of
     its own its speed does.
     """
+    if all(_ticks(value) for value in stream.source.values.values()):
+        return "", "it rises evenly, as a clock does"
     found = _relations(command, stream)
     alike = [one for one in found if one.correlation >= _SAME]
     behind = [one for one in alike if -_AT_ONCE < one.lag < LATEST]
@@ -506,6 +509,13 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
         return "", f"it does not follow the commands: it moves {when} them"
     few = f"it follows the commands on {len(behind)} of {len(found)} axes"
     return "", few if len(behind) <= fewest else f"{few}, but by {min(gains):.3g} to {max(gains):.3g} times as far"
+
+
+def _ticks(value: FloatArray) -> bool:
+    """Whether numbers rise in each row, and mostly by the same: no sensor of a position does."""
+    steps = np.diff(value)
+    even = np.abs(steps / np.median(steps) - 1.0) < _EVEN if len(steps) and steps.min() > 0.0 else np.zeros(1)
+    return bool(even.mean() > _MOSTLY)
 
 
 def _is_namesake(command: Stream, stream: Stream) -> bool:
