@@ -819,8 +819,8 @@ def test_columns_without_names_are_called_as_nothing(tmp_path: Path) -> None:
     t, u, s, z = recorded()
     log = tmp_path / "log"
     log.mkdir()
-    torques = np.column_stack([0.05 * z[:, 0], -np.roll(z[:, 1], -40), np.cos(s), np.sin(3.0 * s)])
     u, z = u + 0.3 * t[:, None], z + 0.3 * s[:, None]  # which a clock is alike
+    torques = np.column_stack([0.05 * z[:, 0], -np.roll(z[:, 1], -40), np.cos(s), np.sin(3.0 * s)])
     for name, time, columns in (("JQ_com", t, u), ("JQ_state", s, z), ("JT", s, torques)):
         np.savetxt(log / f"{name}.txt", np.column_stack([time, columns]), "%.6f")
     np.savetxt(log / "ticks.txt", np.column_stack([s, 3.0 + 0.5 * s]), "%.6f")
