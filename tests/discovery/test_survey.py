@@ -814,6 +814,22 @@ def test_torques_and_attitudes_that_move_alike_are_no_sensors(tmp_path: Path) ->
     assert {why for part in found.parts for why in part.left_out.values()} == {"of a quaternion"}
 
 
+def test_columns_without_names_are_told_apart_by_which_follows_which(tmp_path: Path) -> None:
+    """As far and later: commands, what measures them in another order, and what is none of these, in one table."""
+    t, u, z = recorded_at_once()
+    torque = 40.0 * np.gradient(z[:, 0])
+    columns = [t, z[:, 1], u[:, 0], torque, u[:, 1], z[:, 2], u[:, 2], z[:, 0]]
+    np.savetxt(tmp_path / "log.txt", np.column_stack(columns), "%.6f")
+    found = survey(tmp_path / "log.txt")
+    assert found.roles is not None
+    told, (seen,) = found.roles.command, found.roles.sensors
+    pairs = {told.axes[axis][0].column: seen.axes[axis][0].column for axis in told.axes}
+    assert pairs == {"column 3": "column 8", "column 5": "column 2", "column 7": "column 6"}
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, u, 1.5 * z]), "%.6f")
+    with pytest.raises(RunError, match="which numbers are the commands"):
+        survey(tmp_path / "log.txt")
+
+
 def test_columns_without_names_are_called_as_nothing(tmp_path: Path) -> None:
     """The second column of torques is not that of the commands, nor is a clock in a file of its own a joint."""
     t, u, s, z = recorded()

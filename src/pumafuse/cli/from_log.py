@@ -64,7 +64,8 @@ def run(
     found = survey(log)
     for name in found.run.sensors:
         if by := early(found, name):
-            raise RunError(f"{log}: {too_early(name, max(by.values()))}; `pumafuse init {log}` writes one")
+            advice = f"; `pumafuse init {log}` writes one" if found.roles else ""
+            raise RunError(f"{log}: {too_early(name, max(by.values()))}{advice}")
     found = replace(found, run=found.run.between(*part))  # so that latencies are those of the part
     arm, begins = guess(found)
     texts, here = drafts(found, arm, begins, output), Path()

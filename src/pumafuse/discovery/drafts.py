@@ -120,7 +120,7 @@ def _column(one: Signal) -> Any:
 
 def _rebased(found: Survey, folder: Path) -> str:
     """The log's own ``run.toml`` for another folder."""
-    tree: Any = deepcopy(dict(found.manifest or {}))
+    tree: Any = {"name": found.name} | deepcopy(dict(found.manifest or {}))
     beside = found.log if found.log.is_dir() else found.log.parent
     for table in (tree["command"], tree.get("reference"), *tree.get("sensors", {}).values()):
         if table is not None:

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, permutations
 from typing import TypeAlias
 
 import numpy as np
@@ -30,6 +30,7 @@ from .orientations import Attitude, in_order
 from .own_frames import speeds_follow
 
 _SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
+_ALIKE, _LEVEL = 0.98, 0.1  # correlation of columns of one axis, and share of their range by which their ends differ
 _NAMELESS = FIRST.split()[:1]  # of the words that a column is called that has no name
 _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _EVEN, _MOSTLY = 0.05, 0.9  # of a step, by which those of a clock differ, as it has digits; of the steps
@@ -412,7 +413,35 @@ def _apart(stream: Stream) -> list[Stream]:
             every = sorted(set[tuple[str, ...]]().union(*shared.values()))
             ways.append([of(word, every), *(of(other, rests) for other, rests in shared.items())])
     best = max(ways, key=lambda way: _followers(way[0], way), default=[stream])
-    return best if len(best) > 1 and _followers(best[0], best)[0] else [stream]
+    return best if len(best) > 1 and _followers(best[0], best)[0] else _led(stream)
+
+
+def _led(stream: Stream) -> list[Stream]:
+    """A stream of columns without names, taken apart where some follow others: as far, at the same level, and later."""
+    source, columns = stream.source, list(stream.axes)
+    if len(columns) > _MOST_APART or not all(names.words(one)[:1] == _NAMELESS for one in columns):
+        return [stream]
+    leads = dict[str, dict[str, float]]()  # of those that follow it, how late they do
+    ends = {one: np.quantile(value, (0.0, 0.5, 1.0)) for one, value in source.values.items()}
+    for one, other in permutations(columns, 2):
+        if np.abs(ends[one] - ends[other]).max() > _LEVEL * np.ptp(ends[other]):
+            continue
+        found = following((source.stamp, source.values[one]), (source.stamp, source.values[other]))
+        if found is not None and found.correlation > _ALIKE and found.lag > _AT_ONCE:
+            leads.setdefault(one, {})[other] = found.lag
+    followers = {other for mine in leads.values() for other in mine}
+    pairs = dict[str, str]()
+    for one in (one for one in leads if one not in followers):
+        free = {other: lag for other, lag in leads[one].items() if other not in pairs.values()}
+        if free:
+            pairs[one] = min(free, key=free.__getitem__)
+    if not pairs:
+        return [stream]
+    rest = {axis: some for axis, some in stream.axes.items() if axis not in {*pairs, *pairs.values()}}
+    told, seen = {one: stream.axes[one] for one in pairs}, {one: stream.axes[other] for one, other in pairs.items()}
+    command = Stream("commanded", "command", "others follow it as far, later", stream.part, told)
+    others = {"measured": seen, "others": rest}
+    return [command, *(Stream(name, None, "", stream.part, axes) for name, axes in others.items() if axes)]
 
 
 def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream: Stream) -> bool:
