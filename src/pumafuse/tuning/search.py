@@ -39,6 +39,7 @@ _STEP = 0.010  # s, between latencies that are tried: their maxima are as wide
 _WELL_KNOWN = 1.0 / 8.0  # of a logarithm: without it some ½ · 8² would be lost in log-likelihood
 _NARROWER, _WIDER = 0.6, 3.0  # times the gates
 _NARROWEST = 3.0  # gate: below it rejecting good measurements pays
+_SLOW = 2.0  # s, of a slow disturbance
 _QUIET = 0.03  # share of what the rest is, that other noise begins with
 _KINDS = {"matern": "smooth (Matérn)", "ou": "rough (Ornstein-Uhlenbeck)"}  # of disturbances
 _WALKING = ("input_noise", "drift", "maneuver_noise", "maneuver_drift")  # noise without a disturbance
@@ -89,6 +90,9 @@ def search(
         if found:  # an arm that is likeliest under one noise is near that under another
             start = _with_arm_of(start, found[0].config, free)
         found.append(_maximum(likelihood, start, free, notify))
+    best = _likeliest(likelihood, found, free)
+    if (slow := _slowly_disturbed(best, arms, free)) != best:
+        found.append(_maximum(likelihood, slow, free, notify))
     best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
     best = _without_needless(likelihood, best, free, notify)
     best = _under_gates(likelihood, best, config, free, notify)
@@ -206,6 +210,15 @@ def _noise_models(
     return [_with_quiet(one, arms, free) for one in distinct]
 
 
+def _slowly_disturbed(config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf) -> FusionConfig:
+    """The configuration with a slow, smooth disturbance where it has none, which from quick ones is not found."""
+    model = config
+    for axis, one in arms.items():
+        if config.process[axis].disturbance_sd == 0.0:
+            model = with_disturbance(model, axis, one.spread, _SLOW)
+    return _with_free_noise(config, model, free, arms)
+
+
 def _with_free_noise(config: FusionConfig, model: FusionConfig, free: FreeOf, axes: Iterable[str]) -> FusionConfig:
     """The configuration with the noises of a model that are free."""
     disturbed = config
@@ -298,8 +311,10 @@ def _under_gates(
     return found
 
 
-def _likeliest(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf, reasons: Reasons) -> FusionConfig:
-    """The model of noise that is best for each axis after the penalty for its numbers."""
+def _likeliest(
+    likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf, reasons: Reasons | None = None
+) -> FusionConfig:
+    """The model of noise that is best for each axis after the penalty for its numbers; ``reasons`` get why."""
     scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
     for number, axis in enumerate(likelihood.axes):
         for peak, score in zip(peaks, scores, strict=True):
@@ -309,7 +324,7 @@ def _likeliest(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf, rea
             elif process.disturbance_kind == "matern":
                 score[number] -= SMOOTHER
         kinds = [_kind(peak.config, axis) for peak in peaks]
-        if len(set(kinds)) > 1 and axis in likelihood.sensors:
+        if reasons is not None and len(set(kinds)) > 1 and axis in likelihood.sensors:
             mine = dict[str, float]()
             for kind, score in zip(kinds, scores, strict=True):
                 mine[kind] = max(float(score[number]), mine.get(kind, -np.inf))
