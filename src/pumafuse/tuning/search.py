@@ -90,9 +90,7 @@ def search(
         if found:  # an arm that is likeliest under one noise is near that under another
             start = _with_arm_of(start, found[0].config, free)
         found.append(_maximum(likelihood, start, free, notify))
-    best = _likeliest(likelihood, found, free)
-    if (slow := _slowly_disturbed(best, arms, free)) != best:
-        found.append(_maximum(likelihood, slow, free, notify))
+    found += _slowly_disturbed(likelihood, _likeliest(likelihood, found, free), arms, free, notify)
     best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
     best = _without_needless(likelihood, best, free, notify)
     best = _under_gates(likelihood, best, config, free, notify)
@@ -210,13 +208,22 @@ def _noise_models(
     return [_with_quiet(one, arms, free) for one in distinct]
 
 
-def _slowly_disturbed(config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf) -> FusionConfig:
-    """The configuration with a slow, smooth disturbance where it has none, which from quick ones is not found."""
-    model = config
-    for axis, one in arms.items():
-        if config.process[axis].disturbance_sd == 0.0:
-            model = with_disturbance(model, axis, one.spread, _SLOW)
-    return _with_free_noise(config, model, free, arms)
+def _slowly_disturbed(
+    likelihood: Likelihood, config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf, notify: Notify
+) -> list[Point]:
+    """The maximum with a slow, smooth disturbance of axes that have none, which from quick ones is not found."""
+    model, calm = config, [axis for axis in arms if config.process[axis].disturbance_sd == 0.0]
+    for axis in calm:
+        model = with_disturbance(model, axis, arms[axis].spread, _SLOW)
+    model = _with_free_noise(config, model, free, arms)
+    if model == config:
+        return []
+
+    def theirs(at: FusionConfig) -> list[Parameter]:
+        return [one for one in free(at) if one.axis in calm]
+
+    there = _maximum(likelihood, model, theirs, notify).config
+    return [point(likelihood, there, [one for one in free(there) if one.axis is not None])]
 
 
 def _with_free_noise(config: FusionConfig, model: FusionConfig, free: FreeOf, axes: Iterable[str]) -> FusionConfig:
