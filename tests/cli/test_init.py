@@ -161,6 +161,34 @@ def test_one_command_says_that_the_fit_is_worse_as_tune_does(tmp_path: Path, mon
     assert {"run.toml", "summary.json"} < names(tmp_path)
 
 
+def test_one_command_says_where_no_arm_was_found(tmp_path: Path) -> None:
+    """An encoder that is at each command in the same row; with commands that are gone on from, as is advised, it is."""
+    rng, time = np.random.default_rng(1), 0.1 * np.arange(600)
+    command = np.sin(0.2 * time) + rng.normal(0.0, 0.055, 600)
+    table = np.column_stack([time, command, command + rng.normal(0.0, 0.02, 600)])
+    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t_s,told_rad,seen_rad", comments="")
+    described = """
+        [command]
+        file = "../log.csv"
+        time = "t_s"
+        j = "told_rad"
+        {}
+        [sensors.encoder]
+        file = "../log.csv"
+        time = "t_s"
+        j = "seen_rad"
+    """
+    log, out = tmp_path / "log", tmp_path / "fused"
+    log.mkdir()
+    (log / "run.toml").write_text(described.format(""))
+    done = pumafuse("fuse", log, "-o", out, code=3)
+    assert "no arm was found by which j follows" in done.stdout
+    assert {"run.toml", "summary.json"} < names(out)
+    (log / "run.toml").write_text(described.format("interpolation_ms = 10"))
+    done = pumafuse("fuse", log, "-o", out, "--force")
+    assert "no arm was found" not in done.stdout
+
+
 def smoothed(z: np.ndarray, s: np.ndarray) -> np.ndarray:
     """By a low-pass of 50 ms."""
     found = z.copy()

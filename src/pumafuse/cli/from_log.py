@@ -103,17 +103,18 @@ def _off_the_path(found: Survey, summary: Summary) -> list[str]:
     """
     lines = list[str]()
     for (name, axis), one in found.relations.items():
-        measured = summary.axes[axis].sensors.get(name)
-        if abs(one.correlation) < FOLLOWS or measured is None or measured.skill is None:
+        part = summary.axes.get(axis)  # a sensor in a frame of its own, or one not asked for, has none
+        skill = part.sensors[name].skill if part is not None and name in part.sensors else None
+        if part is None or skill is None or abs(one.correlation) < FOLLOWS:
             continue
-        screen, off = SCREEN[summary.axes[axis].kind], _SD * measured.skill.filter.median
+        screen, off = SCREEN[part.kind], _SD * skill.filter.median
         least = _NOTHING * float(np.ptp(found.run.sensors[name].values[axis]))
         if off > max(_STRAYS_FAR * one.misfit, least):
             lines.append(
                 f"{axis}: {name} is {one.misfit * screen.scale:.3g} {screen.unit} off the path through the commands"
                 f" {one.lag * MS:.0f} ms before, and the filter predicts it to {off * screen.scale:.3g}: no arm was"
-                f" found by which {axis} follows. Were its commands given earlier than they are stamped (shift_s in"
-                " run.toml)?"
+                f" found by which {axis} follows. Does its controller go on between commands (interpolation_ms in"
+                " run.toml), or were these given earlier than they are stamped (shift_s)?"
             )
     return lines
 
