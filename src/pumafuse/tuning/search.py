@@ -90,7 +90,10 @@ def search(
         if found:  # an arm that is likeliest under one noise is near that under another
             start = _with_arm_of(start, found[0].config, free)
         found.append(_maximum(likelihood, start, free, notify))
-    found += _slowly_disturbed(likelihood, _likeliest(likelihood, found, free), arms, free, notify)
+    likeliest = _likeliest(likelihood, found, free)
+    slow = _slowly_disturbed(likelihood, likeliest, arms, free, notify)
+    if _likeliest(likelihood, [*found, *slow], free) != likeliest:
+        found += slow
     best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
     best = _without_needless(likelihood, best, free, notify)
     best = _under_gates(likelihood, best, config, free, notify)
