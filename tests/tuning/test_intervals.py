@@ -62,14 +62,15 @@ def test_a_profile_that_falls_and_rises_again_has_two_maxima() -> None:
 def test_a_profile_is_followed_from_the_inside() -> None:
     """A recorded axis whose likelihood has another maximum far off, as high along all of its disturbance's sd.
 
-    Next to the best one it falls by less than 1.5 to the 1.3-fold; from the other one the interval ended at once.
+    Next to the best one it falls by 1.92 at the 1.3-fold, which is found to 3 % of the root; from the other one the
+    interval ended at once.
     """
     run = pf.Run.read(TRUNK / "0g").between(None, 60.0)
     config = pf.FusionConfig.load(TRUNK / "fusion.toml")
     fixed = ["camera", *(axis for axis in config.arm.axes if axis != "m2")]
     found = quietly(lambda: pf.tune(run, config, fit=["noise", "delay", "plant"], fix=fixed))
     (one,) = [one for one in found.details.parameters if one.key == "process.m2.disturbance_sd_deg"]
-    assert one.ci95[1] is not None and one.ci95[1] > 1.3 * one.value
+    assert one.ci95[1] is not None and one.ci95[1] > 1.25 * one.value
 
 
 # ---- against likelihoods without a filter ---------------------------------------------------------------------------

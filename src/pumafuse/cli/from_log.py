@@ -97,11 +97,11 @@ def run(
 
 
 def _off_the_path(found: Survey, summary: Summary) -> list[str]:
-    """A sentence on each sensor that the filter predicts much worse than the path through the commands, some time ago.
+    """A sentence on each axis of which the filter predicts every sensor much worse than the path through the commands.
 
     The path needs no arm, but it knows the next command: what moves as that is given was commanded earlier.
     """
-    lines = list[str]()
+    lines, follows = dict[str, str](), set[str]()
     for (name, axis), one in found.relations.items():
         part = summary.axes.get(axis)  # a sensor in a frame of its own, or one not asked for, has none
         skill = part.sensors[name].skill if part is not None and name in part.sensors else None
@@ -109,14 +109,15 @@ def _off_the_path(found: Survey, summary: Summary) -> list[str]:
             continue
         screen, off = SCREEN[part.kind], _SD * skill.filter.median
         least = _NOTHING * float(np.ptp(found.run.sensors[name].values[axis]))
-        if off > max(_STRAYS_FAR * one.misfit, least):
-            lines.append(
-                f"{axis}: {name} is {one.misfit * screen.scale:.3g} {screen.unit} off the path through the commands"
-                f" {one.lag * MS:.0f} ms before, and the filter predicts it to {off * screen.scale:.3g}: no arm was"
-                f" found by which {axis} follows. Does its controller go on between commands (interpolation_ms in"
-                " run.toml), or were these given earlier than they are stamped (shift_s)?"
-            )
-    return lines
+        if off < max(_STRAYS_FAR * one.misfit, least):
+            follows.add(axis)
+        lines[axis] = (
+            f"{axis}: {name} is {one.misfit * screen.scale:.3g} {screen.unit} off the path through the commands"
+            f" {one.lag * MS:.0f} ms before, and the filter predicts it to {off * screen.scale:.3g}: no arm was"
+            f" found by which {axis} follows. Does its controller go on between commands (interpolation_ms in"
+            " run.toml), or were these given earlier than they are stamped (shift_s)?"
+        )
+    return [line for axis, line in lines.items() if axis not in follows]
 
 
 def _told_by_one(summary: Summary, config: FusionConfig) -> list[str]:
