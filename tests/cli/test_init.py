@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -182,7 +183,10 @@ def test_one_command_says_where_no_arm_was_found(tmp_path: Path) -> None:
     log.mkdir()
     (log / "run.toml").write_text(described.format(""))
     done = pumafuse("fuse", log, "-o", out, code=3)
-    assert "no arm was found by which j follows" in done.stdout
+    (line,) = [one for one in done.stdout.splitlines() if "no arm was found by which j follows" in one]
+    told = re.search(r"j: encoder is ([\d.]+) deg off the path .* predicts it to ([\d.]+):", line)
+    assert told and float(told[1]) == pytest.approx(np.degrees(0.02), rel=0.1)
+    assert float(told[2]) > 2.0 * float(told[1])
     assert {"run.toml", "summary.json"} < names(out)
     (log / "run.toml").write_text(described.format("interpolation_ms = 10"))
     done = pumafuse("fuse", log, "-o", out, "--force")

@@ -191,9 +191,10 @@ def test_derivatives_are_those_of_the_joint_gaussian(
 
 
 def test_derivatives_are_those_of_innovations_whose_outcomes_stay() -> None:
-    """By the numbers of two axes, where some measurements are rejected and others re-acquire; eight go in one pass.
+    """By the numbers of two axes, where some measurements are rejected and others re-acquire; twelve go in a pass.
 
-    A parameter alone has the same bits as among others, and without any the innovations are the same.
+    A parameter alone, or among as many as fill a shorter pass, has the same bits as among others. Without any the
+    innovations are the same.
     """
     run, config = contradicting()
     segment, outcome = build(run, config), check(run, config).outcome
@@ -214,6 +215,10 @@ def test_derivatives_are_those_of_innovations_whose_outcomes_stay() -> None:
         _, alone_nu, alone_s = linearised(segment, config, outcome, [beside(config, path)])
         np.testing.assert_array_equal(alone_nu[0], by_nu)
         np.testing.assert_array_equal(alone_s[0], by_s)
+    for count in (6, 7, 10, 11):
+        _, some_nu, some_s = linearised(segment, config, outcome, [beside(config, path) for path in paths[:count]])
+        np.testing.assert_array_equal(some_nu, d_nu[:count])
+        np.testing.assert_array_equal(some_s, d_s[:count])
     plain, *none = linearised(segment, config, outcome, [])
     assert [len(one) for one in none] == [0, 0]
     for one in (found, innovations(segment, config, outcome)):

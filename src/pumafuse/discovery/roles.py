@@ -518,7 +518,7 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     the commands are without a word of these, ``q`` beside ``q_cmd``, an axis is enough: joints may rest. In a frame of
     its own its speed does.
     """
-    if all(_ticks(value) for value in stream.source.values.values()):
+    if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
     found = _relations(command, stream)
     alike = [one for one in found if one.correlation >= _SAME]
@@ -540,7 +540,7 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     return "", few if len(behind) <= fewest else f"{few}, but by {min(gains):.3g} to {max(gains):.3g} times as far"
 
 
-def _ticks(value: FloatArray) -> bool:
+def _rises_evenly(value: FloatArray) -> bool:
     """Whether numbers rise in each row, and mostly by the same: no sensor of a position does."""
     steps = np.diff(value)
     even = np.abs(steps / np.median(steps) - 1.0) < _EVEN if len(steps) and steps.min() > 0.0 else np.zeros(1)

@@ -215,12 +215,12 @@ def _slowly_disturbed(
     likelihood: Likelihood, config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf, notify: Notify
 ) -> list[Point]:
     """The maximum with a slow, smooth disturbance of axes that have none, which from quick ones is not found."""
-    model, calm = config, [axis for axis in arms if config.process[axis].disturbance_sd == 0.0]
+    calm = [axis for axis in _may_be_disturbed(config, free, arms) if config.process[axis].disturbance_sd == 0.0]
+    if not calm:
+        return []
+    model = config
     for axis in calm:
         model = with_disturbance(model, axis, arms[axis].spread, _SLOW)
-    model = _with_free_noise(config, model, free, arms)
-    if model == config:
-        return []
 
     def theirs(at: FusionConfig) -> list[Parameter]:
         return [one for one in free(at) if one.axis in calm]
@@ -231,18 +231,21 @@ def _slowly_disturbed(
 
 def _with_free_noise(config: FusionConfig, model: FusionConfig, free: FreeOf, axes: Iterable[str]) -> FusionConfig:
     """The configuration with the noises of a model that are free."""
-    disturbed = config
-    for axis in axes:
-        disturbed = with_disturbance(disturbed, axis, 1.0, 1.0)
-    may_be = {one.axis for one in free(disturbed) if one.path[-1] == "disturbance_sd"}
-    for axis in may_be:
-        new = model.process[str(axis)]
-        config = with_disturbance(config, str(axis), new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
+    for axis in _may_be_disturbed(config, free, axes):
+        new = model.process[axis]
+        config = with_disturbance(config, axis, new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
     for one in free(config):
         if one.fit == "noise" and (one.sensor or one.path[-1] in _WALKING):
             none = one.vanishes and one.at_bound(model) == "lower"
             config = one.put(config, 0.0 if none else one.clipped(one.get(model)))
     return config
+
+
+def _may_be_disturbed(config: FusionConfig, free: FreeOf, axes: Iterable[str]) -> list[str]:
+    """The axes of which a disturbance is free."""
+    for axis in axes:
+        config = with_disturbance(config, axis, 1.0, 1.0)
+    return [str(one.axis) for one in free(config) if one.path[-1] == "disturbance_sd"]
 
 
 def _with_arm_of(config: FusionConfig, other: FusionConfig, free: FreeOf) -> FusionConfig:
