@@ -110,10 +110,11 @@ def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path
     measured = swings(time + early) + np.random.default_rng(4).normal(0.0, 0.02, len(time))
     write(tmp_path / "wrist.csv", {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured})
     line = refused("fuse", tmp_path / "wrist.csv", "-o", tmp_path / "fused")
-    assert "moves before its commands" in line and "shift_s" in line
+    assert "moves before its commands" in line and "shift_s" in line and line.endswith("writes one")
     folder = tmp_path / "folder"
     pumafuse("init", tmp_path / "wrist.csv", "-o", folder)
     assert "no lag can be told" in refused("latency", folder)
+    assert "writes one" not in refused("fuse", folder, "-o", tmp_path / "fused")  # it is there
     head, _, tail = (folder / "run.toml").read_text(encoding="utf-8").partition("[sensors.")
     shift = re.search(r"shift_s = ([\d.]+)", line)
     assert shift is not None

@@ -87,6 +87,14 @@ def test_what_was_rounded_to_a_digit_has_that_resolution_though_few_values_are_n
     logged = np.round(30.0 * np.sin(7.0 * np.arange(40)), 1)
     steps = np.diff(np.unique(logged))
     assert resolution(logged) == pytest.approx(0.1 / np.sqrt(12.0), rel=1e-6) and np.median(steps) > 0.5
+    levels = np.round(np.cumsum(np.append(0.3, 0.7 + 0.1 * np.arange(30))), 1)
+    assert resolution(levels) == pytest.approx(0.1 / np.sqrt(12.0), rel=1e-6)
+
+
+def test_turns_that_were_added_leave_the_resolution() -> None:
+    """The same angle after another turn differs by rounding alone, which is no step."""
+    angle = np.deg2rad(np.round(500.0 * np.sin(0.01 * np.arange(4000)) % 360.0, 1))
+    assert resolution(np.unwrap(angle)) == pytest.approx(np.deg2rad(0.1) / np.sqrt(12.0), rel=1e-6)
 
 
 def test_of_a_periodic_motion_the_shortest_lag_counts() -> None:

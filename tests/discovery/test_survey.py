@@ -1191,6 +1191,7 @@ def test_a_run_in_joints_is_drafted_for_another_folder(tmp_path: Path) -> None:
     (folder / "run.toml").write_text("\n".join(lines))
     run, config = written(survey(folder), tmp_path / "beside" / "out")
     given = pf.Run.read(folder)
+    assert run.name == given.name == "log"
     for axis in "xyz":
         np.testing.assert_array_equal(run.command.values[axis], given.command.values[axis])
     np.testing.assert_array_equal(run.command.orientation, given.command.orientation)

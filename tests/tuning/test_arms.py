@@ -72,8 +72,9 @@ def test_what_bends_an_axis_is_part_of_its_response(arm: Arm) -> None:
 @pytest.mark.parametrize("rest", RESTS)
 @pytest.mark.parametrize("arm", ARMS)
 def test_the_likelihood_of_an_arm_is_the_joint_gaussians(arm: Arm, rest: Rest) -> None:
-    """Of what the arm leaves, in two recordings."""
-    parts = [recording(1), recording(2, 40)]
+    """Of what the arm leaves, in two recordings that rest at two levels before their first command."""
+    other = recording(2, 40)
+    parts = [recording(1), other._replace(command=other.command + 0.4, start=other.start + 0.4)]
     measured, expected = Measured(parts, T, ["a"]), 0.0
     reach = max(np.ptp(one.value) for one in parts)
     for one in parts:

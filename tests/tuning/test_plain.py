@@ -113,6 +113,7 @@ def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_t
     found = with_doubts(lags, doubted, config, config)
     assert found[first] == FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(50.0, 82.0))
     assert found[others[0]].lag_ms_ci95 == (50.0, 60.0)
+    assert others[0] not in with_doubts(lags, doubted, config, config, lost=[others[0]])
     lags = {first: FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(None, 82.0))}
     assert with_doubts(lags, doubted, config, config)[first].lag_ms_ci95 == (None, 82.0)
     assert [Doubt(arm, off, lag=0.08).refutes for off in (3.9e-3, 4.1e-3)] == [False, True]
@@ -194,6 +195,23 @@ def test_an_arm_by_which_a_filter_predicts_better_is_to_take_the_place_of_the_li
     assert doubt.is_beaten and doubt.refutes
     assert doubt.plain.arm.total == pytest.approx(0.29, abs=2e-3)
     assert "The arm is that of least squares instead" in doubt.sentence(pipeline.best, "j")
+
+
+def test_an_arm_that_takes_the_place_of_another_is_kept_and_others_are_not_searched_for_again() -> None:
+    """Of two axes one is held at the arm of least squares: that stays, the other one's is the one that was found."""
+    simulated = pf.simulate(scenario("panel-vision", 0.25, 0.02), 2)
+    config, kinds = simulated.config, ("noise", "delay", "plant")
+    first = Pipeline([simulated.run], config, plans(config, kinds, [], None), lambda _, __: None)
+    quietly(first.fit)
+    held = with_plain_arm(config, "tangential", Arm(0.031, 0.042))
+    again = plans(held, kinds, ["axes.tangential"], None)
+    second = Pipeline([simulated.run], held, again, lambda _, __: None, first.arms_but(["tangential"]))
+    quietly(second.fit)
+    replaced_arm = second.result().arm
+    assert replaced_arm.axes["tangential"].plant == FirstOrder(time_constant=0.042)
+    assert replaced_arm.delay_of("tangential") == 0.031
+    assert second.stages[0].arms["vertical"] is first.stages[0].arms["vertical"]
+    assert replaced_arm.lag_of("vertical") == pytest.approx(first.result().arm.lag_of("vertical"), abs=2e-3)
 
 
 def test_a_lag_that_steps_is_said_of_one_sensor_alone() -> None:

@@ -39,7 +39,7 @@ _STEP = 0.010  # s, between latencies that are tried: their maxima are as wide
 _WELL_KNOWN = 1.0 / 8.0  # of a logarithm: without it some ½ · 8² would be lost in log-likelihood
 _NARROWER, _WIDER = 0.6, 3.0  # times the gates
 _NARROWEST = 3.0  # gate: below it rejecting good measurements pays
-_SLOW = 2.0  # s, of a slow disturbance
+_SLOW = 2.0  # s, of a disturbance that is large at first
 _QUIET = 0.03  # share of what the rest is, that other noise begins with
 _KINDS = {"matern": "smooth (Matérn)", "ou": "rough (Ornstein-Uhlenbeck)"}  # of disturbances
 _WALKING = ("input_noise", "drift", "maneuver_noise", "maneuver_drift")  # noise without a disturbance
@@ -91,9 +91,9 @@ def search(
             start = _with_arm_of(start, found[0].config, free)
         found.append(_maximum(likelihood, start, free, notify))
     likeliest = _likeliest(likelihood, found, free)
-    slow = _slowly_disturbed(likelihood, likeliest, arms, free, notify)
-    if _likeliest(likelihood, [*found, *slow], free) != likeliest:
-        found += slow
+    smooth = _smoothly_disturbed(likelihood, likeliest, arms, free, notify)
+    if _likeliest(likelihood, [*found, *smooth], free) != likeliest:
+        found += smooth
     best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
     best = _without_needless(likelihood, best, free, notify)
     best = _under_gates(likelihood, best, config, free, notify)
@@ -211,10 +211,13 @@ def _noise_models(
     return [_with_quiet(one, arms, free) for one in distinct]
 
 
-def _slowly_disturbed(
+def _smoothly_disturbed(
     likelihood: Likelihood, config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf, notify: Notify
 ) -> list[Point]:
-    """The maximum with a slow, smooth disturbance of axes that have none, which from quick ones is not found."""
+    """The maximum with a smooth disturbance of axes that have none, from all that the arm leaves and the best noise.
+
+    From little of it, beside noise that is not the best yet, it vanishes.
+    """
     calm = [axis for axis in _may_be_disturbed(config, free, arms) if config.process[axis].disturbance_sd == 0.0]
     if not calm:
         return []

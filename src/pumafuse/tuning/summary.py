@@ -173,11 +173,18 @@ def fitted_lags(
 
 
 def with_doubts(
-    lags: Mapping[str, FittedLag], doubts: Mapping[str, Doubt], before: FusionConfig, after: FusionConfig
+    lags: Mapping[str, FittedLag],
+    doubts: Mapping[str, Doubt],
+    before: FusionConfig,
+    after: FusionConfig,
+    lost: Collection[str] = (),
 ) -> dict[str, FittedLag]:
-    """The lags with intervals that cover what least squares says of a doubted arm, and those of replaced arms."""
+    """The lags with intervals that cover what least squares says of a doubted arm, and those of replaced arms.
+
+    Of axes that are ``lost`` none is told.
+    """
     found = dict(lags)
-    for axis, doubt in doubts.items():
+    for axis, doubt in ((axis, one) for axis, one in doubts.items() if axis not in lost):
         low, high = (end * MS for end in doubt.lag_ci95)
         if (one := found.get(axis)) is None:
             lag = after.arm.lag_of(axis) * MS
