@@ -305,6 +305,67 @@ def test_a_table_without_stamps_is_read_at_a_rate(tmp_path: Path) -> None:
         pumafuse("init", tmp_path / "mill.csv", "--rate", rate, "--force", code=2)
 
 
+def undecided(folder: Path, header: str) -> tuple[Path, np.ndarray]:
+    """A log of an arm that goes 3 mm at once and settles with 60 ms, and a sine, in columns that are called as asked."""
+    rng, t = np.random.default_rng(4), np.arange(0.0, 30.0, 0.028)
+    told = np.cumsum(rng.normal(0.0, 3.0, len(t)) * (rng.random(len(t)) < 0.1))
+    seen = response_of(told, 0.028, 0.06) + rng.normal(0.0, 0.1, len(t))
+    rows = [f"{a:.3f},{b:.3f},{c:.3f},{d:.2f}" for a, b, c, d in zip(t, told, seen, np.sin(t), strict=True)]
+    (folder / "log.csv").write_text("\n".join([header, *rows, ""]))
+    return folder / "log.csv", t
+
+
+def response_of(told: np.ndarray, period: float, tau: float) -> np.ndarray:
+    """A held command through a first-order lag: the exact recursion."""
+    left, at = math.exp(-period / tau), 0.0
+    return np.array([at := left * at + (1.0 - left) * before for before in np.append(0.0, told[:-1])])
+
+
+def without_marks(text: str, table: str, *lines: str) -> str:
+    """A run.toml, with lines of a table that are comments no longer."""
+    head, header, body = text.partition(f"\n[{table}]")
+    mine, rest, others = body.partition("\n\n")
+    for line in lines:
+        assert f"\n# {line}" in mine
+        mine = mine.replace(f"\n# {line}", f"\n{line}")
+    return f"{head}{header}{mine}{rest}{others}"
+
+
+def test_a_table_that_does_not_say_who_is_who_is_written_down_and_sorted(tmp_path: Path) -> None:
+    """What is refused is fused when the advice is followed: two lines are taken, and axes are called the same."""
+    log, _ = undecided(tmp_path, "t,north,south,up")
+    line = refused("fuse", log, "-o", tmp_path / "fused")
+    assert "which numbers are the commands" in line and line.endswith(f"`pumafuse init {log}` writes one to sort")
+    made = tmp_path / "made"
+    line = refused("init", log, "-o", made)
+    assert line.endswith(f"written to {made / 'run.toml'}: sort it, then `pumafuse fuse {made} -o DIR`")
+    assert names(made) == {"run.toml"}
+    text = (made / "run.toml").read_text()
+    assert "# up = " in text
+    assert "[command] names no column" in refused("fuse", made, "-o", tmp_path / "fused")
+    text = without_marks(without_marks(text, "command", "north"), "sensors.measured", "south")
+    (made / "run.toml").write_text(text.replace("\nsouth = ", "\nnorth = "))
+    pumafuse("fuse", made, "-o", tmp_path / "fused")
+    tuned = pf.FusionConfig.load(tmp_path / "fused" / "fusion.toml").arm
+    assert tuned.lag_of("north") == pytest.approx(0.06, abs=3e-3)
+
+
+def test_tables_that_do_not_say_who_is_who_are_written_down_each(tmp_path: Path) -> None:
+    """Commands that are known stay so; else each table is a source, in comments."""
+    log, t = undecided(tmp_path, "t,north_cmd,torque,current")
+    refused("init", log, "-o", tmp_path / "commands")
+    text = (tmp_path / "commands" / "run.toml").read_text()
+    assert re.search(r'\n\[command\].*\nfile = "../log.csv"\n', text) and '\nnorth = { column = "north_cmd"' in text
+    folder = tmp_path / "two"
+    folder.mkdir()
+    for name, wave in ("fish", np.sin(t)), ("bird", np.cos(0.37 * t * t)):
+        rows = [f"{a:.3f},{b:.4f}" for a, b in zip(t, wave, strict=True)]
+        (folder / f"{name}.csv").write_text("\n".join(["t,place", *rows, ""]))
+    refused("init", folder, "-o", tmp_path / "made")
+    text = (tmp_path / "made" / "run.toml").read_text()
+    assert "# [sensors.fish]" in text and "# [sensors.bird]" in text and "\n[" not in text
+
+
 def test_what_is_no_log_is_one_line(tmp_path: Path) -> None:
     """Nothing is written."""
     for name in ("a.docx", "a.xlsx"):

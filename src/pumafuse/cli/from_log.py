@@ -13,6 +13,7 @@ import typer
 
 from ..discovery.drafts import drafts
 from ..discovery.guesses import guess
+from ..discovery.roles import UndecidedError
 from ..discovery.survey import FOLLOWS, Survey, early, survey, too_early
 from ..errors import RunError
 from ..fusion import results
@@ -61,7 +62,10 @@ def run(
             is worse than the first guess on the last third of the log.
     """
     results.check_writable(output, force, with_run=True)
-    found = survey(log)
+    try:
+        found = survey(log)
+    except UndecidedError as error:
+        raise RunError(f"{error}; `pumafuse init {log}` writes one to sort") from None
     for name in found.run.sensors:
         if by := early(found, name):
             advice = f"; `pumafuse init {log}` writes one" if found.roles else ""

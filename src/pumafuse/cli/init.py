@@ -11,11 +11,11 @@ import typer
 from rich.table import Table
 
 from ..discovery.contents import Part, Signal, rate_of
-from ..discovery.drafts import BASES, FILES, MANIFEST, drafts
+from ..discovery.drafts import BASES, FILES, MANIFEST, drafts, sketch
 from ..discovery.guesses import SensorGuess, guess
 from ..discovery.questions import decisions, questions
-from ..discovery.roles import Stream
-from ..discovery.survey import Survey, survey
+from ..discovery.roles import Stream, UndecidedError
+from ..discovery.survey import Survey, name_of, survey
 from ..errors import ConfigError, RunError, counted, printable
 from ..folders import write_file
 from ..fusion.config import FusionConfig
@@ -37,13 +37,18 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
 
     Raises:
         PumafuseError: The log cannot be read, has no commands or no sensor, or the files are in the way; or its sensors
-            cannot be registered: then ``run.toml`` alone is written.
+            cannot be registered: then ``run.toml`` alone is written, to be mended.
     """
-    found = survey(log, rate)
-    folder = Path(f"{found.name}-fusion") if output is None else output
+    folder = Path(f"{name_of(log)}-fusion") if output is None else output
     there = [name for name in FILES if (folder / name).exists()]
     if there and not force:
         raise ConfigError(f"{folder}: has {there[0]} already; --force replaces it, or choose another folder")
+    try:
+        found = survey(log, rate)
+    except UndecidedError as error:
+        write_file(folder / MANIFEST, sketch(name_of(log), error, folder), replace=force)
+        then = f"`pumafuse fuse {folder} -o DIR`"
+        raise RunError(f"{error}; what there is was written to {folder / MANIFEST}: sort it, then {then}") from None
     arm, sensors = guess(found)
     texts = drafts(found, arm, sensors, folder)
     show(found, sensors)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any, cast
@@ -16,9 +16,10 @@ from ..logs.columns import leaf
 from ..logs.frames import CARTESIAN
 from ..space.rotations import TURNING
 from ..units import DEG, MS, SCREEN, ending
-from .contents import Signal
+from . import names
+from .contents import Part, Signal, without_clock
 from .guesses import ArmGuess, SensorGuess
-from .roles import Stream
+from .roles import Roles, Stream, UndecidedError, streams_of
 from .survey import Survey
 
 FILES = MANIFEST, *_ = ("run.toml", "arm.toml", "fusion.toml")
@@ -37,6 +38,44 @@ def drafts(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess], fol
     """
     made = _run_toml(found, arm, folder), _arm_toml(found, arm), _fusion_toml(found, arm, sensors)
     return dict(zip(FILES, made, strict=True))
+
+
+def sketch(name: str, undecided: UndecidedError, folder: Path) -> str:
+    """``run.toml`` of a log that does not say who is who: what is in it, in comments that its owner sorts.
+
+    Args:
+        name: Of the log.
+        undecided: What is in it, and what of it is known.
+        folder: Where the file will be.
+    """
+    lines = ["# What is in the log. Lines that begin with # are not used: take the # from those that are meant."]
+    if undecided.roles is not None:
+        told = _source(["command"], undecided.roles.command, folder)
+        return "\n".join([*lines, _pair("name", name), *told, *_unused(undecided.roles, folder), ""])
+    lines += [
+        "# [command] is what the arm is told. Each [sensors.NAME] is what measures the same axes: they are called the",
+        "# same there as in [command], on the left of the =.",
+        _pair("name", name),
+    ]
+    clocked = [part for part in undecided.parts if part.clock is not None]
+    streams = [one for part in clocked for one in streams_of(part) or [Stream(part.stem, None, "", part, {})]]
+    if len(streams) == 1:  # of a table that holds both, each column may be either
+        for table in (["command"], ["sensors", "measured"]):
+            lines += [*_place(table, streams[0], folder), *(f"# {line}" for line in _columns(streams[0]))]
+    else:
+        for one in streams:
+            lines += ["", *(f"# {line}" for line in _source(["sensors", one.name], one, folder)[1:])]
+    for part in undecided.parts:
+        lines += _other_columns(part)
+    return "\n".join([*lines, ""])
+
+
+def _other_columns(part: Part) -> list[str]:
+    """The columns of a part that are in no source, and why."""
+    clockless = without_clock(part) if part.clock is None else ""
+    others = dict.fromkeys((one.column for one in part.signals if clockless), clockless) | dict(part.left_out)
+    lines = [f"# {_line(_pair(names.plain(column), column), printable(why, 200))}" for column, why in others.items()]
+    return ["", f"# Of {printable(part.label)} not taken for positions:", *lines] if others else []
 
 
 def _run_toml(found: Survey, arm: ArmGuess, folder: Path) -> str:
@@ -63,15 +102,24 @@ def _run_toml(found: Survey, arm: ArmGuess, folder: Path) -> str:
         lines += _source(["sensors", one.name], one, folder)
     if roles.reference is not None:
         lines += _source(["reference"], roles.reference, folder)
+    return "\n".join([*lines, *_unused(roles, folder), ""])
+
+
+def _unused(roles: Roles, folder: Path) -> Iterator[str]:
+    """In comments what is in a log and not used, and why."""
     for stream, why in roles.left_out:
         table = ["reference"] if stream.role == "reference" else ["sensors", stream.name]
         unused = [f"# {line}" for line in _source(table, stream, folder)[1:]]
-        lines += ["", f"# Not used: {printable(why, 200)}", *unused]
-    return "\n".join([*lines, ""])
+        yield from ["", f"# Not used: {printable(why, 200)}", *unused]
 
 
 def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
     """The table of a source."""
+    return [*_place(table, stream, folder), *_columns(stream)]
+
+
+def _place(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
+    """Where a source is, and its stamps."""
     part, clock = stream.part, stream.part.clock
     assert clock is not None
     lines = ["", _line(_header(table), printable(stream.why, 200)), _line(_pair("file", _from(folder, part.file)))]
@@ -81,6 +129,12 @@ def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
     if set(time) <= {"column", "nanoseconds"}:
         time = list(time.values()) if clock.time.nanoseconds else clock.time.column
     lines.append(_line(_pair("time", time), clock.basis))
+    return lines
+
+
+def _columns(stream: Stream) -> list[str]:
+    """The axes of a source, and its orientation."""
+    lines = list[str]()
     pose = _pose(stream)
     if pose and stream.attitude:
         lines.append(_line(_pair("pose", pose), "in m, and how it is turned"))

@@ -94,6 +94,19 @@ class Stream:
         return kind_of(f"_{self.axes[axis][0].unit}") or "length"
 
 
+class UndecidedError(RunError):
+    """A log does not say what is commanded, or what measures.
+
+    Attributes:
+        parts: What is in it.
+        roles: Who is who, as far as it is known; None: nothing tells which numbers are the commands.
+    """
+
+    def __init__(self, log: str, why: str, parts: Sequence[Part], roles: Roles | None = None) -> None:
+        super().__init__(f"{log}: {why}")
+        self.parts, self.roles = parts, roles
+
+
 @dataclass(frozen=True)
 class Roles:
     """Who is who.
@@ -150,26 +163,32 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     """Who is who among the parts of a log.
 
     Raises:
-        RunError: There are no positions, or none that can be commands.
+        UndecidedError: There are no positions, or none that can be commands.
+        RunError: Nothing has a clock.
     """
     parts = list(parts)
-    streams = [stream for part in parts for stream in _streams(part)]
+    streams = [stream for part in parts for stream in streams_of(part)]
     if not streams:
         others = [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
         clockless = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
         there = ", ".join(map(printable, [*clockless, *others][:_MOST_LISTED]))
         at_a_rate = " if rows come at a constant rate, give it to init as --rate HZ, else" if clockless else ""
-        raise RunError(
-            f"{log}: no columns of positions with a clock beside them"
-            + (f", but {there}" if there else "")
-            + f";{at_a_rate} {no_commands(parts)}say in run.toml where they are"
-        )
+        why = f"no columns of positions with a clock beside them{', but ' if there else ''}{there}"
+        advice = f"{at_a_rate} {no_commands(parts)}say in run.toml where they are"
+        if all(part.clock is None for part in parts):
+            raise RunError(f"{log}: {why};{advice}")
+        raise UndecidedError(log, f"{why};{advice}", parts)
     named = dict[str, Stream]()
     for one in _apart(streams[0]) if len(streams) == 1 else streams:
         name = _free(one.name, named.keys())
         named[name] = replace(one, name=name)
     streams = _looked_at(list(named.values()))
-    command, why = _command(streams, log, no_commands(parts))
+    if (known := _command(streams)) is None:
+        what = "; ".join(f"{printable(one.part.label)}: {', '.join(list(one.axes)[:_MOST_LISTED])}" for one in streams)
+        called = "None is called command, goal, target, desired, setpoint or action, and none runs ahead of others"
+        advice = f"{no_commands(parts)}say it in run.toml"
+        raise UndecidedError(log, f"which numbers are the commands? {called} ({what}); {advice}", parts)
+    command, why = known
     left_out: list[tuple[Stream, str]] = []
     kept: list[Stream] = []
     for stream in streams:
@@ -301,7 +320,7 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
     return replace(stream, part=replace(stream.part, clock=shifted))
 
 
-def _streams(part: Part) -> list[Stream]:
+def streams_of(part: Part) -> list[Stream]:
     """The columns of a part, those apart whose names say that they are something else, or another list."""
     if part.clock is None:
         return []
@@ -471,7 +490,7 @@ def _free(name: str, taken: Set[str]) -> str:
     return next(one for one in numbered if one not in taken)
 
 
-def _command(streams: Sequence[Stream], log: str, advice: str) -> tuple[Stream, str]:
+def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
     """The commands, and how they are known: by name, and of several by what follows them; without names by that."""
     called = [one for one in streams if one.role == "command"]
     if len(called) == 1:
@@ -485,11 +504,7 @@ def _command(streams: Sequence[Stream], log: str, advice: str) -> tuple[Stream, 
     followers = {one.name: _followers(one, streams) for one in candidates}
     best = max(candidates, key=lambda one: followers[one.name], default=None)
     if best is None or (not called and not followers[best.name][0]):
-        what = "; ".join(f"{printable(one.part.label)}: {', '.join(list(one.axes)[:_MOST_LISTED])}" for one in streams)
-        raise RunError(
-            f"{log}: which numbers are the commands? None is called command, goal, target, desired, setpoint or action,"
-            f" and none runs ahead of others ({what}); {advice}say it in run.toml"
-        )
+        return None
     return best, best.why or "others follow it"
 
 

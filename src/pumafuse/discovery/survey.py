@@ -13,7 +13,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import RunError
 from ..logs.axes import in_axes
 from ..logs.clock import without_strays
 from ..logs.run import REFERENCE, Run, Source
@@ -23,7 +22,7 @@ from .contents import Part, parts_of, period_of, without_clock
 from .following import LATEST, Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
-from .roles import GUESSED_LAG, Roles, relations, roles_of
+from .roles import GUESSED_LAG, Roles, UndecidedError, relations, roles_of
 
 FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
@@ -62,9 +61,14 @@ class Survey:
     @property
     def name(self) -> str:
         """The log's name without the endings of files."""
-        log = self.log.resolve()
-        log = log.parent if log.name == "run.toml" else log
-        return re.sub(r"(\.(csv|parquet|mcap|bag|db3|rrd|mat|np[yz]|json|xlsx|ulg))?(\.gz)?$", "", log.name) or "log"
+        return name_of(self.log)
+
+
+def name_of(log: Path) -> str:
+    """A log's name without the endings of files."""
+    log = log.resolve()
+    log = log.parent if log.name == "run.toml" else log
+    return re.sub(r"(\.(csv|parquet|mcap|bag|db3|rrd|mat|np[yz]|json|xlsx|ulg))?(\.gz)?$", "", log.name) or "log"
 
 
 def survey(log: Path, rate: float = 0.0) -> Survey:
@@ -75,7 +79,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         rate: How often rows, or frames, come in tables without stamps [Hz]; 0: not known.
 
     Raises:
-        PumafuseError: Nothing can be read, or nothing in it can be commands.
+        PumafuseError: Nothing can be read.
+        UndecidedError: Nothing in it can be commands, or nothing follows them.
     """
     described = log if log.name == "run.toml" else log / "run.toml"
     if os.path.isfile(described):  # noqa: PTH113 - Path.is_file raises on a name that is too long
@@ -88,7 +93,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
     if not roles.sensors:
-        raise RunError(f"{log}: commands, but nothing that measures where they lead: {_reasons(roles, parts)}")
+        why = f"commands, but nothing that measures where they lead: {_reasons(roles, parts)}"
+        raise UndecidedError(str(log), why, parts, roles)
     run = without_strays(roles.run)
     aside = own_frames(run)
     run = _along_axes(run, aside)
@@ -104,7 +110,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     bad |= {(name, axis): why for name, why in _without_lag(related).items() for axis in (*run.axes, *TURNING)}
     roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
     if not roles.sensors:
-        raise RunError(f"{log}: commands, but nothing that surely follows them: {_reasons(roles, parts)}")
+        why = f"commands, but nothing that surely follows them: {_reasons(roles, parts)}"
+        raise UndecidedError(str(log), why, parts, roles)
     kept = {(name, axis) for name, one in roles.measured.items() for axis in (*one.axes, *TURNING)}
     related = {key: one for key, one in related.items() if key in kept}
     run, related = _followed(_along_axes(without_strays(roles.run), aside), related)
