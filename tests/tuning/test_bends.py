@@ -1,4 +1,4 @@
-"""Play and a fastest speed are tried by themselves, and taken where they predict motion they were not fitted to."""
+"""Play, a fastest speed and a sag are tried by themselves, and taken where they predict motion they were not fitted to."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tuning_runs import quietly
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 T, LENGTH, RANGE = 0.02, 1500, 0.02  # s, commands, m
-FREE = ("delay", "lag", "damping", "recovery", "gain", "play", "max_speed")
+FREE = ("delay", "lag", "damping", "recovery", "gain", "play", "max_speed", "sag")
 MOVED = 0.01  # of the range: the noise of the sensor, and what comes back within 0.3 s
 
 
@@ -121,6 +121,30 @@ def test_both_are_found() -> None:
     assert bent is not None
     assert bent.arm.play == pytest.approx(0.15 * RANGE, rel=0.15)
     assert bent.arm.max_speed == pytest.approx(0.6 * RANGE * 2.0 * math.pi, rel=0.03)
+
+
+@pytest.mark.parametrize("beyond", [-0.95, -0.3, 0.3])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_sag_is_found(seed: int, beyond: float) -> None:
+    """Where an axis stalls, hangs back or runs ahead: the knee within 5 % of the range, the slope within 10 %."""
+    knee = RANGE * (-0.4, -0.2, 0.0, 0.2, 0.4, 0.55)[seed]
+    true = arm_of(seed, knee=knee, beyond=beyond)
+    bent = found(seed, true)
+    assert bent is not None and bent.arm.play == 0.0 and bent.arm.max_speed == 0.0
+    assert bent.arm.knee == pytest.approx(knee, abs=0.05 * 2.0 * RANGE)
+    assert bent.arm.beyond == pytest.approx(beyond, rel=0.1)
+    assert bent.arm.gain == pytest.approx(true.gain, abs=0.02)  # of a third of the motion, at the least
+    assert bent.off < 0.95 * bent.linear_off
+
+
+def test_a_load_that_is_known_is_not_looked_for() -> None:
+    """Its knee is in the responses already."""
+    true = arm_of(5, knee=0.2 * RANGE, beyond=-0.5)
+    recorded = measured(5, true)
+    knowing = Measured(recorded.recordings, T, ["camera"], true.model)
+    plain = plain_arm(knowing)
+    assert plain is not None and bent_arm(plain, Arm(0.0, 0.1), FREE) is None
+    assert plain.arm.gain == pytest.approx(true.gain, abs=0.01)
 
 
 def test_what_is_fixed_is_not_tried() -> None:

@@ -52,12 +52,16 @@ class Sag(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         slope: What each 1 of p adds.
         knee: The p [m or rad] above which another slope holds; None: none does.
         slope_beyond: The slope there.
+        knee_ci95: The knee's 95 % interval [m or rad], if it was fitted.
+        slope_beyond_ci95: That of the slope beyond.
     """
 
     offset: float = msgspec.field(name="offset_mm", default=0.0)
     slope: Slope = 0.0
     knee: float | None = msgspec.field(name="knee_mm", default=None)
     slope_beyond: Slope | None = None
+    knee_ci95: Interval | None = msgspec.field(name="knee_mm_ci95", default=None)
+    slope_beyond_ci95: Interval | None = None
 
     def __post_init__(self) -> None:
         if (self.knee is None) != (self.slope_beyond is None):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from .arms import BENDS, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
+from .arms import BENDS, SAG, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
 from .bends import Bent, bent_arm
 from .parameters import QUICKEST, RECOVERY, RECOVERY_PRIOR
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
@@ -73,7 +73,7 @@ class Freedom(NamedTuple):
     """
 
     given: Arm
-    free: Collection[str] = ("delay", "lag", "damping", "recovery", "gain", *BENDS)
+    free: Collection[str] = ("delay", "lag", "damping", "recovery", "gain", *BENDS, "sag")
     orders: Sequence[int] = (1, 2)
     gains: Sequence[GainKind] = GAINS
 
@@ -95,10 +95,11 @@ class Freedom(NamedTuple):
         return [name for name in found if name in self.free]
 
     def bent(self, bent: Bent | None) -> Freedom:
-        """With the play and the fastest speed that were found; without any, those that are given stay."""
+        """With the play, fastest speed and sag that were found; without any, those that are given stay."""
         if bent is None:
             return self
-        return self._replace(given=self.given._replace(play=bent.arm.play, max_speed=bent.arm.max_speed))
+        found = {name: getattr(bent.arm, name) for name in (*BENDS, *SAG)}
+        return self._replace(given=self.given._replace(**found))
 
     def shaped(self, arm: Arm, gain: GainKind) -> Arm:
         """An arm with the kind of gain; one as it is given keeps what is known of it."""
@@ -114,7 +115,7 @@ class ArmSearch:
         freedom: What was to be found.
         sensors: By which it is known.
         plain: The linear arm of least squares; None where nothing moves.
-        bent: Their arm with play, a fastest speed or both; None for a linear axis.
+        bent: Their arm with what it has of play, a fastest speed and a sag; None for a linear axis.
         limits: Where its numbers may lie.
         rest: What the best arm leaves.
         rests: Likewise, without a disturbance, with a smooth one and with a rough one.

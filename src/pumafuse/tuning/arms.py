@@ -18,7 +18,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..filter.core import AXIS, Record, at, library
 from ..filter.response import record_of
-from ..model.arm import AxisModel, Gain
+from ..model.arm import AxisModel, Gain, Sag
 from ..model.plants import FirstOrder, SecondOrder
 from .steps import bounded_step
 
@@ -45,7 +45,7 @@ _SHIFT, _LOG_SHIFT = 1e-4, 1e-3  # s, 1: by which responses are varied; delays a
 # longest step of each coordinate; a slope is linear, and its unit is of any size
 _REACH = {
     "delay": 0.03, "lag": 0.7, "damping": 0.7, "recovery": 0.7, "gain": 1.0, "slope": math.inf,
-    "play": 0.7, "max_speed": 0.3,
+    "play": 0.7, "max_speed": 0.3, "knee": math.inf, "beyond": 0.3,
 }  # fmt: skip
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -54,6 +54,8 @@ Coordinates: TypeAlias = Sequence[str]  # among the fields below
 # what no matrix does, and no kind of plant has: bounds in m and m/s
 BENDS = {"play": (1e-6, 1.0), "max_speed": (1e-3, 100.0)}
 LOGARITHMIC = ("lag", "damping", "recovery", *BENDS)
+SAG = ("knee", "beyond")  # of a line in two pieces; the first is the gain
+BEYOND = (-0.98, 9.0)  # bounds of its slope
 
 
 class Recording(NamedTuple):
@@ -119,6 +121,8 @@ class Arm(NamedTuple):
         slope: What it gains with speed [s/m].
         play: Width of the backlash between drive and tool [m]; 0: it has none.
         max_speed: The fastest that the drive goes [m/s]; 0: as fast as it is asked to.
+        knee: Level above which a load holds the tool off [m], as logged.
+        beyond: What each 1 above it adds; 0: none does.
     """
 
     delay: float
@@ -129,6 +133,8 @@ class Arm(NamedTuple):
     slope: float = 0.0
     play: float = 0.0
     max_speed: float = 0.0
+    knee: float = 0.0
+    beyond: float = 0.0
 
     @property
     def total(self) -> float:
@@ -137,7 +143,7 @@ class Arm(NamedTuple):
 
     @property
     def model(self) -> AxisModel:
-        """Plant, gain, fastest speed and play."""
+        """Plant, gain, fastest speed, play, and the knee of its sag."""
         plant: FirstOrder | SecondOrder = FirstOrder(time_constant=self.lag)
         if self.damping:
             plant = SecondOrder(natural_frequency=2.0 * self.damping / self.lag, damping=self.damping)
@@ -148,6 +154,7 @@ class Arm(NamedTuple):
             gain_recovery=self.recovery or None,
             max_speed=self.max_speed or None,
             play=self.play or None,
+            sag=Sag(knee=self.knee, slope_beyond=self.beyond) if self.beyond else None,
         )
 
     @classmethod
@@ -155,6 +162,8 @@ class Arm(NamedTuple):
         """That of an axis's model and its dead time [s]."""
         damping = axis.plant.damping if isinstance(axis.plant, SecondOrder) else 0.0
         gain, bends = axis.gain, (axis.play or 0.0, axis.max_speed or 0.0)
+        if axis.sag is not None and axis.sag.knee is not None and axis.sag.slope_beyond is not None:
+            bends = *bends, axis.sag.knee, axis.sag.slope_beyond
         return cls(delay, axis.plant.lag, damping, axis.gain_recovery or 0.0, gain.intercept, gain.slope, *bends)
 
     def coordinate(self, name: str) -> float:
@@ -438,7 +447,12 @@ class Measured:
         return found
 
     def _is_linear(self, arm: Arm) -> bool:
-        return not any(getattr(arm, bend) for bend in BENDS) and (self._known is None or self._known.sag is None)
+        return not any((arm.play, arm.max_speed, arm.beyond)) and not self.sags
+
+    @property
+    def sags(self) -> bool:
+        """Whether the axis is known to sag."""
+        return self._known is not None and self._known.sag is not None
 
     def _columns(self, one: Recording) -> FloatArray:
         """The measurements, and for each sensor but the first which are its, (s, m)."""
@@ -459,10 +473,8 @@ class Measured:
 
     def _records(self, arms: Sequence[Arm]) -> Record:
         """Arms as the core takes them, (n,)."""
-        found, (delay, lag, damping, recovery, gain, slope, play, max_speed) = (
-            np.zeros(len(arms), AXIS),
-            np.array(arms).T,
-        )
+        found, columns = np.zeros(len(arms), AXIS), np.array(arms).T
+        delay, lag, damping, recovery, gain, slope, play, max_speed, knee, beyond = columns
         if self._known is not None:
             found[:] = record_of(self._known, self.period, 0.0, 0.0)
         found["period"], found["delay"] = self.period, delay
@@ -470,6 +482,8 @@ class Measured:
         found["natural_frequency"], found["damping"] = 2.0 * damping / lag, damping
         found["slope"], found["intercept"], found["recovery"] = slope, gain, recovery
         found["play"], found["max_speed"] = play, max_speed
+        bent = beyond != 0.0
+        found["sag_knee"][bent], found["sag_slope_beyond"][bent] = knee[bent], beyond[bent]
         return found
 
     def _variance(self, one: Recording, rest: Rest) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Whether an axis has play or a fastest speed: tried on its motion, judged where it was not fitted.
+"""Whether an axis has play, a fastest speed or a sag: tried on its motion, judged where it was not fitted.
 
 What turns with the direction looks like a resonance in one motion, and what clips with the speed like a longer lag. The
 likelihood of that motion cannot tell them apart; another part of it can.
@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..units import Screen
-from .arms import BENDS, Arm, Limits, Measured, Recording
+from .arms import BENDS, BEYOND, SAG, Arm, Limits, Measured, Recording
 from .plain import FOLLOWS, PlainArm, independent
 
 _ANY = {"delay": (0.0, 10.0), "lag": (1e-4, 4.0), "damping": (0.2, 8.0), "gain": (0.3, 3.0)}
@@ -25,10 +25,12 @@ _WIDTHS, _SPEEDS = (0.7, 1.5, 3.0), (0.95, 0.8, 0.6)  # of what that arm leaves,
 _EARLIER = (0.0, 0.6)  # starts: of a first-order arm's dead time, what is lag of a second-order plant
 _FEWEST = 20  # measurements of each half: four for each number that is fitted
 _FASTEST = 0.98  # of the time it goes no faster
+_KNEES = np.linspace(0.05, 0.95, 25)  # of the time the axis is lower
+_COORDINATES = {"play": ("play",), "max_speed": ("max_speed",), "sag": SAG}  # of each bend
 
 
 class Bent(NamedTuple):
-    """An arm with play, a fastest speed or both.
+    """An arm with play, a fastest speed, a sag, or several of these.
 
     Attributes:
         arm: The arm, fitted to all of the motion.
@@ -45,12 +47,15 @@ class Bent(NamedTuple):
         play, fastest = (one * screen.scale for one in (self.arm.play, self.arm.max_speed))
         found = [f"play: about {play:.3g} {screen.unit}"] if play else []
         found += [f"fastest speed: about {fastest:.4g} {screen.unit}/s"] if fastest else []
+        if self.arm.beyond:
+            knee, share = self.arm.knee * screen.scale, 1.0 + self.arm.beyond
+            found.append(f"sag: above about {knee:.3g} {screen.unit} it moves {share:.3g} times as far as below")
         off, linear = self.off * screen.scale, self.linear_off * screen.scale
         return [*found, f"with it {off:.3g} {screen.unit} off where it was not fitted, without it {linear:.3g}"]
 
 
 def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
-    """The least-squares arm with what pays of play and a fastest speed; None for a linear axis.
+    """The least-squares arm with what pays of play, a fastest speed and a sag; None for a linear axis.
 
     Args:
         plain: What least squares say of a linear arm.
@@ -61,7 +66,7 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
     if min(half.count for half in search.halves) < _FEWEST:
         return None
     chosen: list[str] = []
-    squares: list[FloatArray] = []  # that are left without a bend, with one, with both
+    squares: list[FloatArray] = []  # that are left without a bend, with one, with two, …
     while kinds := _kinds(search, chosen, free):
         squares = squares or [search.off([])]
         tried = {kind: search.off([*chosen, kind]) for kind in kinds}
@@ -81,8 +86,8 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
 
 def _kinds(search: _Search, chosen: Sequence[str], free: Collection[str]) -> list[str]:
     """The bends that are worth a trial beside those that are chosen."""
-    allowed = filter(free.__contains__, BENDS)
-    return [kind for kind in allowed if kind not in chosen and search.seems(kind, chosen)]
+    tried = [*chosen, "sag"] if search.measured.sags else chosen
+    return [kind for kind in _COORDINATES if kind in free and kind not in tried and search.seems(kind, chosen)]
 
 
 class _Search:
@@ -90,26 +95,56 @@ class _Search:
 
     def __init__(self, plain: PlainArm, given: Arm, free: Collection[str]) -> None:
         self.measured, self._names = plain.measured, [name for name in _ANY if name in free]
-        self._limits, self._rest = Limits({**_ANY, **BENDS}, {}), self.measured.white(plain.arm)
+        told = np.concatenate([one.command for one in self.measured.recordings])
+        knees = float(told.min()), float(told.max())
+        self._limits = Limits({**_ANY, **BENDS, "knee": knees, "beyond": BEYOND}, {})
+        self._rest = self.measured.white(plain.arm)
         self._start = given._replace(delay=plain.arm.delay, lag=plain.arm.lag, play=0.0, max_speed=0.0)
         if "gain" in free:
             self._start = self._start._replace(gain=plain.arm.gain, recovery=0.0, slope=0.0)
-        self._starts: dict[str, float] = {}
+        self._starts: dict[str, dict[str, float]] = {}
         self.halves = _halves(self.measured)
 
     def seems(self, kind: str, beside: Sequence[str]) -> bool:
         """Whether one bend more leaves less of all of the motion; fits begin from the best of a rough grid."""
         arm = self.fitted(self.measured, beside)
+        start = self._knee(arm) if kind == "sag" else self._size(kind, arm)
+        if not start:
+            return False
+        self._starts[kind] = start
+        bent = self.fitted(self.measured, [*beside, kind])
+        return _square(self.measured, bent) < _SEEMS * _square(self.measured, arm)
+
+    def _size(self, kind: str, arm: Arm) -> dict[str, float]:
+        """The likeliest play or fastest speed on a rough grid; none where all that may be is too small."""
         sd, fastest = float(np.std(self.measured.left(arm))), _fastest(self.measured, arm)
         sizes = [sd * one for one in _WIDTHS] if kind == "play" else [fastest * one for one in _SPEEDS]
         if min(sizes) <= BENDS[kind][0]:
-            return False
+            return {}
         shares = product((arm.delay * _SOONER).tolist(), (arm.lag * _SOONER[1:]).tolist(), sizes)
         arms = [arm._replace(delay=delay, lag=lag, **{kind: size}) for delay, lag, size in shares]
         log, _ = self.measured.weighed(arms, self._rest, self._limits)
-        self._starts[kind] = getattr(arms[int(np.argmax(log))], kind)
-        bent = self.fitted(self.measured, [*beside, kind])
-        return _square(self.measured, bent) < _SEEMS * _square(self.measured, arm)
+        return {kind: getattr(arms[int(np.argmax(log))], kind)}
+
+    def _knee(self, arm: Arm) -> dict[str, float]:
+        """The line in two pieces that explains most of what an arm leaves at its levels; none where that is little."""
+        level, left = _levels(self.measured, arm), self.measured.left(arm)
+        sums, lines = list[float](), list[list[float]]()
+        knees = np.quantile(level, _KNEES)
+        for knee in knees:
+            columns = np.column_stack([np.ones(len(level)), level, np.maximum(level - knee, 0.0)])
+            line = np.linalg.lstsq(columns, left, rcond=None)[0]
+            lines.append(line.tolist())
+            sums.append(float(np.sum((left - columns @ line) ** 2)))
+        best = int(np.argmin(sums))
+        if sums[best] > _SEEMS * float(left @ left):
+            return {}
+        knee, (_, below, more) = float(knees[best]), lines[best]
+        if "gain" not in self._names or below <= BEYOND[0]:
+            return {"knee": knee, "beyond": min(max(more, BEYOND[0]), BEYOND[1])}
+        start, grown = self.measured.recordings[0].start, 1.0 + below  # so is the gain of the line below
+        beyond = min(max(more / grown, BEYOND[0]), BEYOND[1])
+        return {"gain": arm.gain * grown, "knee": start + (knee - start) * grown, "beyond": beyond}
 
     def off(self, kinds: Sequence[str]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
@@ -119,8 +154,9 @@ class _Search:
 
     def fitted(self, measured: Measured, kinds: Sequence[str]) -> Arm:
         """The arm of least squares with these bends, of first or second order."""
-        start = self._start._replace(**{kind: self._starts[kind] for kind in kinds})
-        names: list[str] = [*(name for name in self._names if name != "damping"), *kinds]
+        start = self._start._replace(**{name: size for kind in kinds for name, size in self._starts[kind].items()})
+        bends = [name for kind in kinds for name in _COORDINATES[kind]]
+        names: list[str] = [*(name for name in self._names if name != "damping"), *bends]
         found = [measured.fitted(start._replace(damping=0.0), names, self._rest, self._limits)]
         first = found[0].arm
         for earlier in _EARLIER if "damping" in self._names else ():  # dead time and plant make up for each other
@@ -137,6 +173,12 @@ def _fastest(measured: Measured, arm: Arm) -> float:
         for moved, one in zip(measured.responses(arm), measured.recordings, strict=True)
     ]
     return float(np.quantile(np.concatenate(parts), _FASTEST))
+
+
+def _levels(measured: Measured, arm: Arm) -> FloatArray:
+    """Where an arm without a sag is, as logged, at the measurements that count [m]."""
+    parts = zip(measured.recordings, measured.responses(arm), strict=True)
+    return np.concatenate([(one.start + moved)[one.weight > 0.0] for one, moved in parts])
 
 
 def _square(measured: Measured, arm: Arm) -> float:

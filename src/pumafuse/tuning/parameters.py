@@ -15,9 +15,10 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import ConfigError, suggestion
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor
+from ..model.arm import Sag
 from ..model.plants import FirstOrder, SecondOrder
 from ..units import ending, of_kind, si
-from .arms import BELIEF, BENDS, Arm, Rest, longest_delay
+from .arms import BELIEF, BENDS, BEYOND, Arm, Rest, longest_delay
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale", "bias"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -33,6 +34,7 @@ QUICKEST = 2.0  # update periods, of a disturbance
 _PLANT_NOISE = ("input_noise", "maneuver_noise")  # what shakes the plant, and is filtered by it
 _RINGS = 0.4  # damping below which a step overshoots by a quarter, and no drive that is sold is tuned so
 _INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
+_LEVELS = (-1e3, 1e3)  # m or rad
 _TICK = 0.028  # s; a large change of a time, on any arm
 _DIGITS = 6  # of a number that is written
 _AT_BOUND = 1e-6  # of the range of coordinates
@@ -176,7 +178,7 @@ class Parameter:
         one = replace(self, key=key, path=path, axis=axis, sensor=sensor)
         if one.path[-1] == "disturbance_time":  # what is faster is no motion of an arm but noise of its sensors
             return replace(one, bounds=(quickest(known), one.bounds[1]))
-        if self.log:
+        if self.log or "sag" in path:
             return one
         middle, (low, high) = one.get(known), self.bounds
         if self.fit == "delay":
@@ -209,6 +211,8 @@ _TABLE = (
     _line("plant", "axes.{axis}.damping", "arm.axes.{axis}.plant.damping", 0.05, 20.0),
     _line("plant", "axes.{axis}.max_speed_mm_s", "arm.axes.{axis}.max_speed", *BENDS["max_speed"]),
     _line("plant", "axes.{axis}.play_mm", "arm.axes.{axis}.play", *BENDS["play"]),
+    _line("plant", "axes.{axis}.sag.knee_mm", "arm.axes.{axis}.sag.knee", *_LEVELS, log=False, scale=0.1),
+    _line("plant", "axes.{axis}.sag.slope_beyond", "arm.axes.{axis}.sag.slope_beyond", *BEYOND, log=False, scale=0.1),
     _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.5, 0.5, **_INTERCEPT),
     _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *RECOVERY, prior=RECOVERY_PRIOR),
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
@@ -311,6 +315,7 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
             config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
             for bend in BENDS:
                 config = changed(config, ("arm", "axes", axis, bend), 1.0)
+            config = changed(config, ("arm", "axes", axis, "sag"), Sag(knee=0.0, slope_beyond=-0.1))
         config = with_drifts(with_own_delays(config, sensors))
         keys |= {one.key for one in parameters(config, config, sensors, FITS)}
     for name in fixed:
@@ -424,8 +429,11 @@ def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> Fusion
 
 
 def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
-    """The configuration with another arm of an axis, and a delay of its own."""
-    model = arm.model
+    """The configuration with another arm of an axis, and a delay of its own; a load that is given stays."""
+    model, sag = arm.model, config.arm.axes[axis].sag or Sag()
+    if arm.beyond:
+        sag = msgspec.structs.replace(sag, knee=arm.knee, slope_beyond=arm.beyond)
+        config = changed(config, ("arm", "axes", axis, "sag"), sag)
     for name in ("plant", "gain", "gain_recovery", *BENDS):
         config = changed(config, ("arm", "axes", axis, name), getattr(model, name))
     return changed(config, ("arm", "axes", axis, "delay"), arm.delay)

@@ -52,6 +52,7 @@ _NAMES = {  # of an arm's coordinates, by the fields that they are in a configur
     "gain_recovery": "recovery",
     "play": "play",
     "max_speed": "max_speed",
+    "slope_beyond": "sag",
 }
 
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
@@ -135,7 +136,8 @@ def arm_searches(
 def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom:
     """What of an axis's arm the free parameters leave open."""
     given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
-    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if given.damping else 1.0, 0.1, play=1e-3, max_speed=1.0))
+    bends = {"play": 1e-3, "max_speed": 1.0, "beyond": -0.1}
+    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if given.damping else 1.0, 0.1, **bends))
     here, there = ({one.path[-1] for one in free(at) if one.axis == axis} for at in (config, other))
     if any(one.fit == "delay" for one in free(config) if one.axis in (None, axis)):
         here.add("delay")
@@ -146,7 +148,7 @@ def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom:
         here, gains, given = here | {"gain_recovery"}, GAINS, given._replace(gain=1.0, recovery=0.0, slope=0.0)
     elif "intercept" in here:
         gains = ("recovering" if given.recovery else "static",)
-    here |= plants[0] | (there & {*BENDS}) if whole else here
+    here |= plants[0] | (there & {*BENDS, "slope_beyond"}) if whole else here
     names = {_NAMES[field] for field in here if field in _NAMES}
     order = 2 if given.damping else 1
     return Freedom(given, names, (1, 2) if whole else (order,), gains)
