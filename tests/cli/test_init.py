@@ -306,7 +306,7 @@ def test_a_table_without_stamps_is_read_at_a_rate(tmp_path: Path) -> None:
 
 
 def undecided(folder: Path, header: str) -> tuple[Path, np.ndarray]:
-    """A log of an arm that goes 3 mm at once and settles with 60 ms, and a sine, in columns that are called as asked."""
+    """A log of an arm that settles with 60 ms, and a sine, in columns that are called as asked."""
     rng, t = np.random.default_rng(4), np.arange(0.0, 30.0, 0.028)
     told = np.cumsum(rng.normal(0.0, 3.0, len(t)) * (rng.random(len(t)) < 0.1))
     seen = response_of(told, 0.028, 0.06) + rng.normal(0.0, 0.1, len(t))

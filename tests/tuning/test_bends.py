@@ -1,4 +1,4 @@
-"""Play, a fastest speed and a sag are tried by themselves, and taken where they predict motion they were not fitted to."""
+"""Play, a fastest speed and a sag are tried by themselves: they are to predict motion they were not fitted to."""
 
 from __future__ import annotations
 

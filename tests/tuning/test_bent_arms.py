@@ -1,8 +1,10 @@
-"""Play and a fastest speed of an axis are fitted, whether arm.toml has them or not."""
+"""Play, a fastest speed and a sag of an axis are fitted, whether arm.toml has them or not."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -13,13 +15,15 @@ from tuning_runs import quietly
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
-def tuned(scenario: str, fix: tuple[str, ...] = (), **changes: float | None) -> pf.Tuning:
+def tuned(
+    scenario: str, fit: tuple[str, ...] = ("noise", "delay", "plant"), fix: tuple[str, ...] = (), **changes: Any
+) -> pf.Tuning:
     """A scenario's run, tuned from its own arm with ``changes`` of its axis."""
     made = pf.simulate(pf.Scenario.load(SCENARIOS / f"{scenario}.toml"))
     ((axis, model),) = made.config.arm.axes.items()
     arm = replace(made.config.arm, axes={axis: replace(model, **changes)})
     config = replace(made.config, arm=arm)
-    return quietly(lambda: pf.tune([made.run], config, fit=["noise", "delay", "plant"], fix=fix))
+    return quietly(lambda: pf.tune([made.run], config, fit=fit, fix=fix))
 
 
 def test_play_is_found_from_any_value() -> None:
@@ -40,6 +44,22 @@ def test_a_fastest_speed_is_found(degrees: float | None) -> None:
     found = tuned("saturating-servo", max_speed=degrees and degrees * 0.0174533)
     assert found.params["axes.joint.max_speed_deg_s"] == pytest.approx(365.0, rel=0.01)
     assert "max_speed_deg_s_ci95" in found.config.arm.to_toml()
+
+
+@pytest.mark.parametrize("knee", [None, 30.0])
+def test_a_sag_is_found(knee: float | None) -> None:
+    """The lever's knee at 40 degrees, where a line in two pieces through its true sag has it, and the slope beyond.
+
+    Below the knee that line is the gain, 0.98, and beyond it goes 0.88 / 0.98 times as far.
+    """
+    sag = knee and pf.Sag(knee=math.radians(knee), slope_beyond=-0.05)
+    found = tuned("sagging-lever", ("noise", "delay", "plant", "gain"), sag=sag)
+    (at, beyond) = (found.params[f"axes.lever.sag.{key}"] for key in ("knee_deg", "slope_beyond"))
+    made = found.config.arm.axes["lever"].sag
+    assert made is not None and made.knee_ci95 is not None and made.slope_beyond_ci95 is not None
+    assert math.degrees(made.knee_ci95[0]) < 0.98 * 40.0 < at < math.degrees(made.knee_ci95[1]) < 45.0
+    assert made.slope_beyond_ci95[0] < 0.88 / 0.98 - 1.0 < made.slope_beyond_ci95[1] < 0.8 * beyond
+    assert ("sag: above about" in found.details.orders["lever"]) == (knee is None)
 
 
 @pytest.mark.long

@@ -110,8 +110,8 @@ def fitting() -> Generator[Progress]:
 
 
 def show_lags(summary: TuningSummary, period: float) -> None:
-    """Print the lags, and play and fastest speeds where there are any; period [s]."""
-    bends = [_row(one) for one in summary.parameters if one.key.rpartition(".")[2].startswith(tuple(BENDS))]
+    """Print the lags, and play, fastest speeds and sags where there are any; period [s]."""
+    bends = [_row(one) for one in summary.parameters if any(f".{bend}" in one.key for bend in (*BENDS, "sag"))]
     print_tables([table(_HEADINGS, [*_lags(summary), *bends])])
     typer.echo(formatting.lag(period))
 
