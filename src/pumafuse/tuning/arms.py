@@ -305,10 +305,7 @@ class Measured:
         left, parts = self.residuals(arm), list[Recording]()
         for one, mine in zip(self.recordings, left, strict=True):
             white, _ = self._white(one, rest, mine[None])
-            far = np.abs(white[0]) > gate
-            begins = np.flatnonzero(np.append(True, far[1:] != far[:-1]))
-            in_a_row = np.repeat(np.diff(begins, append=len(far)), np.diff(begins, append=len(far)))
-            parts.append(one._replace(weight=np.where(far & (in_a_row <= _FEW), 0.0, one.weight)))
+            parts.append(one._replace(weight=np.where(lonely(np.abs(white[0]) > gate), 0.0, one.weight)))
         return self.of(parts)
 
     def excerpt(self, commands: int, rows: int) -> Measured:
@@ -500,6 +497,13 @@ class Measured:
             at(noise), len(one.time), at(one.time), at(variance), len(columns), at(columns), at(white), at(log)
         )
         return white, float(log[0])
+
+
+def lonely(far: BoolArray) -> BoolArray:
+    """Which of some rows are but a few in a row, (n,)."""
+    begins = np.flatnonzero(np.append(True, far[1:] != far[:-1]))
+    in_a_row = np.repeat(np.diff(begins, append=len(far)), np.diff(begins, append=len(far)))
+    return far & (in_a_row <= _FEW)
 
 
 def _liveliest(one: Recording, most: int) -> Recording:

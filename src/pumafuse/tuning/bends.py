@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..units import Screen
-from .arms import BENDS, BEYOND, SAG, Arm, Limits, Measured, Recording
+from .arms import BENDS, BEYOND, SAG, Arm, Limits, Measured, Recording, lonely
 from .plain import FOLLOWS, PlainArm, independent
 
 _ANY = {"delay": (0.0, 10.0), "lag": (1e-4, 4.0), "damping": (0.2, 8.0), "gain": (0.3, 3.0)}
@@ -26,6 +26,7 @@ _EARLIER = (0.0, 0.6)  # starts: of a first-order arm's dead time, what is lag o
 _FEWEST = 20  # measurements of each half: four for each number that is fitted
 _FASTEST = 0.98  # of the time it goes no faster
 _KNEES = np.linspace(0.05, 0.95, 25)  # of the time the axis is lower
+_MANY = 1.02  # times those that are near the linear arm
 _COORDINATES = {"play": ("play",), "max_speed": ("max_speed",), "sag": SAG}  # of each bend
 
 
@@ -94,7 +95,7 @@ class _Search:
     """Arms of least squares with and without bends, of all of the motion and of its halves."""
 
     def __init__(self, plain: PlainArm, given: Arm, free: Collection[str]) -> None:
-        self.measured, self._names = plain.measured, [name for name in _ANY if name in free]
+        self.measured, self._names = _looked_at(plain), [name for name in _ANY if name in free]
         told = np.concatenate([one.command for one in self.measured.recordings])
         knees = float(told.min()), float(told.max())
         self._limits = Limits({**_ANY, **BENDS, "knee": knees, "beyond": BEYOND}, {})
@@ -164,6 +165,16 @@ class _Search:
             second = first._replace(delay=first.delay - by, lag=first.lag + by, damping=1.0)
             found.append(measured.fitted(second, [*names, "damping"], self._rest, self._limits))
         return max(found, key=lambda one: one.log_posterior).arm
+
+
+def _looked_at(plain: PlainArm) -> Measured:
+    """What least squares look at, with what is far from a linear arm for many rows: it may be where a load holds it."""
+    parts = list[Recording]()
+    for one, near in zip(plain.whole.recordings, plain.measured.recordings, strict=True):
+        far = (one.weight > 0.0) & (near.weight == 0.0)
+        parts.append(one._replace(weight=np.where(lonely(far), 0.0, one.weight)))
+    found = plain.whole.of(parts)
+    return found if found.count > _MANY * plain.measured.count else plain.measured
 
 
 def _fastest(measured: Measured, arm: Arm) -> float:

@@ -65,6 +65,7 @@ class PlainArm(NamedTuple):
         delayed: By how much the command alone is to be delayed to leave the least [s].
         delayed_off: How far that is off where the axis moves [m]; four fifths of the measurements are nearer.
         measured: What was looked at, without outliers.
+        whole: With them.
         step: That it is another one in the second part of the run, where that leaves much less.
     """
 
@@ -73,6 +74,7 @@ class PlainArm(NamedTuple):
     delayed: float
     delayed_off: float
     measured: Measured
+    whole: Measured
     step: LagStep | None = None
 
 
@@ -96,7 +98,7 @@ def independent(left: FloatArray) -> float:
 def plain_arm(measured: Measured) -> PlainArm | None:
     """The arm that leaves the least squares, without outliers; None where nothing follows the commands."""
     begin = min((int(one.given[0]) for one in measured.recordings), default=0)
-    measured = measured.excerpt(COMMANDS, ROWS)
+    measured = whole = measured.excerpt(COMMANDS, ROWS)
     if measured.count < 2 * _FEWEST or not any(np.ptp(one.command) > 0.0 for one in measured.recordings):
         return None
     late, rest = delays(measured).tolist(), measured.white(Arm(0.0, float(LAGS[0])))
@@ -124,7 +126,8 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     commands = [Arm(delay, float(LAGS[0])) for delay in late]
     delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
     between = float(min(allowed)), float(max(allowed))
-    return PlainArm(arm, between, delayed.total, off(measured, delayed), measured, _lag_step(measured, arm, begin))
+    step = _lag_step(measured, arm, begin)
+    return PlainArm(arm, between, delayed.total, off(measured, delayed), measured, whole, step)
 
 
 def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
