@@ -58,15 +58,17 @@ struct Arm {
     double period;          // s
     Real max_speed;         // V [m/s]; 0: there is none
     Real half_play;         // h [m]
-    Real sag_offset, sag_slope, sag_knee, sag_slope_beyond;  // m, 1, m, 1
+    Real sag_offset, sag_slope, sag_knee, sag_slope_beyond, sag_knee_below, sag_slope_below;  // m, 1, m, 1, m, 1
     bool linear, sags;
 
     explicit Arm(const Axis<Real>& axis)
         : plant(axis), slope(axis.slope), intercept(axis.intercept), period(value_of(axis.period)),
           max_speed(axis.max_speed), half_play(0.5 * axis.play), sag_offset(axis.sag_offset),
-          sag_slope(axis.sag_slope), sag_knee(axis.sag_knee), sag_slope_beyond(axis.sag_slope_beyond) {
+          sag_slope(axis.sag_slope), sag_knee(axis.sag_knee), sag_slope_beyond(axis.sag_slope_beyond),
+          sag_knee_below(axis.sag_knee_below), sag_slope_below(axis.sag_slope_below) {
         linear = value_of(max_speed) == 0.0 && value_of(half_play) == 0.0;
-        sags = value_of(sag_offset) != 0.0 || value_of(sag_slope) != 0.0 || value_of(sag_slope_beyond) != 0.0;
+        sags = value_of(sag_offset) != 0.0 || value_of(sag_slope) != 0.0 || value_of(sag_slope_beyond) != 0.0 ||
+               value_of(sag_slope_below) != 0.0;
         lag = plant.order == 1 ? axis.time_constant : 2.0 * axis.damping / axis.natural_frequency;
         farthest = value_of(max_speed) > 0.0 ? value_of(lag * max_speed) : std::numeric_limits<double>::infinity();
         fast = value_of(plant.order == 1 ? plant.rate : plant.omega);
@@ -82,9 +84,13 @@ struct Arm {
     // How far the tool hangs at a position p [m] as logged, and how that changes with p.
     Real sag(const Real& p) const {
         const Real at = sag_offset + sag_slope * p;
-        return value_of(p) > value_of(sag_knee) ? at + (sag_slope_beyond - sag_slope) * (p - sag_knee) : at;
+        if (value_of(p) > value_of(sag_knee)) return at + (sag_slope_beyond - sag_slope) * (p - sag_knee);
+        return value_of(p) < value_of(sag_knee_below) ? at + (sag_slope_below - sag_slope) * (p - sag_knee_below) : at;
     }
-    Real sag_rate(const Real& p) const { return value_of(p) > value_of(sag_knee) ? sag_slope_beyond : sag_slope; }
+    Real sag_rate(const Real& p) const {
+        if (value_of(p) > value_of(sag_knee)) return sag_slope_beyond;
+        return value_of(p) < value_of(sag_knee_below) ? sag_slope_below : sag_slope;
+    }
 
     // The drive over dt, and what is left of the tool's slack (tool less drive) behind it.
     void move(Drive<Real>& d, Real& slack, const Real& dt) const {

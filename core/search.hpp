@@ -107,7 +107,7 @@ inline void weigh(const pf_axis& axis, const Whitening& whitening, Time commands
     };
     of(1.0, plain);
     const bool straight = axis.max_speed == 0.0 && axis.play == 0.0 && axis.sag_offset == 0.0 &&
-                          axis.sag_slope == 0.0 && axis.sag_slope_beyond == 0.0;
+                          axis.sag_slope == 0.0 && axis.sag_slope_beyond == 0.0 && axis.sag_slope_below == 0.0;
     if (straight && axis.slope == 0.0 && axis.recovery == 0.0) more = plain;
     else {
         of(2.0, more);

@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 8              /* of this interface: a program and its library must agree */
+#define PF_VERSION 9              /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -56,6 +56,7 @@ typedef struct {
     double play;                           /* between drive and tool [m] */
     double sag_offset, sag_slope;          /* where the tool hangs at a level p as logged: offset + slope p [m, 1] */
     double sag_knee, sag_slope_beyond;     /* level [m] above which the slope is this one */
+    double sag_knee_below, sag_slope_below; /* level [m] below which the slope is this one */
     double input_noise, drift;             /* densities: white noise on the input [m/sqrt(Hz)]; offset [m/sqrt(s)] */
     double maneuver_noise, maneuver_drift; /* what each m/s of maneuver adds to them, likewise */
     double disturbance_sd, disturbance_time; /* [m], 0: there is none; [s] */

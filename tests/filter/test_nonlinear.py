@@ -23,7 +23,7 @@ from pumafuse.model.plants import PLANTS
 MS = 1_000_000  # ns
 PERIOD, DELAY, START = 0.028, 0.06, 0.5
 PAPER = Gain(slope=0.1, intercept=0.9)
-CURVE = Sag(offset=0.002, slope=-0.05, knee=0.49, slope_beyond=0.1)
+CURVE = Sag(offset=0.002, slope=-0.05, knee=0.47, slope_beyond=0.1, knee_below=0.45, slope_below=-0.4)
 changed = msgspec.structs.replace
 KNOWN: dict[str, PLANTS] = {
     "first order": FirstOrder(time_constant=0.0425),
@@ -155,7 +155,7 @@ def test_it_settles_however_long_it_rests(plant: PLANTS, recovery: float | None)
 
 
 def test_a_load_holds_the_tool_off_by_where_it_is() -> None:
-    """A line in two pieces of the position as commanded, added to the response, also at rest before any command."""
+    """A line in three pieces of the position as commanded, added to the response, also at rest before any command."""
     given, command = random_walk(1)
     time = np.arange(0, int(given[-1]), 7 * MS)
     axis = AxisModel(plant=KNOWN["critical"], gain=PAPER, play=0.003, max_speed=0.3)
@@ -163,9 +163,10 @@ def test_a_load_holds_the_tool_off_by_where_it_is() -> None:
     expected = straight + CURVE.at(START + straight)
     np.testing.assert_allclose(moved(changed(axis, sag=CURVE), given, command, time), expected, rtol=0.0, atol=1e-15)
     p = START + straight
-    by_hand = np.where(p < 0.49, 0.002 - 0.05 * p, 0.002 - 0.05 * 0.49 + 0.1 * (p - 0.49))
+    middle = np.clip(p, 0.45, 0.47)
+    by_hand = 0.002 - 0.05 * middle + 0.1 * np.maximum(p - 0.47, 0.0) - 0.4 * np.minimum(p - 0.45, 0.0)
     np.testing.assert_allclose(CURVE.at(p), by_hand, rtol=0.0, atol=1e-15)
-    assert (p < 0.49).any() and (p > 0.49).any()
+    assert (p < 0.45).any() and (p == middle).any() and (p > 0.47).any()
 
 
 @settings(max_examples=60)
@@ -187,7 +188,8 @@ def test_followed_in_pieces_it_is_the_same_to_the_bit(
         assert follow(record, motion, given[:0], nothing, time[place : place + 1])[0] == found[place]
 
 
-BENDS: dict[str, Any] = {"max_speed": 0.31, "play": 0.0021, "sag": CURVE}
+LOWER = changed(CURVE, knee=0.4, knee_below=0.35)  # of a walk that goes down
+BENDS: dict[str, Any] = {"max_speed": 0.31, "play": 0.0021, "sag": LOWER}
 
 
 @pytest.mark.parametrize("plant", [KNOWN["first order"], KNOWN["under-damped"]], ids=["first order", "under-damped"])
@@ -212,8 +214,10 @@ def test_derivatives_are_those_of_the_innovations(plant: PLANTS) -> None:
         for at in [DELAY if key == "delay" else BENDS[key]]
     ]
     gains = (changed(PAPER, intercept=0.9 + sign * 1e-6) for sign in (-1, 1))
-    sags = (changed(CURVE, slope=-0.05 + sign * 1e-6) for sign in (-1, 1))
-    beside += [(*(with_axis(gain=one) for one in gains), 2e-6), (*(with_axis(sag=one) for one in sags), 2e-6)]
+    beside += [(*(with_axis(gain=one) for one in gains), 2e-6)]
+    for key in ("slope", "knee", "slope_beyond", "knee_below", "slope_below"):
+        sags = (changed(LOWER, **{key: getattr(LOWER, key) + sign * 1e-6}) for sign in (-1, 1))
+        beside.append((*(with_axis(sag=one) for one in sags), 2e-6))
     _, d_nu, _ = linearised(segment, config, outcome, beside)
     fused = segment.measurement_rows.known[:, 0] == pf.Outcome.FUSED
     for found, (low, high, width) in zip(d_nu[:, fused, 0], beside, strict=True):

@@ -133,7 +133,7 @@ def logged(
 @st.composite
 def bends(draw: st.DrawFn) -> dict[str, object]:
     """A fastest speed, play and sag, one of them at least."""
-    curve = pf.Sag(offset=1e-3, slope=-0.05, knee=0.5, slope_beyond=0.1)
+    curve = pf.Sag(offset=1e-3, slope=-0.05, knee=0.5, slope_beyond=0.1, knee_below=0.49, slope_below=-0.9)
     one = {
         "max_speed": some(draw, 0.01, 0.05),
         "play": some(draw, 0.2e-3, 3e-3),

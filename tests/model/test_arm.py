@@ -49,8 +49,9 @@ ascending = st.none() | st.tuples(finite, finite).map(lambda ends: (min(ends), m
 gains = st.builds(Gain, slope=finite, intercept=finite, slope_ci95=interval, intercept_ci95=ascending)
 slopes = st.floats(-1.0, 1e3, exclude_min=True)
 sags = st.builds(Sag, offset=finite, slope=slopes) | st.builds(
-    Sag, offset=finite, slope=slopes, knee=finite, slope_beyond=slopes
-)
+    lambda ends, **slopes: Sag(knee_below=min(ends), knee=max(ends), **slopes),
+    st.tuples(finite, finite), offset=finite, slope=slopes, slope_beyond=slopes, slope_below=slopes,
+)  # fmt: skip
 first_order = st.builds(FirstOrder, time_constant=positive, time_constant_ci95=interval)
 second_order = st.builds(
     SecondOrder,
@@ -207,6 +208,13 @@ REFUSED = {
     "play that is no number": ("42.5", "42.5\nplay_mm = nan", "axes.radial.play_mm", "not a finite number"),
     "unknown key of a sag": ("42.5", "42.5\nsag = { knee = 3.0 }", "'axes.radial.sag.knee'", "knee_mm"),
     "a tool that goes backwards": ("42.5", "42.5\nsag = { slope = -1.0 }", "axes.radial.sag.slope", "> -1"),
+    "a slope without a knee": ("42.5", "42.5\nsag = { slope_below = 0.1 }", "sag: knee_below", "slope_below"),
+    "knees that have changed places": (
+        "42.5",
+        "42.5\nsag = { knee_mm = 3.0, slope_beyond = 0.1, knee_below_mm = 4.0, slope_below = 0.1 }",
+        "sag: knee_below",
+        "above the knee",
+    ),
     "a knee without a slope": ("42.5", "42.5\nsag = { knee_mm = 3.0 }", "sag: a knee", "slope_beyond"),
     "not TOML": ("name = ", "name = = ", "not valid TOML", ""),
 }  # fmt: skip

@@ -137,6 +137,35 @@ def test_a_sag_is_found(seed: int, beyond: float) -> None:
     assert bent.off < 0.95 * bent.linear_off
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_stops_on_both_sides_are_found(seed: int) -> None:
+    """At -0.5 and 0.6 of the range, where a servo stalls; both within 2 % of it, and no play."""
+    knees = {"knee": 0.6 * RANGE, "beyond": -0.95, "knee_below": -0.5 * RANGE, "below": -0.95}
+    bent = found(seed, arm_of(seed, **knees))
+    assert bent is not None and bent.arm.play == 0.0
+    assert bent.arm.knee == pytest.approx(0.6 * RANGE, abs=0.02 * 2.0 * RANGE)
+    assert bent.arm.knee_below == pytest.approx(-0.5 * RANGE, abs=0.02 * 2.0 * RANGE)
+    assert max(bent.arm.beyond, bent.arm.below) < -0.9
+    assert bent.off < 0.5 * bent.linear_off
+
+
+def test_what_holds_for_many_rows_is_looked_at() -> None:
+    """Rows at a stop, which are far from a linear arm, are no outliers, and each hundredth row, which is off, is one."""
+    true = arm_of(2, knee=0.6 * RANGE, beyond=-0.95)
+    recorded = measured(2, true)
+    (one,) = recorded.recordings
+    held = one.value > 0.58 * RANGE
+    off = ~held & (np.arange(len(one.time)) % 100 == 0)
+    recorded = recorded.of([one._replace(value=one.value + 3.0 * RANGE * off)])
+    plain = plain_arm(recorded)
+    assert plain is not None and plain.measured.count < plain.whole.count == recorded.count
+    plain = plain._replace(measured=recorded.of([one._replace(weight=np.where(held | off, 0.0, 1.0))]))
+    bent = bent_arm(plain, Arm(0.0, 0.1), FREE)
+    assert bent is not None
+    assert bent.arm.knee == pytest.approx(0.6 * RANGE, abs=0.02 * 2.0 * RANGE)
+    assert bent.arm.beyond == pytest.approx(-0.95, abs=0.05)
+
+
 def test_a_load_that_is_known_is_not_looked_for() -> None:
     """Its knee is in the responses already."""
     true = arm_of(5, knee=0.2 * RANGE, beyond=-0.5)

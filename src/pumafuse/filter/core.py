@@ -20,7 +20,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
 from ..errors import PumafuseError
 from .events import Events, Results
 
-VERSION = 8  # of the interface
+VERSION = 9  # of the interface
 FINEST = 1e-9  # PF_FINEST
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
@@ -33,6 +33,7 @@ def _numbers(*names: str) -> np.dtype[np.void]:
 AXIS = _numbers(
     *("period", "delay", "time_constant", "natural_frequency", "damping", "slope", "intercept", "recovery"),
     *("max_speed", "play", "sag_offset", "sag_slope", "sag_knee", "sag_slope_beyond"),
+    *("sag_knee_below", "sag_slope_below"),
     *("input_noise", "drift", "maneuver_noise", "maneuver_drift"),
     *("disturbance_sd", "disturbance_time", "smoothness", "offset_sd", "lag_sd", "gain_sd", "start"),
 )

@@ -92,10 +92,12 @@ class Bent:
     def motion(self, goal: float) -> FloatArray:
         """Position and speed of the tool, which rests while the drive does not push it, (2,)."""
         axis, speed, level = self.axis, self.speed(self.state, goal), float(self.axis["start"]) + self.tool
-        beyond = level > axis["sag_knee"]
-        slope = axis["sag_slope_beyond"] if beyond else axis["sag_slope"]
-        sag = axis["sag_offset"] + axis["sag_slope"] * level
-        sag += (axis["sag_slope_beyond"] - axis["sag_slope"]) * (level - axis["sag_knee"]) * beyond
+        slope, knee = axis["sag_slope"], level
+        if level > axis["sag_knee"]:
+            slope, knee = axis["sag_slope_beyond"], axis["sag_knee"]
+        elif level < axis["sag_knee_below"]:
+            slope, knee = axis["sag_slope_below"], axis["sag_knee_below"]
+        sag = axis["sag_offset"] + axis["sag_slope"] * knee + slope * (level - knee)
         x = float(self.state[0])
         rests = self.tool not in (x - self.half, x + self.half) or (self.tool - x) * speed > 0.0
         return np.array((self.tool + sag, 0.0 if rests else speed * (1.0 + slope)))

@@ -30,6 +30,8 @@ def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Rec
     if (sag := axis.sag) is not None:
         found["sag_offset"], found["sag_slope"], found["sag_knee"] = sag.offset, sag.slope, sag.knee or 0.0
         found["sag_slope_beyond"] = sag.slope if sag.slope_beyond is None else sag.slope_beyond
+        found["sag_knee_below"] = sag.knee_below or 0.0
+        found["sag_slope_below"] = sag.slope if sag.slope_below is None else sag.slope_below
     return found
 
 

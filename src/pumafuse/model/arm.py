@@ -45,34 +45,48 @@ class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class Sag(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How far a static load holds the tool off, by its position p as commanded: a line, or one in two pieces.
+    """How far a load or a stop holds the tool off, by its position p as commanded: a line in up to three pieces.
 
     Attributes:
         offset: At p = 0 [m or rad], along the line that holds there below the knee.
         slope: What each 1 of p adds.
         knee: The p [m or rad] above which another slope holds; None: none does.
         slope_beyond: The slope there.
+        knee_below: The p [m or rad] below which another slope holds; None: none does.
+        slope_below: The slope there.
         knee_ci95: The knee's 95 % interval [m or rad], if it was fitted.
         slope_beyond_ci95: That of the slope beyond.
+        knee_below_ci95: That of the knee below.
+        slope_below_ci95: That of the slope below.
     """
 
     offset: float = msgspec.field(name="offset_mm", default=0.0)
     slope: Slope = 0.0
     knee: float | None = msgspec.field(name="knee_mm", default=None)
     slope_beyond: Slope | None = None
+    knee_below: float | None = msgspec.field(name="knee_below_mm", default=None)
+    slope_below: Slope | None = None
     knee_ci95: Interval | None = msgspec.field(name="knee_mm_ci95", default=None)
     slope_beyond_ci95: Interval | None = None
+    knee_below_ci95: Interval | None = msgspec.field(name="knee_below_mm_ci95", default=None)
+    slope_below_ci95: Interval | None = None
 
     def __post_init__(self) -> None:
         if (self.knee is None) != (self.slope_beyond is None):
             raise ConfigError("sag: a knee and slope_beyond belong together")
+        if (self.knee_below is None) != (self.slope_below is None):
+            raise ConfigError("sag: knee_below and slope_below belong together")
+        if self.knee is not None and self.knee_below is not None and self.knee_below > self.knee:
+            raise ConfigError("sag: knee_below is above the knee")
 
     def at(self, position: FloatArray) -> FloatArray:
         """Off by how much [m or rad] at positions as commanded; the shape of ``position``."""
         line = self.offset + self.slope * position
-        if self.knee is None or self.slope_beyond is None:
-            return line
-        return line + (self.slope_beyond - self.slope) * np.maximum(position - self.knee, 0.0)
+        if self.knee is not None and self.slope_beyond is not None:
+            line = line + (self.slope_beyond - self.slope) * np.maximum(position - self.knee, 0.0)
+        if self.knee_below is not None and self.slope_below is not None:
+            line = line + (self.slope_below - self.slope) * np.minimum(position - self.knee_below, 0.0)
+        return line
 
 
 class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from msgspec.structs import replace
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..filter.core import AXIS, Record, at, library
@@ -45,7 +46,7 @@ _SHIFT, _LOG_SHIFT = 1e-4, 1e-3  # s, 1: by which responses are varied; delays a
 # longest step of each coordinate; a slope is linear, and its unit is of any size
 _REACH = {
     "delay": 0.03, "lag": 0.7, "damping": 0.7, "recovery": 0.7, "gain": 1.0, "slope": math.inf,
-    "play": 0.7, "max_speed": 0.3, "knee": math.inf, "beyond": 0.3,
+    "play": 0.7, "max_speed": 0.3, "knee": math.inf, "beyond": 0.3, "knee_below": math.inf, "below": 0.3,
 }  # fmt: skip
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -54,8 +55,8 @@ Coordinates: TypeAlias = Sequence[str]  # among the fields below
 # what no matrix does, and no kind of plant has: bounds in m and m/s
 BENDS = {"play": (1e-6, 1.0), "max_speed": (1e-3, 100.0)}
 LOGARITHMIC = ("lag", "damping", "recovery", *BENDS)
-SAG = ("knee", "beyond")  # of a line in two pieces; the first is the gain
-BEYOND = (-0.98, 9.0)  # bounds of its slope
+SAG = ("knee", "beyond", "knee_below", "below")  # of a line in pieces, one of which is the gain
+BEYOND = (-0.98, 9.0)  # bounds of the slope of another
 
 
 class Recording(NamedTuple):
@@ -123,6 +124,7 @@ class Arm(NamedTuple):
         max_speed: The fastest that the drive goes [m/s]; 0: as fast as it is asked to.
         knee: Level above which a load holds the tool off [m], as logged.
         beyond: What each 1 above it adds; 0: none does.
+        knee_below, below: Likewise below a level.
     """
 
     delay: float
@@ -135,6 +137,8 @@ class Arm(NamedTuple):
     max_speed: float = 0.0
     knee: float = 0.0
     beyond: float = 0.0
+    knee_below: float = 0.0
+    below: float = 0.0
 
     @property
     def total(self) -> float:
@@ -143,7 +147,7 @@ class Arm(NamedTuple):
 
     @property
     def model(self) -> AxisModel:
-        """Plant, gain, fastest speed, play, and the knee of its sag."""
+        """Plant, gain, fastest speed, play, and the knees of its sag."""
         plant: FirstOrder | SecondOrder = FirstOrder(time_constant=self.lag)
         if self.damping:
             plant = SecondOrder(natural_frequency=2.0 * self.damping / self.lag, damping=self.damping)
@@ -154,16 +158,22 @@ class Arm(NamedTuple):
             gain_recovery=self.recovery or None,
             max_speed=self.max_speed or None,
             play=self.play or None,
-            sag=Sag(knee=self.knee, slope_beyond=self.beyond) if self.beyond else None,
+            sag=self.sag_beside(Sag()) if self.beyond or self.below else None,
         )
+
+    def sag_beside(self, given: Sag) -> Sag:
+        """Its knees, with the rest of a sag that is given."""
+        if self.beyond:
+            given = replace(given, knee=self.knee, slope_beyond=self.beyond)
+        return replace(given, knee_below=self.knee_below, slope_below=self.below) if self.below else given
 
     @classmethod
     def of(cls, axis: AxisModel, delay: float) -> Arm:
         """That of an axis's model and its dead time [s]."""
         damping = axis.plant.damping if isinstance(axis.plant, SecondOrder) else 0.0
         gain, bends = axis.gain, (axis.play or 0.0, axis.max_speed or 0.0)
-        if axis.sag is not None and axis.sag.knee is not None and axis.sag.slope_beyond is not None:
-            bends = *bends, axis.sag.knee, axis.sag.slope_beyond
+        sag = axis.sag or Sag()
+        bends += tuple(one or 0.0 for one in (sag.knee, sag.slope_beyond, sag.knee_below, sag.slope_below))
         return cls(delay, axis.plant.lag, damping, axis.gain_recovery or 0.0, gain.intercept, gain.slope, *bends)
 
     def coordinate(self, name: str) -> float:
@@ -444,7 +454,7 @@ class Measured:
         return found
 
     def _is_linear(self, arm: Arm) -> bool:
-        return not any((arm.play, arm.max_speed, arm.beyond)) and not self.sags
+        return not any((arm.play, arm.max_speed, arm.beyond, arm.below)) and not self.sags
 
     @property
     def sags(self) -> bool:
@@ -471,7 +481,7 @@ class Measured:
     def _records(self, arms: Sequence[Arm]) -> Record:
         """Arms as the core takes them, (n,)."""
         found, columns = np.zeros(len(arms), AXIS), np.array(arms).T
-        delay, lag, damping, recovery, gain, slope, play, max_speed, knee, beyond = columns
+        delay, lag, damping, recovery, gain, slope, play, max_speed, *sag = columns
         if self._known is not None:
             found[:] = record_of(self._known, self.period, 0.0, 0.0)
         found["period"], found["delay"] = self.period, delay
@@ -479,8 +489,9 @@ class Measured:
         found["natural_frequency"], found["damping"] = 2.0 * damping / lag, damping
         found["slope"], found["intercept"], found["recovery"] = slope, gain, recovery
         found["play"], found["max_speed"] = play, max_speed
-        bent = beyond != 0.0
-        found["sag_knee"][bent], found["sag_slope_beyond"][bent] = knee[bent], beyond[bent]
+        for name, knee, other in (("beyond", *sag[:2]), ("below", *sag[2:])):
+            where, bent = f"sag_knee{'_below' * (name == 'below')}", other != 0.0
+            found[where][bent], found[f"sag_slope_{name}"][bent] = knee[bent], other[bent]
         return found
 
     def _variance(self, one: Recording, rest: Rest) -> FloatArray:

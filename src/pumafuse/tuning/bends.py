@@ -6,8 +6,9 @@ likelihood of that motion cannot tell them apart; another part of it can.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
-from itertools import product
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,8 @@ _FEWEST = 20  # measurements of each half: four for each number that is fitted
 _FASTEST = 0.98  # of the time it goes no faster
 _KNEES = np.linspace(0.05, 0.95, 25)  # of the time the axis is lower
 _MANY = 1.02  # times those that are near the linear arm
-_COORDINATES = {"play": ("play",), "max_speed": ("max_speed",), "sag": SAG}  # of each bend
+_KINDS = (("play", "max_speed", "sag"), ("stops",))  # of bends; sags have one knee, stops one on each side
+_SAGS = ("sag", "stops")
 
 
 class Bent(NamedTuple):
@@ -48,9 +50,11 @@ class Bent(NamedTuple):
         play, fastest = (one * screen.scale for one in (self.arm.play, self.arm.max_speed))
         found = [f"play: about {play:.3g} {screen.unit}"] if play else []
         found += [f"fastest speed: about {fastest:.4g} {screen.unit}/s"] if fastest else []
-        if self.arm.beyond:
-            knee, share = self.arm.knee * screen.scale, 1.0 + self.arm.beyond
-            found.append(f"sag: above about {knee:.3g} {screen.unit} it moves {share:.3g} times as far as below")
+        sides = ("above", self.arm.knee, self.arm.beyond), ("below", self.arm.knee_below, self.arm.below)
+        for where, knee, slope in sides:
+            if slope:
+                times = f"{1.0 + slope:.3g} times as far as elsewhere"
+                found.append(f"sag: {where} about {knee * screen.scale:.3g} {screen.unit} it moves {times}")
         off, linear = self.off * screen.scale, self.linear_off * screen.scale
         return [*found, f"with it {off:.3g} {screen.unit} off where it was not fitted, without it {linear:.3g}"]
 
@@ -68,27 +72,26 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
         return None
     chosen: list[str] = []
     squares: list[FloatArray] = []  # that are left without a bend, with one, with two, …
-    while kinds := _kinds(search, chosen, free):
-        squares = squares or [search.off([])]
-        tried = {kind: search.off([*chosen, kind]) for kind in kinds}
-        best = min(kinds, key=lambda kind: float(tried[kind].sum()))
-        if tried[best].sum() > _PAYS * squares[-1].sum() or np.any(tried[best] > _SEEMS * squares[-1]):
-            break
-        left = search.measured.left(search.fitted(search.measured, [*chosen, best]))
-        if squares[-1].sum() - tried[best].sum() < FOLLOWS / independent(left) * tried[best].sum():
-            break  # an error that goes on for long is alike in both halves, and by chance like play
-        chosen.append(best)
-        squares.append(tried[best])
+    for kinds in _KINDS:
+        while tried := {kind: search.off(_beside(chosen, kind)) for kind in kinds if search.seems(kind, chosen)}:
+            squares = squares or [search.off([])]
+            best = min(tried, key=lambda kind: float(tried[kind].sum()))
+            if tried[best].sum() > _PAYS * squares[-1].sum() or np.any(tried[best] > _SEEMS * squares[-1]):
+                break
+            left = search.measured.left(search.fitted(search.measured, _beside(chosen, best)))
+            if squares[-1].sum() - tried[best].sum() < FOLLOWS / independent(left) * tried[best].sum():
+                break  # an error that goes on for long is alike in both halves, and by chance like play
+            chosen = _beside(chosen, best)
+            squares.append(tried[best])
     if not chosen:
         return None
     linear, bent = (float(np.sqrt(one.mean())) for one in (squares[0], squares[-1]))
     return Bent(search.fitted(search.measured, chosen), bent, linear)
 
 
-def _kinds(search: _Search, chosen: Sequence[str], free: Collection[str]) -> list[str]:
-    """The bends that are worth a trial beside those that are chosen."""
-    tried = [*chosen, "sag"] if search.measured.sags else chosen
-    return [kind for kind in _COORDINATES if kind in free and kind not in tried and search.seems(kind, chosen)]
+def _beside(chosen: Sequence[str], kind: str) -> list[str]:
+    """One bend more; of sags there is one."""
+    return [*(one for one in chosen if one not in _SAGS or kind not in _SAGS), kind]
 
 
 class _Search:
@@ -97,24 +100,31 @@ class _Search:
     def __init__(self, plain: PlainArm, given: Arm, free: Collection[str]) -> None:
         self.measured, self._names = _looked_at(plain), [name for name in _ANY if name in free]
         told = np.concatenate([one.command for one in self.measured.recordings])
-        knees = float(told.min()), float(told.max())
-        self._limits = Limits({**_ANY, **BENDS, "knee": knees, "beyond": BEYOND}, {})
+        self._low, self._high = float(told.min()), float(told.max())
+        self._middle = 0.5 * (self._low + self._high)
+        sag = {name: (self._low, self._high) if name.startswith("knee") else BEYOND for name in SAG}
+        self._limits = Limits({**_ANY, **BENDS, **sag}, {})
         self._rest = self.measured.white(plain.arm)
         self._start = given._replace(delay=plain.arm.delay, lag=plain.arm.lag, play=0.0, max_speed=0.0)
         if "gain" in free:
             self._start = self._start._replace(gain=plain.arm.gain, recovery=0.0, slope=0.0)
         self._starts: dict[str, dict[str, float]] = {}
+        self._free = free
         self.halves = _halves(self.measured)
 
-    def seems(self, kind: str, beside: Sequence[str]) -> bool:
-        """Whether one bend more leaves less of all of the motion; fits begin from the best of a rough grid."""
-        arm = self.fitted(self.measured, beside)
-        start = self._knee(arm) if kind == "sag" else self._size(kind, arm)
+    def seems(self, kind: str, chosen: Sequence[str]) -> bool:
+        """Whether a bend that is free leaves less of all of the motion; fits begin from the best of a rough grid."""
+        is_sag = kind in _SAGS
+        if kind in chosen or (is_sag and self.measured.sags) or ("sag" if is_sag else kind) not in self._free:
+            return False
+        beside = _beside(chosen, kind)
+        arm = self.fitted(self.measured, beside[:-1])
+        start = self._knees(arm, 1 if kind == "sag" else 2) if is_sag else self._size(kind, arm)
         if not start:
             return False
         self._starts[kind] = start
-        bent = self.fitted(self.measured, [*beside, kind])
-        return _square(self.measured, bent) < _SEEMS * _square(self.measured, arm)
+        square = _square(self.measured, self.fitted(self.measured, chosen))
+        return _square(self.measured, self.fitted(self.measured, beside)) < _SEEMS * square
 
     def _size(self, kind: str, arm: Arm) -> dict[str, float]:
         """The likeliest play or fastest speed on a rough grid; none where all that may be is too small."""
@@ -127,25 +137,31 @@ class _Search:
         log, _ = self.measured.weighed(arms, self._rest, self._limits)
         return {kind: getattr(arms[int(np.argmax(log))], kind)}
 
-    def _knee(self, arm: Arm) -> dict[str, float]:
-        """The line in two pieces that explains most of what an arm leaves at its levels; none where that is little."""
+    def _knees(self, arm: Arm, count: int) -> dict[str, float]:
+        """The line with so many knees that explains most of what an arm leaves; none where that is little.
+
+        One of its pieces is the gain: the middle one, or of two that whose gain is nearer to 1.
+        """
         level, left = _levels(self.measured, arm), self.measured.left(arm)
-        sums, lines = list[float](), list[list[float]]()
-        knees = np.quantile(level, _KNEES)
-        for knee in knees:
-            columns = np.column_stack([np.ones(len(level)), level, np.maximum(level - knee, 0.0)])
+        found = list[tuple[float, list[float], tuple[float, ...]]]()
+        for knees in combinations(np.quantile(level, _KNEES).tolist(), count):
+            if count == 2 and not knees[0] <= self._middle <= knees[1]:
+                continue
+            columns = np.column_stack([np.ones(len(level)), level, *(np.maximum(level - knee, 0.0) for knee in knees)])
             line = np.linalg.lstsq(columns, left, rcond=None)[0]
-            lines.append(line.tolist())
-            sums.append(float(np.sum((left - columns @ line) ** 2)))
-        best = int(np.argmin(sums))
-        if sums[best] > _SEEMS * float(left @ left):
+            found.append((float(np.sum((left - columns @ line) ** 2)), line.tolist(), knees))
+        if not found or min(found)[0] > _SEEMS * float(left @ left):
             return {}
-        knee, (_, below, more) = float(knees[best]), lines[best]
-        if "gain" not in self._names or below <= BEYOND[0]:
-            return {"knee": knee, "beyond": min(max(more, BEYOND[0]), BEYOND[1])}
-        start, grown = self.measured.recordings[0].start, 1.0 + below  # so is the gain of the line below
-        beyond = min(max(more / grown, BEYOND[0]), BEYOND[1])
-        return {"gain": arm.gain * grown, "knee": start + (knee - start) * grown, "beyond": beyond}
+        _, line, knees = min(found)
+        gains = [arm.gain * max(1.0 + slope, 1e-3) for slope in np.cumsum(line[1:]).tolist()]
+        middle = 1 if count == 2 or abs(math.log(gains[1])) < abs(math.log(gains[0])) else 0
+        gain, start = gains[middle] if "gain" in self._names else arm.gain, self.measured.recordings[0].start
+        made = {"gain": gain} if "gain" in self._names else {}
+        for place, knee in enumerate(knees):
+            at, slope, piece = (*SAG[2:], place) if place < middle else (*SAG[:2], place + 1)
+            made[at] = start + (knee - start) * gain / arm.gain
+            made[slope] = min(max(gains[piece] / gains[middle] - 1.0, BEYOND[0]), BEYOND[1])
+        return made
 
     def off(self, kinds: Sequence[str]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
@@ -156,14 +172,18 @@ class _Search:
     def fitted(self, measured: Measured, kinds: Sequence[str]) -> Arm:
         """The arm of least squares with these bends, of first or second order."""
         start = self._start._replace(**{name: size for kind in kinds for name, size in self._starts[kind].items()})
-        bends = [name for kind in kinds for name in _COORDINATES[kind]]
+        bends = [name for kind in kinds for name in self._starts[kind] if name != "gain"]
         names: list[str] = [*(name for name in self._names if name != "damping"), *bends]
-        found = [measured.fitted(start._replace(damping=0.0), names, self._rest, self._limits)]
+        limits = self._limits
+        if "stops" in kinds:  # between them is the middle of what is commanded
+            sides = {"knee": (self._middle, self._high), "knee_below": (self._low, self._middle)}
+            limits = limits._replace(bounds={**limits.bounds, **sides})
+        found = [measured.fitted(start._replace(damping=0.0), names, self._rest, limits)]
         first = found[0].arm
         for earlier in _EARLIER if "damping" in self._names else ():  # dead time and plant make up for each other
             by = earlier * first.delay
             second = first._replace(delay=first.delay - by, lag=first.lag + by, damping=1.0)
-            found.append(measured.fitted(second, [*names, "damping"], self._rest, self._limits))
+            found.append(measured.fitted(second, [*names, "damping"], self._rest, limits))
         return max(found, key=lambda one: one.log_posterior).arm
 
 

@@ -213,6 +213,8 @@ _TABLE = (
     _line("plant", "axes.{axis}.play_mm", "arm.axes.{axis}.play", *BENDS["play"]),
     _line("plant", "axes.{axis}.sag.knee_mm", "arm.axes.{axis}.sag.knee", *_LEVELS, log=False, scale=0.1),
     _line("plant", "axes.{axis}.sag.slope_beyond", "arm.axes.{axis}.sag.slope_beyond", *BEYOND, log=False, scale=0.1),
+    _line("plant", "axes.{axis}.sag.knee_below_mm", "arm.axes.{axis}.sag.knee_below", *_LEVELS, log=False, scale=0.1),
+    _line("plant", "axes.{axis}.sag.slope_below", "arm.axes.{axis}.sag.slope_below", *BEYOND, log=False, scale=0.1),
     _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.5, 0.5, **_INTERCEPT),
     _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *RECOVERY, prior=RECOVERY_PRIOR),
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
@@ -315,7 +317,8 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
             config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
             for bend in BENDS:
                 config = changed(config, ("arm", "axes", axis, bend), 1.0)
-            config = changed(config, ("arm", "axes", axis, "sag"), Sag(knee=0.0, slope_beyond=-0.1))
+            both = Sag(knee=0.0, slope_beyond=-0.1, knee_below=0.0, slope_below=-0.1)
+            config = changed(config, ("arm", "axes", axis, "sag"), both)
         config = with_drifts(with_own_delays(config, sensors))
         keys |= {one.key for one in parameters(config, config, sensors, FITS)}
     for name in fixed:
@@ -431,9 +434,8 @@ def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> Fusion
 def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     """The configuration with another arm of an axis, and a delay of its own; a load that is given stays."""
     model, sag = arm.model, config.arm.axes[axis].sag or Sag()
-    if arm.beyond:
-        sag = msgspec.structs.replace(sag, knee=arm.knee, slope_beyond=arm.beyond)
-        config = changed(config, ("arm", "axes", axis, "sag"), sag)
+    if arm.beyond or arm.below:
+        config = changed(config, ("arm", "axes", axis, "sag"), arm.sag_beside(sag))
     for name in ("plant", "gain", "gain_recovery", *BENDS):
         config = changed(config, ("arm", "axes", axis, name), getattr(model, name))
     return changed(config, ("arm", "axes", axis, "delay"), arm.delay)
