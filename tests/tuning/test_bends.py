@@ -150,7 +150,7 @@ def test_stops_on_both_sides_are_found(seed: int) -> None:
 
 
 def test_what_holds_for_many_rows_is_looked_at() -> None:
-    """Rows at a stop, which are far from a linear arm, are no outliers, and each hundredth row, which is off, is one."""
+    """Rows at a stop, far from a linear arm, are no outliers; each hundredth row elsewhere, which is off, is one."""
     true = arm_of(2, knee=0.6 * RANGE, beyond=-0.95)
     recorded = measured(2, true)
     (one,) = recorded.recordings
