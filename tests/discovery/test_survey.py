@@ -716,6 +716,8 @@ def test_joints_are_known_by_their_names(axis: str, turns: bool) -> None:
         ("A1_Soll [°]", "a1", "deg"),
         ("m3", "m3", ""),
         ("range_mm", "position", "mm"),
+        ("command.arm_deg", "arm", "deg"),
+        ("robot.position_mm", "position", "mm"),
         ("position[肩]", "position", ""),
         ("position[start]", "start_axis", ""),
     ],

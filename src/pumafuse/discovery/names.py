@@ -246,7 +246,8 @@ def axis_of(column: str, labels: list[str]) -> str:
     kept = [_TRANSLATIONS.get(word, word) for word in kept]
     if kept and all(word.isdigit() for word in kept):
         kept = ["joint", *kept]
-    return plain("_".join(kept)) or "position"
+    named = leaf(column).rpartition(".")[2] if unit and "." in column else ""  # command.arm_deg is of the axis arm
+    return plain("_".join(kept)) or plain(named) or "position"
 
 
 def label_of(column: str, labels: list[str]) -> str | None:
