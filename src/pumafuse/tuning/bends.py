@@ -27,6 +27,7 @@ _EARLIER = (0.0, 0.6)  # starts: of a first-order arm's dead time, what is lag o
 _FEWEST = 20  # measurements of each half: four for each number that is fitted
 _FASTEST = 0.98  # of the time it goes no faster
 _KNEES = np.linspace(0.05, 0.95, 25)  # of the time the axis is lower
+_SLIGHT = 0.01  # of a slope that is no sag: of exact data any other slope explains something
 _MANY = 1.02  # times those that are near the linear arm
 _KINDS = (("play", "max_speed", "sag"), ("stops",))  # of bends; sags have one knee, stops one on each side
 _SAGS = ("sag", "stops")
@@ -123,8 +124,10 @@ class _Search:
         if not start:
             return False
         self._starts[kind] = start
-        square = _square(self.measured, self.fitted(self.measured, chosen))
-        return _square(self.measured, self.fitted(self.measured, beside)) < _SEEMS * square
+        bent, square = self.fitted(self.measured, beside), _square(self.measured, self.fitted(self.measured, chosen))
+        if is_sag and max(abs(bent.beyond), abs(bent.below)) < _SLIGHT:
+            return False
+        return _square(self.measured, bent) < _SEEMS * square
 
     def _size(self, kind: str, arm: Arm) -> dict[str, float]:
         """The likeliest play or fastest speed on a rough grid; none where all that may be is too small."""
