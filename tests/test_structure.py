@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any, get_args, get_type_hints
 import pytest
 
 import pumafuse as pf
+from pumafuse.cli.screen import say, say_json
 
 SOURCE = Path(pf.__file__).parent
 # each imports itself and those before it
@@ -114,3 +116,25 @@ def classes_of(hint: Any) -> Iterator[type]:
         yield hint
     for part in get_args(hint):
         yield from classes_of(part)
+
+
+def test_one_place_writes_text_to_the_terminal() -> None:
+    """Tables and lines of progress are rich's, which shows no control characters; all else is said by ``say``."""
+    called = {
+        path.relative_to(SOURCE).as_posix()
+        for path in SOURCE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in {"print", "typer.echo", "click.echo", "typer.secho"}
+    }
+    assert called == {"cli/screen.py"}
+
+
+def test_what_a_terminal_would_obey_is_not_said(capsys: pytest.CaptureFixture[str]) -> None:
+    """Escapes, a bell, an end of a page, marks of direction; JSON stays JSON, of the same text."""
+    text = "a\x1b[31m\x9b0m\x07\x0c\u202eb\n肩 ± ζ"
+    say(text)
+    assert capsys.readouterr().out == "a?[31m?0m???b\n肩 ± ζ\n"
+    say_json({"name": text})
+    out = capsys.readouterr().out
+    assert json.loads(out) == {"name": text}
+    assert all(one.isprintable() or one == "\n" for one in out)

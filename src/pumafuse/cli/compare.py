@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-import typer
 from rich.table import Table
 
 from .. import folders, toml
@@ -23,11 +22,11 @@ from ..fusion.score import OrientationScore, ReferenceTrack
 from ..fusion.summary import ScoreSummary
 from ..logs.frames import CARTESIAN
 from ..units import KINDS, SCREEN, Kind
+from .screen import say, say_json
 from .tables import (
     consistency_table,
     orientation_table,
     position,
-    print_json,
     print_tables,
     score_table,
     share_rejected,
@@ -84,7 +83,7 @@ def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | N
     if draw:
         _draw(compared, why)
     if json:
-        print_json([{**_reported(one), "take": one.name == best} for one in compared])
+        say_json([{**_reported(one), "take": one.name == best} for one in compared])
         return
     scored = [(one.name, one.result.summary, one.scores) for one in compared if one.scores]
     every = [(one.name, one.result.summary) for one in compared]
@@ -94,7 +93,7 @@ def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | N
     print_tables(skill_table(every, kind) for kind in KINDS)
     print_tables(_difference_table(compared, kind) for kind in KINDS)
     if why:
-        typer.echo(why)
+        say(why)
 
 
 def _differences(first: Result, other: Result) -> dict[str, Difference]:
@@ -211,7 +210,7 @@ def _draw(compared: Sequence[Compared], why: str) -> None:
     picture = io.BytesIO()
     drawn.savefig(picture, format="png", dpi=130)
     folders.write_file(Path(FIGURE), picture.getvalue())
-    typer.echo(f"drawn in {FIGURE}", err=True)
+    say(f"drawn in {FIGURE}", err=True)
 
 
 def _reference(result: Result, path: Path | None) -> ReferenceTrack | None:
@@ -234,7 +233,7 @@ def _write_trajectories(given: Sequence[Path], reference: Path | None, output: P
             if track is not None and (track.cartesian or set(CARTESIAN) <= set(track.position)):
                 write_tum(track, *of, f"{folder}: the reference", new / f"{name}.reference.tum")
     if not quiet:
-        typer.echo(f"trajectories written to {output}")
+        say(f"trajectories written to {output}")
 
 
 def _reported(one: Compared) -> dict[str, Any]:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import typer
 
 from ..arrays import FloatArray
 from ..errors import warn
 from ..model.arm import ArmModel
 from ..model.discrete import DiscreteModel, discretize
 from ..units import MS, Screen, in_unit, si
-from .tables import print_json
+from .screen import say, say_json
 
 _MOST_TICKS = 200  # of a step response
 _MATRICES = ("F", "B", "H", "Q")
@@ -33,9 +32,7 @@ def run(source: str, axis: str | None, period_ms: float | None, json: bool) -> N
         for name in (arm.axes if axis is None else [axis])
     }
     if json:
-        print_json(
-            {"arm": arm.name, "axes": {name: _tree(model, arm.screen_of(name)) for name, model in models.items()}}
-        )
+        say_json({"arm": arm.name, "axes": {name: _tree(model, arm.screen_of(name)) for name, model in models.items()}})
         return
     for name, model in models.items():
         _print(f"{arm.name}, {name}", model, arm.screen_of(name))
@@ -53,15 +50,15 @@ def _tree(model: DiscreteModel, screen: Screen) -> dict[str, object]:
 
 
 def _print(title: str, model: DiscreteModel, screen: Screen) -> None:
-    typer.echo(f"{title}: period {model.period * MS:g} ms, delay {model.delay * MS:g} ms")
-    typer.echo(f"states: {', '.join(model.states)} ({screen.unit}, {screen.unit}/s)")
+    say(f"{title}: period {model.period * MS:g} ms, delay {model.delay * MS:g} ms")
+    say(f"states: {', '.join(model.states)} ({screen.unit}, {screen.unit}/s)")
     with np.printoptions(precision=6, suppress=False, linewidth=120):
         for name in _MATRICES:
             unit = f" [{screen.unit}²] for input noise of 1 {screen.unit}/√Hz" if name == "Q" else ""
-            typer.echo(f"{name}{unit} =\n{getattr(model, name)}")
+            say(f"{name}{unit} =\n{getattr(model, name)}")
         poles = (f"{pole.real:.6g}" + (f"{pole.imag:+.6g}j" if pole.imag else "") for pole in model.poles.tolist())
-        typer.echo(f"poles: {', '.join(poles)}")
-        typer.echo(f"step response, p[0], p[1], …:\n{_step_response(model)}\n")
+        say(f"poles: {', '.join(poles)}")
+        say(f"step response, p[0], p[1], …:\n{_step_response(model)}\n")
 
 
 def _step_response(model: DiscreteModel) -> FloatArray:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import typer
-
 from ..errors import ConfigError, warn
 from ..folders import FolderError, write_file
 from ..fusion.config import FusionConfig
 from ..live.estimator import LiveEstimator
 from ..live.export import MARK, header, identifier, left_out
+from .screen import say
 
 
 def run(config: Path, output: Path, force: bool) -> None:
@@ -36,13 +35,11 @@ def run(config: Path, output: Path, force: bool) -> None:
     warn(known.arm.doubts() + known.arm.joint_doubts())
     write_file(output, header(known, name, str(config)), replace=force)
     axes = ", ".join(known.arm.axes)
-    typer.echo(f"{name}_model, of {axes} measured by {', '.join(known.sensors)}, written to {output}")
+    say(f"{name}_model, of {axes} measured by {', '.join(known.sensors)}, written to {output}")
     if known.frame is not None:
-        typer.echo(f"it is in the arm's axes: turning x, y, z into {axes}, as [frame] says, is left to the controller")
+        say(f"it is in the arm's axes: turning x, y, z into {axes}, as [frame] says, is left to the controller")
     if known.tool is not None or any(sensor.is_placed for sensor in known.sensors.values()):
-        typer.echo(
-            f"it is in the base's axes: {left_out(known)} left to the controller, which gives {axes} of the tool point"
-        )
+        say(f"it is in the base's axes: {left_out(known)} left to the controller, which gives {axes} of the tool point")
 
 
 def _check_replaceable(path: Path, force: bool) -> None:

@@ -29,6 +29,7 @@ from ..units import MS, SCREEN
 from . import init
 from .fuse import draw, show
 from .register import taken
+from .screen import say
 from .tune import WORSE, end, fitting, show_lags
 
 _SD = 1.4826  # of normal errors, over the median of their sizes
@@ -88,13 +89,13 @@ def run(
     show(summary)
     strays = _off_the_path(found, summary)
     for line in [*strays, *_told_by_one(summary, est.config)]:
-        typer.echo(line)
+        say(line)
     for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
-        typer.echo(taken(name, 0.0))
+        say(taken(name, 0.0))
     folder = shlex.quote(str(output))
-    typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {folder}/fusion.toml -o DIR")
+    say(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {folder}/fusion.toml -o DIR")
     if any(one.suffix in _BAGS for one in (log.iterdir() if log.is_dir() else [log])):
-        typer.echo(f"or as a node of ROS 2: pumafuse live ros2:{folder}/run.toml -c {folder}/fusion.toml")
+        say(f"or as a node of ROS 2: pumafuse live ros2:{folder}/run.toml -c {folder}/fusion.toml")
     end(fitted.details)
     if strays:
         raise typer.Exit(WORSE)

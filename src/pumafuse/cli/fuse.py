@@ -9,8 +9,6 @@ from importlib.resources import as_file, files
 from itertools import count
 from pathlib import Path
 
-import typer
-
 from ..errors import RunError, printable, warn
 from ..fusion import results
 from ..fusion.config import FusionConfig
@@ -23,6 +21,7 @@ from ..pieces.fusing import fuse_to
 from ..pieces.reading import needs_whole, rows_of
 from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
+from .screen import say
 from .tables import left_out, orientation_table, outcome_table, print_tables, runs_table, score_table, skill_table
 
 SHORT = 5_000_000  # rows of a run, each half a kB in memory; a longer one goes through piece by piece
@@ -68,7 +67,7 @@ def run(
             with progress_bar(str(runs[0])) as progress:
                 summary = job(runs[0], output, progress)
         show(summary)
-        typer.echo(f"{where} {output}")
+        say(f"{where} {output}")
         return
     places = dict(zip(map(str, runs), _folders(runs, output), strict=True))
     there = {path: summary for path, place in places.items() if resume and (summary := making.made(place, Path(path)))}
@@ -78,7 +77,7 @@ def run(
         found = there | done
         summaries = {place.name: found[path] for path, place in places.items() if path in found}
         print_tables(runs_table(summaries, kind) for kind in KINDS)
-        typer.echo(f"written to {output}" + (f"; {len(there)} of {len(found)} were there already" if there else ""))
+        say(f"written to {output}" + (f"; {len(there)} of {len(found)} were there already" if there else ""))
     report_failures(failed, len(places), output)
 
 
@@ -88,7 +87,7 @@ def demo(output: Path, force: bool) -> None:
     Raises:
         PumafuseError: The folder is in the way.
     """
-    typer.echo(
+    say(
         "A 60 s scan of a panel by a PUMA 560 (simulated with masses, friction, elastic joints and servos of which the"
         " filter knows\nnothing): a command every 28 ms, a camera (0.5 mm noise, 45 ms late, dropouts and outliers),"
         " and a reference to score\nagainst that the filter never sees.\n"
@@ -97,7 +96,7 @@ def demo(output: Path, force: bool) -> None:
         scan, config = data / "scan1", data / "fusion.toml"
         # without the laser tracker it shows best what a camera and a model do together
         run([scan], config, output, sensors=["vision"], rate=200.0, rrd=True, figures=True, force=force)
-    typer.echo(
+    say(
         f"\nWhat to open next:\n"
         f"  {output / 'fused.png'}   the run: command, measurements, estimate with its band\n"
         f"  {output / 'error.png'}   its error against the reference, and the error bars\n"
@@ -174,16 +173,16 @@ def show(summary: Summary) -> None:
     """Print the tables of one fusion."""
     part = "" if summary.from_s is None else f" from {summary.from_s:g} s on"
     made = f"{summary.estimates} estimates over {summary.duration_s:.1f} s{part}, {summary.mode}"
-    typer.echo(f"{printable(summary.run)}: {made}, arm {printable(summary.arm)}")
+    say(f"{printable(summary.run)}: {made}, arm {printable(summary.arm)}")
     if without := left_out(summary):
-        typer.echo(f"left out: {without}")
+        say(f"left out: {without}")
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
     print_tables(outcome_table(summary, kind) for kind in KINDS)
     print_tables(skill_table([("", summary)], kind) for kind in KINDS)
     print_tables(score_table([(summary.run, summary, scores)], kind) for kind in KINDS)
     print_tables([orientation_table([(summary.run, summary.orientation)])])
     for line in beaten(summary.axes):
-        typer.echo(line)
+        say(line)
 
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:

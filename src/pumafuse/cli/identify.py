@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import typer
-
 from ..errors import ConfigError, warn
 from ..folders import FolderError, write_file
 from ..identification.identify import Identification, identify
@@ -14,6 +12,7 @@ from ..identification.trials import StepTrials
 from ..model.arm import ArmModel
 from ..units import SCREEN, si
 from ..views import report as reports
+from .screen import say
 from .tables import print_tables, table
 
 
@@ -69,11 +68,11 @@ def run(
     if report is not None:
         reports.write_identification(found, campaign, report, force)
     if json:
-        typer.echo(found.to_json())
+        say(found.to_json())
         return
     _show(found)
-    typer.echo(f"written to {output}" + (f" and {report}" if report is not None else ""))
-    typer.echo(f"next: pumafuse verify RUN --arm {output}")
+    say(f"written to {output}" + (f" and {report}" if report is not None else ""))
+    say(f"next: pumafuse verify RUN --arm {output}")
 
 
 def _check_replaceable(path: Path, force: bool) -> None:
@@ -88,9 +87,9 @@ def _check_replaceable(path: Path, force: bool) -> None:
 
 def _show(found: Identification) -> None:
     print_tables([table(*reports.models(found))])
-    typer.echo("\n".join(reports.sentences(found)))
+    say("\n".join(reports.sentences(found)))
     if found.dependences:
         print_tables([table(*reports.dependences(found))])
     print_tables([table(*reports.scatter(found))])
     for one in found.performance:
-        typer.echo(f"combined model by {one.factor}: {one.verdict}")
+        say(f"combined model by {one.factor}: {one.verdict}")

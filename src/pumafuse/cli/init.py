@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-import typer
 from rich.table import Table
 
 from ..discovery.contents import Part, Signal, rate_of
@@ -21,6 +20,7 @@ from ..folders import write_file
 from ..fusion.config import FusionConfig
 from ..logs.run import Run, described
 from ..units import DEG, MS, SCREEN
+from .screen import say
 from .tables import print_tables, table
 
 _FEW = 4  # columns that are named
@@ -65,12 +65,12 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     for name, text in texts.items():
         write_file(folder / name, text, replace=force)
     place = shlex.quote(str(folder))
-    typer.echo(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
+    say(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
     tuned, fused = f"{place}/tuned", f"{place}/fused"
     if not found.own_frames:
-        typer.echo(f"  pumafuse latency {place}")
-    typer.echo(f"  pumafuse tune {place} -c {place}/fusion.toml -o {tuned} --fit noise,delay,plant")
-    typer.echo(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
+        say(f"  pumafuse latency {place}")
+    say(f"  pumafuse tune {place} -c {place}/fusion.toml -o {tuned} --fit noise,delay,plant")
+    say(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
 
 
 def registered(found: Survey, recorded: Run) -> FusionConfig | None:
@@ -90,7 +90,7 @@ def registered(found: Survey, recorded: Run) -> FusionConfig | None:
     except RunError as error:
         if not found.run.sensors:
             raise
-        typer.echo(f"not registered: {error}")
+        say(f"not registered: {error}")
         return None
     shown.show(done.details)
     return done.config
@@ -100,7 +100,7 @@ def show(found: Survey, sensors: Mapping[str, SensorGuess]) -> None:
     """Print what was found, and what the user has to decide."""
     print_tables(_tables(found))
     for number, question in enumerate(questions(found, sensors), 1):
-        typer.echo(f"{number}. {question}" if number > 1 else f"To decide:\n1. {question}")
+        say(f"{number}. {question}" if number > 1 else f"To decide:\n1. {question}")
 
 
 def _tables(found: Survey) -> Iterator[Table]:

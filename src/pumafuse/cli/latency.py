@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import typer
 from rich.console import Console
 
 from ..errors import ConfigError
@@ -13,6 +12,7 @@ from ..folders import write_file
 from ..logs.run import Run
 from ..tuning.latency import Latency, latency
 from ..views import report as reports
+from .screen import say
 from .tables import print_tables, table
 
 
@@ -32,13 +32,13 @@ def run(
     found = _told(paths, sensor, report, json, force, part=part)
     if found is None:
         return
-    typer.echo("\nto write into fusion.toml and arm.toml (pumafuse identify RUN -o arm.toml writes the latter):\n")
-    typer.echo(reports.settings(found))
-    typer.echo("elsewhere:")
+    say("\nto write into fusion.toml and arm.toml (pumafuse identify RUN -o arm.toml writes the latter):\n")
+    say(reports.settings(found))
+    say("elsewhere:")
     for line in reports.elsewhere(found.details):
-        typer.echo(f"  {line}")
+        say(f"  {line}")
     if report is not None:
-        typer.echo(f"written to {report}")
+        say(f"written to {report}")
 
 
 def identify(
@@ -51,8 +51,8 @@ def identify(
     """
     if _told(paths, sensor, report, json, force, output=output) is None:
         return
-    typer.echo(f"written to {output}" + (f" and {report}" if report is not None else ""))
-    typer.echo(f"next: pumafuse verify RUN --arm {output}, with a run that it was not made from")
+    say(f"written to {output}" + (f" and {report}" if report is not None else ""))
+    say(f"next: pumafuse verify RUN --arm {output}, with a run that it was not made from")
 
 
 def _told(
@@ -73,7 +73,7 @@ def _told(
     if report is not None:
         reports.write_latency(found, report, force)
     if json:
-        typer.echo(found.to_json(), nl=False)
+        say(found.to_json().removesuffix("\n"))
         return None
     _show(found)
     return found
@@ -82,10 +82,10 @@ def _told(
 def _show(found: Latency) -> None:
     """Print the answers and a table on stdout."""
     for line in reports.answers(found.details):
-        typer.echo(line)
+        say(line)
     print_tables([table(*reports.lags(found.details))])
     if any(one.shared_delay for one in found.details.axes.values()):
-        typer.echo("* one dead time for several axes")
+        say("* one dead time for several axes")
 
 
 def _found(paths: Sequence[Path], sensor: str | None, part: tuple[float | None, float | None]) -> Latency:

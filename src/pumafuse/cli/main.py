@@ -14,6 +14,7 @@ import typer
 from typer import Argument, BadParameter, Option
 
 from ..errors import PumafuseError, PumafuseWarning, printable
+from .screen import say
 
 # With matrices of 5 by 5 the threads of a BLAS only wait for each other, ten times as long on a busy machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -50,7 +51,7 @@ def _version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        typer.echo(f"pumafuse {version('pumafuse')}")
+        say(f"pumafuse {version('pumafuse')}")
         raise typer.Exit
 
 
@@ -440,18 +441,18 @@ def main() -> None:
     try:
         app(arguments[:end], obj=arguments[end:])
     except PumafuseError as error:
-        typer.echo(f"pumafuse: {error}", err=True)
+        say(f"pumafuse: {error}", err=True)
         sys.exit(1)
     except MemoryError:
-        typer.echo("pumafuse: not enough memory: use a part of the log, or fewer columns", err=True)
+        say("pumafuse: not enough memory: use a part of the log, or fewer columns", err=True)
         sys.exit(1)
     except OSError as error:
         if not isinstance(error, BrokenPipeError):  # whoever read our output has what it wanted
-            typer.echo(f"pumafuse: {error.filename or 'standard output'}: {error.strerror}", err=True)
+            say(f"pumafuse: {error.filename or 'standard output'}: {error.strerror}", err=True)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what its buffer holds would fail once more at exit
         sys.exit(1)
     except Exception as error:
-        typer.echo(f"pumafuse: {_unexpected(error)}", err=True)
+        say(f"pumafuse: {_unexpected(error)}", err=True)
         sys.exit(70)
 
 
@@ -487,7 +488,7 @@ def _end(number: int, _frame: object) -> None:
 
 def _one_line(message: Warning | str, category: type[Warning], *_: object) -> None:
     name = "warning" if issubclass(category, PumafuseWarning) else category.__name__
-    typer.echo(f"{name}: {message}", err=True)
+    say(f"{name}: {message}", err=True)
 
 
 def _names(listed: str | None, option: str = "--sensors") -> list[str] | None:

@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar, cast
 
-import typer
 from rich.console import Console
 from rich.markup import escape
 
 from ..errors import PumafuseError, PumafuseWarning
 from ..folders import sweep
+from .screen import say
 
 R = TypeVar("R")
 
@@ -69,7 +69,7 @@ def run_jobs(
                     failed[name] = problem
                 move(len(results) + len(failed))
     except KeyboardInterrupt:
-        typer.echo(f"interrupted: {len(results)} of {len(jobs)} runs are done and kept", err=True)
+        say(f"interrupted: {len(results)} of {len(jobs)} runs are done and kept", err=True)
         raise
     except TerminatedWorkerError:
         kept = f"{len(results)} of {len(jobs)} runs are done and kept"
@@ -90,7 +90,7 @@ def report_failures(failed: Mapping[str, str], count: int, where: Path) -> None:
         PumafuseError: There is one.
     """
     for name, problem in failed.items():
-        typer.echo(f"pumafuse: {name}: {problem}", err=True)
+        say(f"pumafuse: {name}: {problem}", err=True)
     if failed:
         rest = "" if len(failed) == count else f"; the others are in {where}"
         raise PumafuseError(f"{len(failed)} of {count} runs failed (see above){rest}")

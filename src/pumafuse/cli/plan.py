@@ -6,14 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import typer
-
 from ..errors import ConfigError, warn
 from ..identification import plan as plans
 from ..identification.plan import Design
 from ..logs import tables
 from ..model.arm import CANONICAL_AXES, ArmModel
 from ..units import SCREEN, SPEEDS, Kind, si
+from .screen import say
 
 _PERIOD = 0.028  # s, the paper's
 # m/s and mm, the paper's; degrees/s and degrees, which are as far at 0.57 m from the joint
@@ -70,7 +69,7 @@ def run(
     )
     warn(planned.warnings)
     plans.write(planned, output, force)
-    typer.echo(
+    say(
         f"{len(planned.trials)} step trials and {len(planned.noise)} white-noise sequences,"
         f" {planned.duration / 60.0:.1f} minutes without the moves between positions, written to {output}"
         f"\nnext: record samples.csv beside trials.csv, then pumafuse identify {output} -o arm.toml"

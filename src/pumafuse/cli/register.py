@@ -17,6 +17,7 @@ from ..registration.register import Registered
 from ..registration.runs import RegisteredSensor, RegistrationSummary, register
 from ..toml import Interval
 from ..units import DEG, MM, MS
+from .screen import say
 from .tables import print_tables, table
 
 SUMMARY = "registration.json"
@@ -52,14 +53,14 @@ def run(
             found.config.save(new)
             (new / SUMMARY).write_text(found.to_json(), encoding="utf-8")
     if json:
-        typer.echo(found.to_json(), nl=False)
+        say(found.to_json().removesuffix("\n"))
     else:
         show(found.details)
         if output is not None:
             folder = shlex.quote(str(output))
             first = any(_MENDED.intersection(one.findings) for one in found.details.sensors.values())
             after = "mend run.toml as said above, and register anew" if first else None
-            typer.echo(f"written to {output}\nnext: {after or f'pumafuse fuse RUN -c {folder}/fusion.toml -o DIR'}")
+            say(f"written to {output}\nnext: {after or f'pumafuse fuse RUN -c {folder}/fusion.toml -o DIR'}")
     if any(one.frame is None for one in found.details.sensors.values()):
         raise typer.Exit(_NOT_ALL)
 
@@ -69,7 +70,7 @@ def show(found: RegistrationSummary) -> None:
     for name, one in found.sensors.items():
         _show(name, one)
     if found.joints:
-        typer.echo("joints do not answer alike; each is later than the one that answers first by")
+        say("joints do not answer alike; each is later than the one that answers first by")
         rows = [[n, f"{one.later * MS:.2f}", _limits(one.later_ci95, MS, ".2f")] for n, one in found.joints.items()]
         print_tables([table(["joint", "later_ms", "95 % interval"], rows)])
 
@@ -77,17 +78,17 @@ def show(found: RegistrationSummary) -> None:
 def _show(name: str, one: RegisteredSensor) -> None:
     """Print what was found of one sensor."""
     if one.frame is None or one.marker is None or one.lag is None:
-        typer.echo(f"{name}: not registered")
+        say(f"{name}: not registered")
         return
     turned = "" if one.angular_rms is None else f" and {one.angular_rms * DEG:.3g}°"
-    typer.echo(f"{name}: {one.rows} measurements; left over {(one.rms or 0.0) * MM:.3g} mm{turned} RMS")
+    say(f"{name}: {one.rows} measurements; left over {(one.rms or 0.0) * MM:.3g} mm{turned} RMS")
     rows = [*_places("frame", one.frame), *_places("marker", one.marker)]
     rows.append(["lag, ms", f"{one.lag * MS:.2f}", _limits(one.lag_ci95, MS, ".2f")])
     if one.latency is not None:
         rows.append(["latency_ms", f"{one.latency * MS:.2f}", _limits(one.latency_ci95, MS, ".2f")])
     print_tables([table(["number", "found", "95 % interval"], rows)])
     if one.latency is not None and one.latency_ci95 == (one.latency, one.latency):
-        typer.echo(taken(name, one.latency))
+        say(taken(name, one.latency))
 
 
 def taken(name: str, latency: float) -> str:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-import typer
-
 from ..simulation import simulate as simulation
 from ..simulation.campaign import TRIALS
 from ..simulation.scenario import Scenario
 from .many import report_failures, run_jobs
+from .screen import say
 
 
 def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
@@ -21,7 +20,7 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
     """
     scenario = Scenario.load(path)
     if scenario.teaches:
-        typer.echo(f"{scenario.name}: {scenario.teaches}")
+        say(f"{scenario.name}: {scenario.teaches}")
     failed: dict[str, str] = {}
     if runs is None:
         written, folders = [_simulate(scenario, scenario.seed, output, force)], output
@@ -33,8 +32,8 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
     if written:
         commands, rows, trials = (sum(counts) for counts in zip(*written, strict=True))
         counted = f"{commands} commands, {rows} rows of measurements" + (f", {trials} step trials" if trials else "")
-        typer.echo(f"{len(written)} {'run' if len(written) == 1 else 'runs'}: {counted}, written to {output}")
-        typer.echo(f"next: pumafuse fuse {folders} -c {min(output.glob('**/fusion.toml'))} -o result")
+        say(f"{len(written)} {'run' if len(written) == 1 else 'runs'}: {counted}, written to {output}")
+        say(f"next: pumafuse fuse {folders} -c {min(output.glob('**/fusion.toml'))} -o result")
     report_failures(failed, len(written) + len(failed), output)
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
-from typing import Any, Literal, TextIO
+from typing import Literal, TextIO
 
 import msgspec
-import typer
 from rich import box
 from rich.cells import cell_len
 from rich.console import Console
@@ -45,12 +44,6 @@ def console(file: TextIO) -> Console:
     """A stream for people: 120 columns wide where it is no terminal; nowhere if it is closed, which makes it None."""
     there = file or StringIO()
     return Console(file=there, highlight=False, emoji=False, width=None if there.isatty() else 120)
-
-
-def print_json(tree: Any) -> None:
-    """Print a tree of dictionaries, lists and structs on standard output."""
-    encoded = msgspec.json.Encoder(decimal_format="number").encode(tree)
-    typer.echo(msgspec.json.format(encoded, indent=2))
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:

@@ -21,6 +21,7 @@ from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Progress, tune
 from ..units import SCREEN
 from ..views import formatting
+from .screen import say
 from .tables import interval, number, print_tables, table
 
 SUMMARY = "tuning.json"
@@ -81,10 +82,10 @@ def run(
 
             (new / PAGE).write_text(page(found, runs), encoding="utf-8")
     if json:
-        typer.echo(found.to_json(), nl=False)
+        say(found.to_json().removesuffix("\n"))
     else:
         _show(found.details, found.config.arm.update_period)
-        typer.echo(f"written to {output}\nnext: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR")
+        say(f"written to {output}\nnext: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR")
     end(found.details)
 
 
@@ -113,14 +114,14 @@ def show_lags(summary: TuningSummary, period: float) -> None:
     """Print the lags, and play, fastest speeds and sags where there are any; period [s]."""
     bends = [_row(one) for one in summary.parameters if any(f".{bend}" in one.key for bend in (*BENDS, "sag"))]
     print_tables([table(_HEADINGS, [*_lags(summary), *bends])])
-    typer.echo(formatting.lag(period))
+    say(formatting.lag(period))
 
 
 def _show(summary: TuningSummary, period: float) -> None:
     """Print the summary on stdout; period [s]."""
     print_tables([_parameters(summary)])
     if summary.lags:
-        typer.echo(formatting.lag(period))
+        say(formatting.lag(period))
     lines = [*formatting.chosen(summary.orders), *summary.not_identifiable]
     pairs = sorted(summary.correlations, key=lambda pair: -abs(pair.correlation))
     lines += [formatting.together(pair) for pair in pairs[:_PAIRS]]
@@ -130,7 +131,7 @@ def _show(summary: TuningSummary, period: float) -> None:
         off = f"{interval(one.bias, one.sd, one.kind)} {SCREEN[one.kind].unit}"
         lines.append(f"{one.run}: {one.sensor} is off by {off} on {one.axis}")
     for line in lines:
-        typer.echo(line)
+        say(line)
     likelihood = [
         [axis, str(one.components), number(one.before, ".1f"), number(one.after, ".1f")]
         for axis, one in summary.likelihood.items()
@@ -139,7 +140,7 @@ def _show(summary: TuningSummary, period: float) -> None:
     if summary.validation:
         print_tables([_validation(summary)])
     for check in summary.validation or ():
-        typer.echo(f"{check.run}, {check.axis}: {check.verdict}")
+        say(f"{check.run}, {check.axis}: {check.verdict}")
 
 
 def _parameters(summary: TuningSummary) -> Table:

@@ -15,7 +15,8 @@ from ..model.arm import ArmModel
 from ..units import si
 from ..views import formatting
 from ..views import report as reports
-from .tables import print_json, print_tables, table
+from .screen import say, say_json
+from .tables import print_tables, table
 
 _FAILED = 3
 
@@ -46,11 +47,11 @@ def run(
     verified = [verification for verification, _ in found]
     warn(f"run '{one.run}': {note}" for one in verified for note in one.notes)
     if json:
-        print_json([toml.reported(one, one.kind) for one in verified])
+        say_json([toml.reported(one, one.kind) for one in verified])
     else:
         print_tables(table(*of_kind) for of_kind in reports.verifications(verified))
-        typer.echo("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
+        say("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
         if report is not None:
-            typer.echo(f"written to {report}")
+            say(f"written to {report}")
     if not all(one.holds for one in verified):
         raise typer.Exit(_FAILED)
