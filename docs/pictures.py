@@ -11,11 +11,13 @@ import warnings
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import msgspec
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.optimize import minimize_scalar
 
 import pumafuse as pf
+from pumafuse.filter.response import response
 from pumafuse.fusion.score import interpolated
 from pumafuse.views import colours, step_figures
 
@@ -24,6 +26,11 @@ DATA = Path(pf.__file__).parent / "data"
 SCAN = DATA / "scan"
 SD, GATE = 0.5e-3, 4.0  # m, sigma: the camera's, the same for both filters
 STRETCH = (33.6, 36.2)  # s of the scan, with an outlier and dropouts
+BENDS = {  # scenarios of arms that are not linear
+    "saturating-servo": "a fastest speed: behind beyond it",
+    "tool-with-play": "play: off by half of it, either way",
+    "sagging-lever": "a sag: off by where it is",
+}
 COLOURS = ["#c2c6cc", "#8a8f98", "#e8890c", colours.ESTIMATE, "#0a3d7a"]
 
 
@@ -141,6 +148,32 @@ def lateness() -> None:
     figure.savefig(HERE / "images" / "lag.svg", metadata={"Date": None})
 
 
+def bends() -> None:
+    """What a fastest speed, play and a sag look like: measurements less the linear arm, over what shows each."""
+    figure, shown = plt.subplots(1, 3, figsize=(13.0, 3.8), layout="constrained")
+    for axes, (name, title) in zip(shown, BENDS.items(), strict=True):
+        made = pf.simulate(pf.Scenario.load(HERE.parent / "scenarios" / f"{name}.toml"))
+        ((axis, model),) = made.config.arm.axes.items()
+        linear = msgspec.structs.replace(model, max_speed=None, play=None, sag=None)
+        given, command = made.run.command.series(axis)
+        stamp, seen = made.run.sensors["camera"].series(axis)
+        valid = stamp - round(made.config.sensors["camera"].latency * 1e9)
+        arm = made.config.arm.update_period, made.config.arm.delay_of(axis), given, command, float(command[0])
+        beside, near = (response(linear, *arm, valid + shift) for shift in (0, 1_000_000))
+        speed = (near - beside) * 1e3  # rad/s
+        off, over = np.degrees(seen - command[0] - beside), np.degrees(speed if name == "saturating-servo" else beside)
+        for forth, colour, label in (True, COLOURS[2], "on the way up"), (False, colours.ESTIMATE, "on the way down"):
+            some = (speed > 0.0) == forth
+            axes.plot(over[some], off[some], "o", ms=3, color=colour, label=label)
+        unit = "speed of the linear arm [deg/s]" if name == "saturating-servo" else "position of the linear arm [deg]"
+        axes.set(xlabel=unit, ylabel="camera less the linear arm [deg]")
+        axes.set_title(title, loc="left")
+        axes.axhline(0.0, color="k", lw=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    shown[0].legend(frameon=False, fontsize=8)
+    figure.savefig(HERE / "images" / "bends.svg", metadata={"Date": None})
+
+
 def between(axes, start, end, level, name, colour):
     """An arrow from one instant to another with its name above."""
     arrow = {"arrowstyle": "<->", "color": colour, "shrinkA": 0.0, "shrinkB": 0.0}
@@ -167,6 +200,7 @@ def main() -> None:
     picture = step_figures.responses(pf.identify(trials), trials)
     (HERE / "images" / "steps.svg").write_text(picture, encoding="utf-8")
     lateness()
+    bends()
 
 
 if __name__ == "__main__":
