@@ -27,6 +27,7 @@ _EARLIER = (0.0, 0.6)  # starts: of a first-order arm's dead time, what is lag o
 _FEWEST = 20  # measurements of each half: four for each number that is fitted
 _FASTEST = 0.98  # of the time it goes no faster
 _KNEES = np.linspace(0.05, 0.95, 25)  # of the time the axis is lower
+_HOPES = 0.95  # of the squares, which a line with knees may leave where it was not fitted, without a new arm beside it
 _SLIGHT = 0.01  # of a slope that is no sag: of exact data any other slope explains something
 _MANY = 1.02  # times those that are near the linear arm
 _KINDS = (("play", "max_speed", "sag"), ("stops",))  # of bends; sags have one knee, stops one on each side
@@ -79,7 +80,7 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
             best = min(tried, key=lambda kind: float(tried[kind].sum()))
             if tried[best].sum() > _PAYS * squares[-1].sum() or np.any(tried[best] > _SEEMS * squares[-1]):
                 break
-            left = search.measured.left(search.fitted(search.measured, _beside(chosen, best)))
+            left = search.measured.left(search.whole(_beside(chosen, best)))
             if squares[-1].sum() - tried[best].sum() < FOLLOWS / independent(left) * tried[best].sum():
                 break  # an error that goes on for long is alike in both halves, and by chance like play
             chosen = _beside(chosen, best)
@@ -87,7 +88,7 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
     if not chosen:
         return None
     linear, bent = (float(np.sqrt(one.mean())) for one in (squares[0], squares[-1]))
-    return Bent(search.fitted(search.measured, chosen), bent, linear)
+    return Bent(search.whole(chosen), bent, linear)
 
 
 def _beside(chosen: Sequence[str], kind: str) -> list[str]:
@@ -109,9 +110,13 @@ class _Search:
         self._start = given._replace(delay=plain.arm.delay, lag=plain.arm.lag, play=0.0, max_speed=0.0)
         if "gain" in free:
             self._start = self._start._replace(gain=plain.arm.gain, recovery=0.0, slope=0.0)
+        self._linear: Arm | None = None
         self._starts: dict[str, dict[str, float]] = {}
         self._free = free
         self.halves = _halves(self.measured)
+        first, parts = self.halves[0].recordings, self.measured.recordings
+        counts = [one.weight[part.weight > 0.0] > 0.0 for one, part in zip(first, parts, strict=True)]
+        self._rows = np.concatenate(counts)  # of the first half, among those that count
 
     def seems(self, kind: str, chosen: Sequence[str]) -> bool:
         """Whether a bend that is free leaves less of all of the motion; fits begin from the best of a rough grid."""
@@ -119,12 +124,12 @@ class _Search:
         if kind in chosen or (is_sag and self.measured.sags) or ("sag" if is_sag else kind) not in self._free:
             return False
         beside = _beside(chosen, kind)
-        arm = self.fitted(self.measured, beside[:-1])
+        arm = self.whole(beside[:-1])
         start = self._knees(arm, 1 if kind == "sag" else 2) if is_sag else self._size(kind, arm)
         if not start:
             return False
         self._starts[kind] = start
-        bent, square = self.fitted(self.measured, beside), _square(self.measured, self.fitted(self.measured, chosen))
+        bent, square = self.whole(beside), _square(self.measured, self.whole(chosen))
         if is_sag and max(abs(bent.beyond), abs(bent.below)) < _SLIGHT:
             return False
         return _square(self.measured, bent) < _SEEMS * square
@@ -146,16 +151,11 @@ class _Search:
         One of its pieces is the gain: the middle one, or of two that whose gain is nearer to 1.
         """
         level, left = _levels(self.measured, arm), self.measured.left(arm)
-        found = list[tuple[float, list[float], tuple[float, ...]]]()
-        for knees in combinations(np.quantile(level, _KNEES).tolist(), count):
-            if count == 2 and not knees[0] <= self._middle <= knees[1]:
-                continue
-            columns = np.column_stack([np.ones(len(level)), level, *(np.maximum(level - knee, 0.0) for knee in knees)])
-            line = np.linalg.lstsq(columns, left, rcond=None)[0]
-            found.append((float(np.sum((left - columns @ line) ** 2)), line.tolist(), knees))
-        if not found or min(found)[0] > _SEEMS * float(left @ left):
+        knees = _best_knees(level, left, count, self._middle)
+        columns = np.column_stack([np.ones(len(level)), level, *(np.maximum(level - knee, 0.0) for knee in knees)])
+        if not knees or not self._predicts(columns, left):
             return {}
-        _, line, knees = min(found)
+        line: list[float] = np.linalg.lstsq(columns, left, rcond=None)[0].tolist()
         gains = [arm.gain * max(1.0 + slope, 1e-3) for slope in np.cumsum(line[1:]).tolist()]
         middle = 1 if count == 2 or abs(math.log(gains[1])) < abs(math.log(gains[0])) else 0
         gain, start = gains[middle] if "gain" in self._names else arm.gain, self.measured.recordings[0].start
@@ -165,6 +165,22 @@ class _Search:
             made[at] = start + (knee - start) * gain / arm.gain
             made[slope] = min(max(gains[piece] / gains[middle] - 1.0, BEYOND[0]), BEYOND[1])
         return made
+
+    def _predicts(self, columns: FloatArray, left: FloatArray) -> bool:
+        """Whether columns (n, c) that are fitted to one half of what is left explain some of the other."""
+        shares = list[float]()
+        for here, there in (self._rows, ~self._rows), (~self._rows, self._rows):
+            line = np.linalg.lstsq(columns[here], left[here], rcond=None)[0]
+            apart = left[there] - columns[there] @ line
+            shares.append(float(apart @ apart) / max(float(left[there] @ left[there]), 1e-300))
+        return max(shares) < _SEEMS and sum(shares) < 2.0 * _HOPES
+
+    def whole(self, kinds: Sequence[str]) -> Arm:
+        """The arm of least squares with these bends of all of the motion."""
+        if kinds:
+            return self.fitted(self.measured, kinds)
+        self._linear = self._linear or self.fitted(self.measured, [])
+        return self._linear
 
     def off(self, kinds: Sequence[str]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
@@ -188,6 +204,25 @@ class _Search:
             second = first._replace(delay=first.delay - by, lag=first.lag + by, damping=1.0)
             found.append(measured.fitted(second, [*names, "damping"], self._rest, limits))
         return max(found, key=lambda one: one.log_posterior).arm
+
+
+def _best_knees(level: FloatArray, left: FloatArray, count: int, middle: float) -> list[float]:
+    """The knees of the line over levels that explains most of what is left, two on both sides of a level; or none."""
+    places: list[float] = np.quantile(level, _KNEES).tolist()
+    pairs = combinations(range(len(places)), count)
+    every = np.array([one for one in pairs if count == 1 or places[one[0]] <= middle < places[one[1]]], dtype=np.intp)
+    if not len(every):
+        return []
+    straight = np.linalg.qr(np.column_stack([np.ones(len(level)), level]))[0]
+    bent = np.column_stack([np.maximum(level - knee, 0.0) for knee in places])
+    rest, bent = left - straight @ (straight.T @ left), bent - straight @ (straight.T @ bent)
+    own, with_rest = bent.T @ bent, (bent.T @ rest)[every]
+    own += 1e-12 * np.diag(own).max() * np.eye(len(places))
+    shares = np.asarray(
+        np.linalg.solve(own[every[:, :, None], every[:, None, :]], with_rest[:, :, None]), dtype=np.float64
+    )
+    explained = np.einsum("ij,ij->i", shares[:, :, 0], with_rest)
+    return [places[one] for one in every[int(np.argmax(explained))].tolist()]
 
 
 def _looked_at(plain: PlainArm) -> Measured:
