@@ -79,9 +79,9 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
     for kinds in _KINDS:
         while tried := {kind: search.off(_beside(chosen, kind)) for kind in kinds if search.seems(kind, chosen)}:
             squares = squares or [search.off([])]
-            best = min(tried, key=lambda kind: float(tried[kind].sum()))
-            pays = _KNEED if best in _SAGS else _PAYS
-            if tried[best].sum() > pays * squares[-1].sum() or np.any(tried[best] > _SEEMS * squares[-1]):
+            paying = {kind: left for kind, left in tried.items() if _pays(kind, left, squares[-1])}
+            best = min(paying, key=lambda kind: float(tried[kind].sum()), default=None)
+            if best is None:
                 break
             left = search.measured.left(search.whole(_beside(chosen, best)))
             if squares[-1].sum() - tried[best].sum() < FOLLOWS / independent(left) * tried[best].sum():
@@ -92,6 +92,12 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
         return None
     linear, bent = (float(np.sqrt(one.mean())) for one in (squares[0], squares[-1]))
     return Bent(search.whole(chosen), bent, linear)
+
+
+def _pays(kind: str, left: FloatArray, before: FloatArray) -> bool:
+    """Whether the squares that are left in both halves, (2,), fell enough."""
+    share = _KNEED if kind in _SAGS else _PAYS
+    return bool(left.sum() < share * before.sum() and np.all(left < _SEEMS * before))
 
 
 def _beside(chosen: Sequence[str], kind: str) -> list[str]:
