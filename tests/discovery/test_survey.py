@@ -699,6 +699,22 @@ def test_joints_are_known_by_their_names(axis: str, turns: bool) -> None:
 
 
 @pytest.mark.parametrize(
+    ("column", "role"),
+    [
+        ("set_point_deg", "command"),
+        ("Sollwert_1", "command"),
+        ("process_value", "sensor"),
+        ("Istwert_1", "sensor"),
+        ("axis1_pv", "sensor"),
+        ("value", None),
+    ],
+)
+def test_roles_of_columns_by_name(column: str, role: str | None) -> None:
+    """As controllers of processes and of machines call them, in German, too."""
+    assert names.column_role(column) == role
+
+
+@pytest.mark.parametrize(
     ("column", "axis", "unit"),
     [
         ("x_mm", "x", "mm"),

@@ -24,16 +24,16 @@ _ROLES: dict[Role, frozenset[str]] = {
     "reference": words_in("truth reference ref ground gt groundtruth"),
     "command": words_in(
         "command commands commanded cmd goal goals target targets desired des demand demanded setpoint setpoints set sp"
-        " soll sol planned action actions control ctrl input inputs com wanted reqd requested"
+        " soll sol sollwert planned action actions control ctrl input inputs com wanted reqd requested"
     ),
     "sensor": _DEVICES
     | words_in(
-        "state states measured measurement measurements meas msr actual present real ist pv current encoder encoders"
+        "state states measured measurement measurements meas msr actual present real ist istwert pv process current encoder encoders"
         " feedback fbk fb observed observation estimate estimated recorded reported odom"
     ),
 }
 # In the name of a topic or file these are something else.
-_OF_COLUMNS = words_in("set sp pv fb current present real control ctrl input inputs")
+_OF_COLUMNS = words_in("set sp pv process fb current present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
