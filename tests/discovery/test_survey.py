@@ -327,8 +327,12 @@ def test_commands_that_are_samples_of_a_path(tmp_path: Path) -> None:
         assert "(interpolation_ms in run.toml)" in "\n".join(asked(found))
         run, config = written(found, tmp_path / "out")
         assert config.arm.update_period == pytest.approx(0.01)
+        assert not survey(tmp_path / "out").interpolation
         text = (tmp_path / "out" / "run.toml").read_text()
         (tmp_path / "out" / "run.toml").write_text(text.replace("interpolation_ms", "# interpolation_ms"))
+        described = survey(tmp_path / "out")
+        assert described.interpolation == 0.01 and len(described.run.command.stamp) == len(t)
+        assert "(interpolation_ms in run.toml)" in "\n".join(asked(described))
         held = pf.Run.read(tmp_path / "out")
         for what, one in (("path", run), ("held", held)):
             arm = structs.replace(config.arm, update_period=0.01 if what == "path" else 0.1)

@@ -46,7 +46,8 @@ class Survey:
         roles: Who is who; None where a ``run.toml`` says it.
         manifest: What that ``run.toml`` holds.
         own_frames: The sensors that seem to stand in frames of their own.
-        interpolation: In which steps the run's commands go on between those of the log [s]; 0: they are the log's.
+        interpolation: In which steps the run's commands seem to go on between those of the log [s]; 0: they do not. A
+            ``run.toml`` is taken as it is, all the same.
     """
 
     log: Path
@@ -89,7 +90,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         aside = own_frames(run)
         run = _along_axes(run, aside)
         run, related = _followed(run, relations(run))
-        return Survey(log, run, related, manifest=manifest, own_frames=aside)
+        found = Survey(log, run, related, manifest=manifest, own_frames=aside)
+        return replace(found, interpolation=interpolation(found))
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
     if not roles.sensors:
