@@ -66,7 +66,7 @@ def run(
     try:
         found = survey(log)
     except UndecidedError as error:
-        raise RunError(f"{error}; `pumafuse init {log}` writes one to sort") from None
+        raise RunError(f"{error}; `pumafuse init {shlex.quote(str(log))}` writes one to sort") from None
     for name in found.run.sensors:
         if by := early(found, name):
             advice = f"; `pumafuse init {log}` writes one" if found.roles else ""

@@ -47,7 +47,7 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
         found = survey(log, rate)
     except UndecidedError as error:
         write_file(folder / MANIFEST, sketch(name_of(log), error, folder), replace=force)
-        then = f"`pumafuse fuse {folder} -o DIR`"
+        then = f"`pumafuse fuse {shlex.quote(str(folder))} -o DIR`"
         raise RunError(f"{error}; what there is was written to {folder / MANIFEST}: sort it, then {then}") from None
     arm, sensors = guess(found)
     texts = drafts(found, arm, sensors, folder)
