@@ -53,6 +53,25 @@ def test_motion_outweighs_the_name_target(tmp_path: Path) -> None:
     assert [(one.part.stem, "follows 'base_link_hinge'" in one.why) for one in found.sensors] == [("ir_target", True)]
 
 
+def test_joints_of_which_few_run_behind_are_commanded(tmp_path: Path) -> None:
+    """Seven joints called target; what nothing names leads two of them by chance, and follows the others."""
+    time, rng = np.arange(0.0, 40.0, 0.02), np.random.default_rng(8)
+    waves = np.cumsum(rng.normal(size=(7, len(time))), axis=1) * 0.02
+
+    def late(wave: np.ndarray, by: float) -> np.ndarray:
+        return np.interp(time - by, time, wave)
+
+    seen = [late(wave, 0.06 if joint < 5 else -0.06) for joint, wave in enumerate(waves)]
+    columns = [f"target_joint_{joint}" for joint in range(7)] + [f"real_position_joint_{joint}" for joint in range(7)]
+    rows = [",".join(f"{value:.5f}" for value in row) for row in zip(time, *waves, *seen, strict=True)]
+    log = tmp_path / "log.csv"
+    log.write_text("\n".join([",".join(["time_s", *(one.replace("real_", "") for one in columns)]), *rows, ""]))
+    found = survey(log)
+    assert found.roles is not None and found.roles.command.role == "command"
+    assert all(signals[0].column.startswith("target") for signals in found.roles.command.axes.values())
+    assert set(found.run.sensors) and len(found.run.axes) == 5
+
+
 def test_a_target_that_leads_is_commanded(tmp_path: Path) -> None:
     """The same names the other way round: what is called target runs ahead of what nothing names."""
     time = np.arange(0.0, 40.0, 0.02)

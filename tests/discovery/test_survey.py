@@ -1065,6 +1065,34 @@ def test_seconds_stay_seconds_where_the_motion_is_one_of_a_robot(tmp_path: Path)
     assert part.clock.basis == "s by interval"
 
 
+def test_a_clock_that_was_counted_gives_way_to_one_that_was_measured(tmp_path: Path) -> None:
+    """A loop that was to run at 500 Hz and ran at half of it: 80 ms late, not 40. Clocks that agree are no question."""
+    rng = np.random.default_rng(2)
+    real = np.cumsum(rng.uniform(0.003, 0.005, 4000))
+    told, seen = np.sin(2.0 * real) + 0.3 * np.sin(7.1 * real), real - 0.08
+    seen = np.sin(2.0 * seen) + 0.3 * np.sin(7.1 * seen) + rng.normal(0.0, 1e-3, len(real))
+    nominal = 0.8 + 0.002 * np.arange(4000)
+    columns = {"timestamp": nominal, "real_time": real, "x_target_m": told, "x_actual_m": seen}
+    write(tmp_path / "log.csv", columns)
+    found = survey(tmp_path / "log.csv")
+    assert found.relations["actual", "x"].lag == pytest.approx(0.08, abs=3e-3)
+    assert any(
+        "which is the clock of log.csv? By timestamp it lasts 7.998 s, by real_time 16" in one for one in asked(found)
+    )
+    write(tmp_path / "log.csv", columns | {"timestamp": np.round(real, 2)})
+    assert not any("which is the clock" in one for one in asked(survey(tmp_path / "log.csv")))
+
+
+def test_an_angle_by_the_name_of_what_measures_it_is_one(tmp_path: Path) -> None:
+    """``reference`` beside ``theta``, without a unit: both in rad, not in m."""
+    t = np.arange(0.0, 30.0, 0.02)
+    columns = {"time_s": t, "reference": np.sin(t) + 0.3 * np.sin(3.3 * t)}
+    write(tmp_path / "log.csv", columns | {"theta": np.interp(t - 0.1, t, columns["reference"])})
+    found = survey(tmp_path / "log.csv")
+    assert set(found.run.kinds.values()) == {"angle"}
+    assert found.run.command.values["theta"].max() == pytest.approx(columns["reference"].max())
+
+
 def test_rows_in_packets_are_spread_by_what_counts_them(tmp_path: Path) -> None:
     """A camera that sends 16 rows at a time follows as late as it would one by one; without a counter it is asked."""
     t, u, s, z = recorded()

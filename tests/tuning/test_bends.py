@@ -166,6 +166,12 @@ def test_what_holds_for_many_rows_is_looked_at() -> None:
     assert bent.arm.beyond == pytest.approx(-0.95, abs=0.05)
 
 
+def test_no_load_moves_a_tool_many_times_as_far() -> None:
+    """Four times as far above a level is another fault: nothing is said of a load."""
+    bent = found(1, arm_of(1, knee=0.0, beyond=3.0))
+    assert bent is None or bent.arm.beyond == bent.arm.below == 0.0
+
+
 def test_a_load_that_is_known_is_not_looked_for() -> None:
     """Its knee is in the responses already."""
     true = arm_of(5, knee=0.2 * RANGE, beyond=-0.5)

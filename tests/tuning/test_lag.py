@@ -68,6 +68,7 @@ def test_a_gain_that_recovers_is_part_of_it() -> None:
     found = fitted_lags(free, config, config, {"vertical": (0.001, np.inf)}, [])["vertical"]
     assert found.lag_ms == pytest.approx(1e3 * (delay + plant + 0.01))
     assert found.lag_ms_ci95 == (pytest.approx(found.lag_ms - 1.0), None)
+    assert fitted_lags(free, config, config, {"vertical": (10.0, 0.1)}, [])["vertical"].lag_ms_ci95[0] == 0.0
     assert fitted_lags(free_of(likelihood, config, ("noise",)), config, config, {}, []) == {}
 
 

@@ -106,7 +106,7 @@ def test_one_command_says_the_lag_of_an_arm_with_a_dead_band(tmp_path: Path) -> 
 def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_that_of_least_squares() -> None:
     """80 (78 to 82) ms by the likelihood and 50 to 60 ms by least squares are 50 to 82; an open end stays open."""
     config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config
-    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), 0.055, 1e-3, Measured([], T, []))
+    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), 0.055, 1e-3, *[Measured([], T, [])] * 2)
     doubted = {axis: Doubt(arm, off=1.5e-3, lag=0.08) for axis in config.arm.axes}
     first, *others = config.arm.axes
     lags = {first: FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(78.0, 82.0))}

@@ -93,7 +93,10 @@ def run(
     for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
         say(taken(name, 0.0))
     folder = shlex.quote(str(output))
-    say(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {folder}/fusion.toml -o DIR")
+    another = "pumafuse fuse ANOTHER_LOG"
+    if found.roles is not None:  # it is read by what `init` finds in it, as this one was
+        another = "pumafuse init ANOTHER_LOG -o ANOTHER && pumafuse fuse ANOTHER"
+    say(f"written to {output}\nnext: {another} -c {folder}/fusion.toml -o DIR")
     if any(one.suffix in _BAGS for one in (log.iterdir() if log.is_dir() else [log])):
         say(f"or as a node of ROS 2: pumafuse live ros2:{folder}/run.toml -c {folder}/fusion.toml")
     end(fitted.details)

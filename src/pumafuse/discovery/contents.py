@@ -65,6 +65,7 @@ _EVEN = 0.1  # share by which most steps of a counter may differ from the usual 
 _LONGEST_WAIT = 3.0  # packets, that a row waits: of rows that come in bursts by themselves some wait longer
 _ROUNDED, _FLOAT32 = 1.5e-6, 1.2e-7  # s, of stamps in us; share, of stamps in float32
 _ALIKE_SPANS = 1.2  # factor between the spans that two clocks of a table tell
+_OF_STEP = 0.01  # by which no step of a clock that was counted differs from the others
 _METRES = names.words_in(
     "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage tfMessage"
 )
@@ -469,10 +470,28 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
     for clock in filter(None, candidates()):
         source = Source(clock.stamp, {one.name: one.plain for one in signals}, table.path.name)
         if not signals or not (stands := standing_clock(source)):
-            return _numbered(table, _spread(table, clock, counts), counts), notes
+            others = filter(None, (_clock_of(table, name, stroke) for name in called if name not in clock.time.columns))
+            return _numbered(table, _spread(table, _or_another(table, clock, others), counts), counts), notes
         notes.append(f"{clock.time.column} is no clock: {stands}")
         coarse = coarse or float(np.ptp(clock.stamp[clock.stamp != NO_STAMP])) / 1e9
     return None, notes
+
+
+def _or_another(table: Table, clock: Clock, others: Iterable[Clock]) -> Clock:
+    """A clock, with a question where another one in the table tells another time; the other one if this one is even."""
+    for other in others:
+        spans = [float(np.ptp(one.stamp[one.stamp != NO_STAMP])) / 1e9 for one in (clock, other)]
+        if max(spans) > _ALIKE_SPANS * min(spans) > 0.0:
+            steps = np.diff(clock.stamp)
+            counted = np.abs(steps - np.median(steps)).max() <= _OF_STEP * np.median(steps)
+            names_of = clock.time.column, other.time.column
+            doubt = (
+                f"which is the clock of {table.path.name}? By {names_of[0]} it lasts {spans[0]:.4g} s, by"
+                f" {names_of[1]} {spans[1]:.4g} s"
+                + (f"; {names_of[0]} is exactly even, as what is counted, so {names_of[1]} is taken" if counted else "")
+            )
+            return replace(other if counted else clock, doubt=doubt)
+    return clock
 
 
 def _spread(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:

@@ -476,7 +476,9 @@ def _looked_at(streams: Sequence[Stream]) -> list[Stream]:
     for stream in streams:
         columns = [one.column for signals in stream.axes.values() for one in signals]
         seen = stream.role == "command" and any(map(names.may_be_seen, [stream.part.stem, *columns]))
-        led = [one for one in streams if one.role is None and _followers(one, [replace(stream, role=None)])[0]]
+        unnamed = [one for one in streams if seen and one.role is None]
+        fewest = 0.5 * len(stream.axes) if len(stream.axes) > len(CARTESIAN) else 0.0  # in space one, or its speed
+        led = [one for one in unnamed if _followers(one, [replace(stream, role=None)])[0] > fewest]
         if seen and led:
             why = f"it is called target, but follows '{printable(led[0].name)}': it is what a sensor looks at"
             stream = replace(stream, role="sensor", why=why)
@@ -644,7 +646,7 @@ def _with_units(roles: Roles) -> Roles:
 
     The commands' to sources whose units are known, else by their range; then all others' to those.
     """
-    command, reference = roles.command, roles.reference
+    command, reference = _angles_by_name(roles), roles.reference
     others = [one for one in (reference, *reversed(roles.sensors)) if one is not None]
     sure = [one for one in others if not one.guessed]
     for one in sure:  # the first sensor has the last word
@@ -655,6 +657,17 @@ def _with_units(roles: Roles) -> Roles:
     return replace(
         roles, command=command, sensors=sensors, reference=None if reference is None else _fitted(reference, command)
     )
+
+
+def _angles_by_name(roles: Roles) -> Stream:
+    """The commands, in units of angles where nothing says it of them, but the name of what measures them."""
+    found = dict(roles.command.axes)
+    for axis, signals in roles.command.axes.items():
+        seen = [some for one in roles.measured.values() for some in one.axes.get(axis, ())]
+        guessed = signals[0].basis == "range" and roles.command.kind(axis) == "length"
+        if guessed and any(names.is_turning(one.axis) and kind_of(f"_{one.unit}") == "angle" for one in seen):
+            found[axis] = _in(signals, "_rad")
+    return replace(roles.command, axes=found)
 
 
 def _ranged(stream: Stream, measured: Set[str]) -> Stream:

@@ -56,7 +56,7 @@ Coordinates: TypeAlias = Sequence[str]  # among the fields below
 BENDS = {"play": (1e-6, 1.0), "max_speed": (1e-3, 100.0)}
 LOGARITHMIC = ("lag", "damping", "recovery", *BENDS)
 SAG = ("knee", "beyond", "knee_below", "below")  # of a line in pieces, one of which is the gain
-BEYOND = (-0.98, 9.0)  # bounds of the slope of another
+BEYOND = (-0.98, 1.0)  # bounds of the slope of another: no load moves a tool more than twice as far
 
 
 class Recording(NamedTuple):

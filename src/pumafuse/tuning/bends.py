@@ -139,7 +139,8 @@ class _Search:
             return False
         self._starts[kind] = start
         bent, square = self.whole(beside), _square(self.measured, self.whole(chosen))
-        if is_sag and max(abs(bent.beyond), abs(bent.below)) < _SLIGHT:
+        slopes = bent.beyond, bent.below
+        if is_sag and (max(map(abs, slopes)) < _SLIGHT or max(slopes) >= BEYOND[1]):
             return False
         return _square(self.measured, bent) < _SEEMS * square
 

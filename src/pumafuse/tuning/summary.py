@@ -167,7 +167,8 @@ def fitted_lags(
         lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
         if axis in lost:
             continue
-        ends = [end * MS if abs(end) <= LONGEST else None for end in (lag - below, lag + above)]
+        low = max(lag - below, min(lag, 0.0))  # no arm is there before its commands
+        ends = [end * MS if abs(end) <= LONGEST else None for end in (low, lag + above)]
         found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
     return found
 
