@@ -140,7 +140,8 @@ class _Search:
         self._starts[kind] = start
         bent, square = self.whole(beside), _square(self.measured, self.whole(chosen))
         slopes = bent.beyond, bent.below
-        if is_sag and (max(map(abs, slopes)) < _SLIGHT or max(slopes) >= BEYOND[1]):
+        most = BEYOND[1] if kind == "sag" else 0.0  # a stop holds an axis off
+        if is_sag and (max(map(abs, slopes)) < _SLIGHT or max(slopes) >= most):
             return False
         return _square(self.measured, bent) < _SEEMS * square
 
