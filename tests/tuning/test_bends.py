@@ -166,6 +166,14 @@ def test_what_holds_for_many_rows_is_looked_at() -> None:
     assert bent.arm.beyond == pytest.approx(-0.95, abs=0.05)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_gain_that_is_not_free_is_no_sag(seed: int) -> None:
+    """A straight line explains what a gain of 0.85 leaves; knees explain it no better."""
+    true = arm_of(seed)._replace(gain=0.85)
+    bent = found(seed, true, tuple(name for name in FREE if name != "gain"))
+    assert bent is None or bent.arm.beyond == bent.arm.below == 0.0
+
+
 def test_no_load_moves_a_tool_many_times_as_far() -> None:
     """Four times as far above a level is another fault: nothing is said of a load."""
     bent = found(1, arm_of(1, knee=0.0, beyond=3.0))
