@@ -59,6 +59,7 @@ _LONGEST_STEP = 0.03  # s
 _MOST = 20  # steps away from a maximum
 _SLOWLY, _LONGER = 0.5, 1.5  # log-likelihood that a step loses: with less the next one is so many times as long
 _PIECES = 20  # of all recordings, that a model which is right has independent scores in
+_ENOUGH = 20_000  # commands or measurements of a recording that an arm is known by: more make none better
 _SLOPE = 1e-5  # of a coordinate, by which quantities are varied
 
 
@@ -137,7 +138,7 @@ class ArmSearch:
             least: The least noise of each sensor [m].
             believed: Whether the sensors' noise is believed to be what second differences show.
         """
-        self._measured, self.sensors = measured, measured.sensors
+        self._measured, self.sensors = measured.liveliest(_ENOUGH), measured.sensors
         self._longest = longest_delay(measured.period)
         self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
         self.bent = self._bent(freedom)

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -39,6 +40,7 @@ _BEND = 0.6745 * math.sqrt(6.0)  # median of a second difference of white noise,
 _FEW = 3  # outliers in a row
 _HARMLESS = 0.02  # of the range that is measured
 _SLOW, _FASTEST = 0.1, 0.99  # of the speed that so many rows do not exceed: slower is at rest
+_QUARTERS, _FEW_COMMANDS = 4, 200  # of a long recording; of which parts are no excerpt
 _SETTLED = 2.6  # s, after which an arm has forgotten earlier commands
 _CLOSE = 0.01  # log-likelihood: what is expected to gain less is no step
 _STEPS = 12  # of Gauss and Newton, at most
@@ -318,9 +320,25 @@ class Measured:
             parts.append(one._replace(weight=np.where(lonely(np.abs(white[0]) > gate), 0.0, one.weight)))
         return self.of(parts)
 
+    def liveliest(self, most: int) -> Measured:
+        """Where each quarter of a recording moves most: of so many commands and measurements in all, about.
+
+        Shorter recordings, and those of few commands, are whole.
+        """
+        parts = list[Recording]()
+        for one in self.recordings:
+            commands, long = len(one.given), max(len(one.given), len(one.time))
+            if long <= most or commands < _FEW_COMMANDS:
+                parts.append(one)
+                continue
+            edges = np.linspace(0, commands, _QUARTERS + 1).astype(int).tolist()
+            longest = max(commands * most // long, _FEW_COMMANDS) // _QUARTERS
+            parts += [_liveliest(one, longest, *ends) for ends in pairwise(edges)]
+        return self.of(parts)
+
     def excerpt(self, commands: int, rows: int) -> Measured:
         """The part of each recording with the most motion, and some of its measurements, evenly."""
-        parts = [_liveliest(one, commands) for one in self.recordings]
+        parts = [_liveliest(one, commands, 0, len(one.given)) for one in self.recordings]
         return self.of([one.of(slice(None, None, len(one.time) // rows + 1)) for one in parts])
 
     def responses(self, arm: Arm) -> list[FloatArray]:
@@ -517,17 +535,18 @@ def lonely(far: BoolArray) -> BoolArray:
     return far & (in_a_row <= _FEW)
 
 
-def _liveliest(one: Recording, most: int) -> Recording:
-    """The part with the most motion, without what the commands before it still do."""
+def _liveliest(one: Recording, most: int, begin: int, end: int) -> Recording:
+    """The part of the commands between two with the most motion, without what the commands before it still do."""
     if len(one.given) <= most:
         return one
-    ends = np.append(np.arange(0, len(one.given) - most, most // 2), len(one.given) - most)
+    most = min(most, end - begin)
+    firsts = np.append(np.arange(begin, end - most, max(most // 2, 1)), end - most)
     way = np.append(0.0, np.cumsum(np.abs(np.diff(one.command))))
-    first = int(max(ends, key=lambda end: way[end + most - 1] - way[end]))
+    first = int(max(firsts, key=lambda place: way[place + most - 1] - way[place]))
     given, command = one.given[first : first + most], one.command[first : first + most]
     since = given[0] + round(_SETTLED * 1e9) * (first > 0)
     part = one.of((one.time >= since) & (one.time <= given[-1]))
-    start = float(command[0])
+    start = float(command[0]) if first else one.start
     return part._replace(given=given, command=command, start=start, value=part.value + one.start - start)
 
 
