@@ -80,7 +80,7 @@ def _other_columns(part: Part) -> list[str]:
 
 def _run_toml(found: Survey, arm: ArmGuess, folder: Path) -> str:
     if found.manifest is not None:
-        return _rebased(found, folder)
+        return _rebased(found, arm, folder)
     assert found.roles is not None
     roles = found.roles
     lines = [
@@ -91,18 +91,22 @@ def _run_toml(found: Survey, arm: ArmGuess, folder: Path) -> str:
     if found.interpolation:
         why = "DECIDE: what measures follows the path between commands; without this line each is held"
         lines.append(_line(_pair("interpolation_ms", found.interpolation * MS), why))
-    levels = {
-        f"{axis}_{SCREEN[one.kind].unit}": _digits(one.start * SCREEN[one.kind].scale, 6)
-        for axis, one in arm.axes.items()
-        if one.start is not None and axis not in TURNING
-    }
-    if levels:
+    if levels := _levels(arm):
         lines.append(_line(_pair("start", levels), "its sensor says so: not at its first command"))
     for one in roles.sensors:
         lines += _source(["sensors", one.name], one, folder)
     if roles.reference is not None:
         lines += _source(["reference"], roles.reference, folder)
     return "\n".join([*lines, *_unused(roles, folder), ""])
+
+
+def _levels(arm: ArmGuess) -> dict[str, float]:
+    """Where axes start by their sensors, which is not at their first command: the keys of ``start``."""
+    return {
+        f"{axis}_{SCREEN[one.kind].unit}": _digits(one.start * SCREEN[one.kind].scale, 6)
+        for axis, one in arm.axes.items()
+        if one.start is not None and axis not in TURNING
+    }
 
 
 def _unused(roles: Roles, folder: Path) -> Iterator[str]:
@@ -172,9 +176,12 @@ def _column(one: Signal) -> Any:
     return {"column": one.column, **more} if more else one.column
 
 
-def _rebased(found: Survey, folder: Path) -> str:
-    """The log's own ``run.toml`` for another folder."""
+def _rebased(found: Survey, arm: ArmGuess, folder: Path) -> str:
+    """The log's own ``run.toml`` for another folder; if it says of no axis where it starts, the sensors do."""
     tree: Any = {"name": found.name} | deepcopy(dict(found.manifest or {}))
+    levels = {key: level for key, level in _levels(arm).items() if key.rpartition("_")[0] in tree["command"]}
+    if levels:
+        tree["command"].setdefault("start", levels)
     beside = found.log if found.log.is_dir() else found.log.parent
     for table in (tree["command"], tree.get("reference"), *tree.get("sensors", {}).values()):
         if table is not None:

@@ -107,6 +107,8 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
             if stream.name in {*run.sensors, roles.command.name} or "follow" in why or "its commands" in why:
                 yield f"{printable(stream.name)} is not used on {', '.join(stream.axes)}: {why}"
     yield from later
+    for (name, axis), why in found.unused.items():
+        yield f"{name} is not used on {axis}: {why}. Is it in another frame, or stamped by another clock?"
     if found.relations and run.reference is None:
         yield (
             "how old is a measurement when it is stamped? Commands and measurements tell only the sum of the arm's lag"

@@ -48,6 +48,7 @@ class Survey:
         own_frames: The sensors that seem to stand in frames of their own.
         interpolation: In which steps the run's commands seem to go on between those of the log [s]; 0: they do not. A
             ``run.toml`` is taken as it is, all the same.
+        unused: Why a sensor that a ``run.toml`` describes is not used on an axis, by its name and the axis.
     """
 
     log: Path
@@ -58,6 +59,7 @@ class Survey:
     manifest: Mapping[str, Any] | None = None
     own_frames: Mapping[str, OwnFrame] = field(default_factory=dict[str, OwnFrame])
     interpolation: float = 0.0
+    unused: Mapping[tuple[str, str], str] = field(default_factory=dict[tuple[str, str], str])
 
     @property
     def name(self) -> str:
@@ -90,7 +92,7 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         aside = own_frames(run)
         run = _along_axes(run, aside)
         run, related = _followed(run, relations(run))
-        found = Survey(log, run, related, manifest=manifest, own_frames=aside)
+        found = _without_early(Survey(log, run, related, manifest=manifest, own_frames=aside))
         return replace(found, interpolation=interpolation(found))
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
@@ -108,7 +110,7 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         if abs(one.correlation) < FOLLOWS:
             bad[key] = f"it does not follow the commands (correlation {one.correlation:+.2f}): are columns exchanged?"
         elif one.lag < least and abs(one.correlation) < surely:
-            bad[key] = f"it moves {-one.lag * MS:.0f} ms before its commands (correlation {one.correlation:+.2f})"
+            bad[key] = _ahead(one)
     bad |= {(name, axis): why for name, why in _without_lag(related).items() for axis in (*run.axes, *TURNING)}
     roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
     if not roles.sensors:
@@ -157,7 +159,7 @@ def _without_lag(related: _Relations) -> dict[str, str]:
     """Sources of which an axis surely moves alike, but as late as lags are looked for: that is no following."""
     late: dict[str, list[str]] = {}
     for (name, axis), one in related.items():
-        if one.lag >= LATEST and abs(one.correlation) >= _SURELY:
+        if one.lag >= LATEST and _is_sure(one):
             late.setdefault(name, []).append(axis)
     return {
         name: (
@@ -177,7 +179,29 @@ def early(found: Survey, name: str) -> dict[str, float]:
     """By how much a source moves before its commands [s], for each of its axes that surely does."""
     least = least_lag(found.run)
     mine = {axis: one for (source, axis), one in found.relations.items() if source == name}
-    return {axis: -one.lag for axis, one in mine.items() if abs(one.correlation) >= _SURELY and one.lag < least}
+    return {axis: -one.lag for axis, one in mine.items() if _is_sure(one) and one.lag < least}
+
+
+def _without_early(found: Survey) -> Survey:
+    """Without the axes of a sensor that move before their commands, where it surely follows those of others."""
+    run, unused = found.run, dict[tuple[str, str], str]()
+    for name, source in run.sensors.items():
+        ahead = early(found, name)
+        sure = [axis for (mine, axis), one in found.relations.items() if mine == name and _is_sure(one)]
+        if ahead and len(ahead) < len(sure):
+            values = {axis: value for axis, value in source.values.items() if axis not in ahead}
+            run = replace(run, sensors={**run.sensors, name: replace(source, values=values)})
+            unused |= {(name, axis): _ahead(found.relations[name, axis]) for axis in ahead}
+    related = {key: one for key, one in found.relations.items() if key not in unused}
+    return replace(found, run=run, relations=related, unused=unused)
+
+
+def _ahead(one: Following) -> str:
+    return f"it moves {-one.lag * MS:.0f} ms before its commands (correlation {one.correlation:+.2f})"
+
+
+def _is_sure(one: Following) -> bool:
+    return abs(one.correlation) >= _SURELY
 
 
 def too_early(name: str, by: float) -> str:
@@ -205,7 +229,7 @@ def soonest(found: Survey) -> float:
     """The least lag of any source behind the path through the commanded points, where it is known well [s]."""
     lags = dict[str, list[float]]()
     for (name, _), one in found.relations.items():
-        if abs(one.correlation) >= _SURELY:
+        if _is_sure(one):
             lags.setdefault(name, []).append(one.lag)
     return min((float(np.median(mine)) for mine in lags.values()), default=math.inf)
 

@@ -178,7 +178,8 @@ def tune(
         free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed)
     result, arms = pipeline.result(), {axis: one for stage in stages for axis, one in stage.arms.items()}
     lost = [axis for axis, one in arms.items() if one.plain is None or result.arm.lag_of(axis) > LONGEST]
-    lags = with_doubts(fitted_lags(free, config, result, around, lost), found, config, result, lost)
+    untold = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]  # nobody measures these
+    lags = with_doubts(fitted_lags(free, config, result, around, untold), found, config, result, untold)
     tuned = _with_provenance(result, free, known, {} if interrupted else lags, names)
     doubted += [f"{axis}: {one.plain.step}" for axis, one in arms.items() if one.plain and one.plain.step]
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
