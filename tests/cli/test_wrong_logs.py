@@ -146,7 +146,9 @@ def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(descr
     axes = json.loads((tmp_path / "fused/summary.json").read_text(encoding="utf-8"))["axes"]
     assert axes["a"]["sensors"]["encoder"]["outcomes"]["fused"] == len(time)
     assert set(axes) == ({"a", "b"} if described else {"a"})
-    assert "lag of b" not in done.stdout and (not described or axes["b"]["sensors"]["encoder"]["outcomes"].get("fused", 0) == 0)
+    assert "lag of b" not in done.stdout and (
+        not described or axes["b"]["sensors"]["encoder"]["outcomes"].get("fused", 0) == 0
+    )
 
 
 @pytest.mark.parametrize("command", ["init", "fuse"])

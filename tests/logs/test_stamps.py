@@ -11,16 +11,19 @@ from pumafuse.logs.stamps import going_on, packets, spread
 EVEN = 7_000_000 * np.arange(3000)  # ns
 
 
-@pytest.mark.parametrize("unit", [1_000, 1_000_000])
+WRAPS = [(1_000, 2**32, "2^32 us"), (1_000_000, 2**32, "2^32 ms"), (1_000_000, 86_400_000, "midnight")]
+
+
+@pytest.mark.parametrize(("unit", "count", "words"), [*WRAPS, (1_000_000, 43_200_000, "12 hours")])
 @pytest.mark.parametrize("epoch", [0, 1_700_000_000_000_000_000])
-def test_counters_of_32_bits_go_on(unit: int, epoch: int) -> None:
-    """A wrap at 2^32 us or ms, bare or on top of a date, is taken back to the last digit, over a dropout too."""
-    wrap = 2**32 * unit
+def test_clocks_that_begin_anew_go_on(unit: int, count: int, words: str, epoch: int) -> None:
+    """After 2^32 us or ms, a day or half of one, bare or on top of a date, to the last digit, over a dropout too."""
+    wrap = count * unit
     true = np.delete(EVEN // unit * unit + wrap - 9_999_000_000, slice(1420, 1428))
     found, notes = going_on(epoch + true % wrap, "log: t")
     assert (found == epoch + true).all()
     assert len(notes) == 1
-    assert f"2^32 {'us' if unit == 1_000 else 'ms'}, first in row" in notes[0]
+    assert f"{words}, first in row" in notes[0]
 
 
 @pytest.mark.parametrize("way", [-1, 1])

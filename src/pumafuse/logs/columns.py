@@ -47,11 +47,12 @@ _REWRITTEN = (
     (r"^(\d\d)\.(\d\d)\.(\d{4})[ T]", r"\3-\2-\1 "),
     (r"^(\d{4})/(\d\d)/(\d\d)[ T]", r"\1-\2-\3 "),
     (r"^(\d{1,9}(?:\.\d{1,9})?) SEC$", r"0:00:\1"),
+    (r"^(\d\d?:\d\d:\d\d):(\d{3,9})( ?[AP]M)?$", r"\1.\2\3"),
 )
-# A time of day, or since the start: 12:34:56.789; of pandas 0 days 00:00:01.5.
+# A time of day, or since the start: 12:34:56.789, 12:34:56:789 PM; of pandas 0 days 00:00:01.5.
 _ELAPSED = (
     r"^(?:(?P<days>\d{1,4}) DAYS?,? )?(?P<hours>\d{1,4}):(?P<minutes>\d\d):(?P<seconds>\d{1,9})"
-    r"(?:[.,](?P<fraction>\d{1,9}))?$"
+    r"(?:[.,](?P<fraction>\d{1,9}))? ?(?P<half>[AP]M)?$"
 )
 BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
 _NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
@@ -441,6 +442,11 @@ def _durations(text: pa.ChunkedArray) -> pa.ChunkedArray:
         digits = pc.struct_field(found, part)
         digits = pc.utf8_rpad(digits, 9, "0") if part == "fraction" else digits
         number = pc.if_else(pc.equal(digits, ""), "0", digits).cast(pa.int64())
+        if part == "hours":  # 12:30 AM is half past midnight
+            half = pc.struct_field(found, "half")
+            noon = pc.multiply(12, pc.equal(half, "PM").cast(pa.int64()))
+            clock = pc.subtract(number, pc.multiply(12, pc.equal(number, 12).cast(pa.int64())))
+            number = pc.if_else(pc.equal(half, ""), number, pc.add(clock, noon))
         total = pc.add(pc.multiply(total, factor), number)
     return total.cast(pa.duration("ns"))
 

@@ -9,8 +9,13 @@ import numpy as np
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import counted
 
-_PERIODS = {2**32 * 1_000: "2^32 us", 2**32 * 1_000_000: "2^32 ms"}  # ns, after which counters of 32 bits begin anew
 _HOUR_NS = 3_600_000_000_000
+_PERIODS = {  # ns, after which counters of 32 bits begin anew, and times of day without a date
+    2**32 * 1_000: "2^32 us",
+    2**32 * 1_000_000: "2^32 ms",
+    24 * _HOUR_NS: "midnight",
+    12 * _HOUR_NS: "12 hours",
+}
 _CLOSE = 10  # usual intervals, within which a step is one of these: a dropout may hide some rows
 _FAR_NS = 60_000_000_000  # from all other stamps: a stamp of 0 that is as far is none; rows so far apart tell no step
 _WAITS = 10.0  # times the usual interval, from which a row begins another packet
@@ -20,7 +25,7 @@ _LEAST_WAIT = 0.02  # s, from which it matters
 
 
 def going_on(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
-    """Stamps that go on over wraps of 32 bits and over one step of an hour, zeros apart, and a sentence on each.
+    """Stamps that go on over wraps of 32 bits, midnight and one step of an hour, zeros apart, and a sentence on each.
 
     Args:
         stamp: Of the rows, int64 ns, (rows,).
