@@ -452,7 +452,8 @@ def _seen_before(config: FusionConfig, run: Run, validation: Sequence[Check] | N
 
 def _validation_notes(validation: Sequence[Check] | None, known: bool, interrupted: bool) -> list[str]:
     """What to know of the validation; ``known``: it was on a run that was fitted on."""
-    notes = [f"{one.run}, {one.axis}: {one.verdict}" for one in validation or () if one.worse]
+    beside = "what was fitted, beside what it began with, on measurements that neither was fitted on"
+    notes = [f"{one.run}, {one.axis}: {beside}: {one.verdict}" for one in validation or () if one.worse]
     why = ""
     if validation is None and not interrupted:
         why = "no run was left to validate on (--validate RUN)"
