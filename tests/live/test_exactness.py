@@ -12,7 +12,16 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.run import Source
-from streams import counted, delayed, differences, events_of, feed, fused_in_any_order, outcomes_of
+from streams import (
+    counted,
+    delayed,
+    differences,
+    estimates_are_as_live,
+    events_of,
+    feed,
+    fused_in_any_order,
+    outcomes_of,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -34,9 +43,7 @@ def recorded(name: str) -> tuple[pf.Run, pf.FusionConfig]:
 def test_in_any_order(name: str, longest: float) -> None:
     """Each event up to 1.2 s late, a tenth of them twice: the offline estimates once measurements are in."""
     run, config = recorded(name)
-    offline = pf.fuse(run, config)
-    live = pf.LiveEstimator(config, start=run.start)
-    fused_in_any_order(run, offline, live, longest)
+    fused_in_any_order(run, pf.fuse(run, config), pf.LiveEstimator(config, start=run.start), longest)
 
 
 BENT = ["saturating-servo", "tool-with-play", "sagging-lever"]
@@ -45,17 +52,7 @@ BENT = ["saturating-servo", "tool-with-play", "sagging-lever"]
 @pytest.mark.parametrize("name", ["scan1", "panel-vision", "cylindrical-cartesian", *BENT])
 def test_estimates_at_the_time_are_as_live(name: str) -> None:
     """Fed in order, the estimate at each command is that of `fuse --as-live`."""
-    run, config = recorded(name)
-    offline, live = pf.fuse(run, config, mode="as-live"), pf.LiveEstimator(config, start=run.start)
-    found = [
-        live.estimate(event.stamp)
-        for event in events_of(run)
-        if feed(live, event).outcome is pf.Outcome.FUSED and not event.sensor
-    ]
-    assert [estimate.stamp for estimate in found] == (offline.origin + np.rint(offline.time * 1e9)).astype(int).tolist()
-    for axis, track in offline.axes.items():
-        assert [estimate[axis].position for estimate in found] == track.position.tolist()
-        assert [estimate[axis].position_sd for estimate in found] == track.position_sd.tolist()
+    estimates_are_as_live(*recorded(name))
 
 
 def test_the_frame_is_where_the_first_command_is_however_late_it_comes() -> None:
