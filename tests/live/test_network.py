@@ -13,7 +13,7 @@ import pytest
 import pumafuse as pf
 from pumafuse.live import backlog, network
 from pumafuse.live.address import Address
-from pumafuse.live.network import Connection, Source, TcpClient, TcpListener, UdpListener, UdpSender
+from pumafuse.live.network import Remote, TcpClient, TcpListener, UdpListener, UdpSender
 
 LOOPBACK = (socket.AF_INET, ("127.0.0.1", 0))
 
@@ -22,7 +22,7 @@ def everybody(_: str) -> bool:
     return True
 
 
-def until(source: Source, enough: Callable[[list[bytes]], bool]) -> list[bytes]:
+def until(source: Remote, enough: Callable[[list[bytes]], bool]) -> list[bytes]:
     """Lines as they come, until there are enough; half a minute is too long for anything here."""
     lines, give_up = list[bytes](), time.monotonic() + 30.0
     while not enough(lines):
@@ -236,19 +236,19 @@ class TestTcpClient:
     def test_it_waits_longer_and_longer(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Half a second, twice that, up to half a minute."""
         waits: list[float] = []
-        source = Connection(Address.parse("tcp://127.0.0.1:9"), lambda _: False, lambda _: None)
+        source = TcpClient(Address.parse("tcp://127.0.0.1:9"), lambda _: None)
 
         def wait(seconds: float) -> None:
             waits.append(seconds)
             if len(waits) == 9:
-                source.stop()
+                source._end()
 
         def nobody(*_: object) -> None:
             raise ConnectionRefusedError(111, "Connection refused")
 
         monkeypatch.setattr(source._stopped, "wait", wait)
         monkeypatch.setattr(network.socket, "create_connection", nobody)
-        source.stay_connected()
+        source._stay_connected()
         assert waits == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0]
 
 

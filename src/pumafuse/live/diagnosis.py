@@ -56,7 +56,6 @@ class Recent:
     """What came of commands and measurements in the last seconds, in the arm's axes."""
 
     def __init__(self, config: FusionConfig) -> None:
-        """Nothing yet."""
         self._config, self._axes, self._sensors = config, tuple(config.arm.axes), tuple(config.sensors)
         self._settled = round(max(settled(config, axis) for axis in self._axes) * 1e9)
         self.restart()
@@ -67,14 +66,7 @@ class Recent:
         self._latest, self._start = [ALWAYS] * len(self._sensors), dict[str, float]()
 
     def keep(self, stamp: int, source: int, given: int, values: Array[c_double]) -> None:
-        """Keep an event; of a dense sensor some.
-
-        Args:
-            stamp: Int ns.
-            source: ``COMMAND``, or which sensor.
-            given: Its axes, as bits.
-            values: [m or rad], (A,).
-        """
+        """Keep an event; of a dense sensor some."""
         if source == COMMAND:
             if len(self._start) < len(self._axes):
                 begun = {name: values[axis] for axis, name in enumerate(self._axes) if given >> axis & 1}
@@ -133,19 +125,12 @@ class Recent:
 
 @dataclass
 class _Trouble:
-    """A fault that a look has found.
+    """A fault that a look has found."""
 
-    Attributes:
-        fault: As the last look has found it.
-        travel: How far apart the commands of its axes were then [m or rad].
-        found: In how many looks in a row it was found.
-        missed: In how many looks in a row it was not, though they would have shown it.
-    """
-
-    fault: Fault
-    travel: float = 0.0
-    found: int = 0
-    missed: int = 0
+    fault: Fault  # as the last look has found it
+    travel: float = 0.0  # how far apart the commands of its axes were then [m or rad]
+    found: int = 0  # in how many looks in a row it was found
+    missed: int = 0  # in how many looks in a row it was not, though they would have shown it
 
     @property
     def is_said(self) -> bool:
@@ -154,16 +139,9 @@ class _Trouble:
 
 
 class Diagnosis:
-    """Says once what is wrong with a stream, and once that it is over.
-
-    Attributes:
-        recent: What came in the last seconds.
-        due: When to look again [ns].
-        doubtful: Axes of which the estimate is not to be believed as far as its standard deviation says.
-    """
+    """Says once what is wrong with a stream, and once that it is over."""
 
     def __init__(self, config: FusionConfig, log: RateLimitedLog) -> None:
-        """Diagnose streams of a configuration; ``log`` gets the sentences."""
         self._config, self._log = config, log
         self._axes, self._sensors = tuple(config.arm.axes), tuple(config.sensors)
         self.recent = Recent(config)

@@ -21,7 +21,7 @@ from ..fusion.setup import live_model
 from ..logs.frames import CARTESIAN, Placed
 from ..space.rotations import TURNING
 from ..units import Kind
-from .clock import Clock, Time, Verdict, nanoseconds
+from .clock import Clock, SetBack, Time, Verdict, nanoseconds
 from .commands import Commands, CommandWatch, number
 from .diagnosis import Diagnosis
 from .frame_start import FrameStart
@@ -30,7 +30,6 @@ from .joints import Joints
 from .rate_limit import RateLimitedLog
 from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
 from .screening import NEWS, CommandScreen, HoldWatch, Screened
-from .set_back import SetBack
 from .tool import NO_TOOL, NOISE, ORIENTATION, Row, axes_of, check_tool, row_noise, tool_of
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
@@ -368,11 +367,7 @@ class LiveEstimator:
         return self._begin_segment([one for one, _ in self._behind])
 
     def _parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """An event's values with a pose in the place of joints, and a commanded orientation as axes.
-
-        Raises:
-            ValueError: It cannot be used; says why.
-        """
+        """An event's values with a pose in the place of joints, and a commanded orientation as axes."""
         if self._joints is not None and (told := self._joints.told(values)) is not None:
             values = self._joints.posed(values, told)
         if self._tool is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -17,7 +18,8 @@ from ..errors import ConfigError, reason, suggestion
 from ..logs.bags import DAMAGE
 from ..logs.manifest import Manifest
 from .backlog import MOST, Backlog
-from .messages import Reader
+from .messages import Reader, readers_of
+from .network import EVENT_BYTES
 from .rate_limit import RateLimitedLog
 from .sources import QUIET
 from .wire import Event
@@ -29,64 +31,35 @@ _DEPTH = 1000  # messages of a topic that the middleware keeps
 _MOST_AT_ONCE = 64  # events taken in before the node looks for messages again
 _LOOK = 0.5  # s between two looks at who publishes
 _ALONE = 5.0  # s without a publisher until that is said
-_BYTES = 500  # about, of an event
 
 
+@dataclass
 class Topic:
-    """A topic that is listened to.
+    """A topic that is listened to."""
 
-    Attributes:
-        name: As ``run.toml`` has it.
-        readers: Of the sources that are in its messages.
-        subscription: None until somebody publishes it.
-        kind: The type of messages that is subscribed to.
-        publishers: How many there were at the last look; None before anybody was.
-        lost: How many messages the middleware has lost.
-    """
-
-    def __init__(self, name: str, readers: Sequence[Reader]) -> None:
-        self.name, self.readers = name, readers
-        self.subscription: Any = None
-        self.kind = ""
-        self.publishers: int | None = None
-        self.lost = 0
+    name: str  # as run.toml has it
+    readers: Sequence[Reader]  # of the sources that are in its messages
+    subscription: Any = None  # once somebody publishes it
+    kind: str = ""  # of messages that is subscribed to
+    publishers: int | None = None  # at the last look; None before anybody was
+    lost: int = 0  # messages, by the middleware
 
 
 class Ros2Source:
-    """Events from the topics of a running robot.
-
-    Attributes:
-        node: The node.
-        frame: In which the commands are, by their messages; empty where these do not say.
-        simulated: Whether time is that of a simulation.
-    """
+    """Events from the topics of a running robot, whose commands, and time, may be those of a frame and a simulation."""
 
     def __init__(self, listed: Manifest, arguments: Sequence[str], notify: Callable[[str], None]) -> None:
-        """Make the node; :meth:`start` begins to listen, :meth:`close` ends it.
-
-        Args:
-            listed: What ``run.toml`` says.
-            arguments: ``--ros-args`` and what is behind it.
-            notify: Takes a sentence for the log.
-
-        Raises:
-            ConfigError: There is no ROS 2, it refuses the arguments, or a source of ``run.toml`` has no topic, or none
-                that a node could read.
-        """
-        entries, commanded = (
-            {**listed.sensors, "": listed.command},
-            dict[str, float](),
-        )  # commands of an instant last
-        for name, entry in entries.items():
+        """Make the node, with ``--ros-args`` and what is behind it; :meth:`close` ends it."""
+        for name, entry in {**listed.sensors, "": listed.command}.items():
             if not entry.topic:
                 who = f"sensor '{name}' has" if name else "the commands have"
                 raise ConfigError(f"run.toml: {who} no topic; give the running robot's, as in topic = '/joint_states'")
-        readers = [Reader(name, entry, commanded) for name, entry in entries.items()]
+        readers = readers_of(listed)
         names = dict.fromkeys(one.entry.topic for one in readers)
         self._topics = [Topic(name, [one for one in readers if one.entry.topic == name]) for name in names]
         self._command = readers[-1]
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._backlog = Backlog[Event]("messages", self._log, lambda event: not event.sensor, lambda _: _BYTES)
+        self._backlog = Backlog[Event]("messages", self._log, lambda event: not event.sensor, lambda _: EVENT_BYTES)
         self._burst = list[tuple[int, Event]]()  # by when each was received [ns]
         self._rclpy, no_signals = load("rclpy"), load("rclpy.signals").SignalHandlerOptions.NO  # pumafuse has its own
         try:
@@ -140,8 +113,7 @@ class Ros2Source:
         """How many events came, and how many messages were lost."""
         waited = self._backlog
         lost = sum(topic.lost for topic in self._topics) + waited.dropped
-        text = f"{waited.name}: {waited.received} events, {lost} lost"
-        return f"{text}, {waited.shed} shed" if waited.shed else text
+        return f"{waited.name}: {waited.received} events, {lost} lost{waited.shed_words}"
 
     def clock(self) -> int:
         """The time of the node's clock [ns]."""
@@ -239,11 +211,7 @@ class Ros2Source:
 
 
 def load(module: str) -> Any:
-    """A module of ROS 2.
-
-    Raises:
-        ConfigError: It is not here.
-    """
+    """A module of ROS 2."""
     try:
         return import_module(module)
     except ImportError as error:

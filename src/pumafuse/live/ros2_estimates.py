@@ -29,11 +29,6 @@ class Ros2Estimates:
     """A watcher of a stream that publishes its estimates."""
 
     def __init__(self, source: Ros2Source, live: LiveEstimator) -> None:
-        """Make the publishers of a node that has started.
-
-        Raises:
-            ConfigError: Packages of ROS 2 are missing.
-        """
         self._source, self._live, node = source, live, source.node
         poses, joints = load("geometry_msgs.msg"), load("sensor_msgs.msg")
         self._diagnostic, axes = load("diagnostic_msgs.msg"), live.axes
