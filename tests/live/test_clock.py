@@ -48,7 +48,7 @@ def test_a_command_of_the_right_time_rules_out_a_reset() -> None:
     for step in range(4):
         assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
         if step == 1:
-            clock.confirm()
+            clock.other = []
 
 
 def pair() -> tuple[pf.LiveEstimator, pf.LiveEstimator]:

@@ -70,7 +70,7 @@ class Clock:
         self.ahead_of: str | None = None  # whose stamp raised the latest doubt: a sensor, None for a command
         self._sure: int | None = None  # the newest stamp before a jump ahead that is still in doubt
         self._jumped, self._commands = 0, 0  # where it jumped to, and how many commands have confirmed it
-        self.other: list[int] = []  # stamps of the commands in a row that have another time
+        self.other: list[int] = []  # stamps of the commands in a row that have another time, until one is plainly right
 
     @property
     def doubtful(self) -> bool:
@@ -115,10 +115,6 @@ class Clock:
         self._sure, self._commands = None, 0
         self.newest = newest
         self.low, self.high = newest - self.window, newest + self.window
-
-    def confirm(self) -> None:
-        """Forget commands that had another time, as one has come that is plainly right."""
-        self.other = []
 
     def judge(self, stamp: int, source: str | None) -> Verdict:
         """Judge a stamp that is not between ``low`` and ``high``, and move on to it if it is accepted."""
