@@ -288,6 +288,11 @@ class Both:
     def feed(self, piece: bytes) -> None:
         self.stream.take(self.lines.cut(piece))
 
+    def replay(self, run: pf.Run) -> None:
+        for events in replayed(run, self.live.config, np.inf):
+            self.stream.take(events)
+        self.stream.end()
+
     def end(self) -> None:
         self.stream.take(self.lines.rest())
         self.stream.end()

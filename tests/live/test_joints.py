@@ -28,7 +28,6 @@ from streams import (
     differences,
     estimates_are_as_live,
     events_of,
-    record_is_as_live,
     replay_is_as_live,
     wired,
 )
@@ -147,13 +146,6 @@ def test_a_stray_joint_takes_its_pose_with_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(later.values["x"][~run.command.stray], clean.values["x"])
 
 
-def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path, run: pf.Run, config: pf.FusionConfig) -> None:
-    """Lines in degrees."""
-    found, _, given = record_is_as_live(tmp_path / "record", run, config)
-    assert found.command.joints is not None and found.sensors["tracker"].joints is None
-    assert len(given) == len(run.command.stamp)
-
-
 def test_a_configuration_keeps_its_robot(tmp_path: Path, config: pf.FusionConfig) -> None:
     """Saved and loaded again, from anywhere, it reads joints to the same poses; what is saved says the same again."""
     (tmp_path / "saved").mkdir()
@@ -224,14 +216,18 @@ def test_joints_on_the_wire() -> None:
         LineDecoder(ARM.kind_of, framed=False, joints={"t": "angle"})
 
 
-def test_lines_in_joints_as_a_user_gives_them(tmp_path: Path) -> None:
+def test_lines_in_joints_as_a_user_gives_them(tmp_path: Path, run: pf.Run, config: pf.FusionConfig) -> None:
     """`[robot]` in fusion.toml is all that `pumafuse live` needs: the estimates are those of the record as live."""
-    run = run_of(tmp_path, seconds=2.0)
     (tmp_path / "saved").mkdir()
-    known(run).save(tmp_path / "saved")
+    config.save(tmp_path / "saved")
     words = [EXECUTABLE, "live", "stdin", "-c", tmp_path / "saved" / "fusion.toml", "--record", tmp_path / "record"]
     done = subprocess.run(words, input=b"\n".join(wired(run)) + b"\n", capture_output=True, timeout=120, check=True)
     assert b"not heeded" not in done.stderr
-    offline = pf.fuse(pf.Run.read(tmp_path / "record"), known(run), mode="as-live")
-    found = [json.loads(line)["x"]["position_mm"] for line in done.stdout.splitlines()]
-    assert found == (offline.axes["x"].position * 1e3).tolist()
+    found = pf.Run.read(tmp_path / "record")
+    assert found.notes == () and len(found.command.stamp) == len(run.command.stamp)
+    assert found.command.joints is not None and found.sensors["tracker"].joints is None
+    offline, given = pf.fuse(found, config, mode="as-live"), [json.loads(line) for line in done.stdout.splitlines()]
+    for axis, track in offline.axes.items():
+        unit, scale = ("deg", 180.0 / math.pi) if axis.startswith("r") else ("mm", 1e3)
+        assert [one[axis][f"position_{unit}"] for one in given] == (track.position * scale).tolist()
+        assert [one[axis][f"sd_{unit}"] for one in given] == (track.position_sd * scale).tolist()
