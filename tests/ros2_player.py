@@ -2,8 +2,8 @@
 
     python ros2_player.py BAG OUT NODE TOPIC...
 
-Messages go out at the pace of their recording, once the node listens to the topics and tells that it is there. OUT gets
-a JSON object a line: of a topic its stamp [ns] and numbers.
+Messages go out at the pace of their recording, once the node tells that it is there and listens to the topics, each of
+which has as many publishers as it is named. OUT gets a JSON object a line: of a topic its stamp [ns] and numbers.
 """
 
 from __future__ import annotations
@@ -73,8 +73,10 @@ def play(bag: Path, out: Path, name: str, topics: Sequence[str]) -> None:
     def told() -> int:
         return sum(one["topic"] == "diagnostics" for one in written)
 
-    wait(time.time() + LONGEST, lambda: told() > 0)
-    wait(time.time() + LONGEST, lambda: all(publishers[one].get_subscription_count() for one in topics))
+    def are_there(topic: str) -> bool:
+        return publishers[topic].get_subscription_count() and node.count_publishers(topic) >= topics.count(topic)
+
+    wait(time.time() + LONGEST, lambda: told() > 0 and all(map(are_there, topics)))
     later = time.time() - records[0].time / 1e9
     for record in records:
         wait(record.time / 1e9 + later)

@@ -156,9 +156,9 @@ def test_publishers_come_late_leave_and_return(tmp_path: Path, start: Callable[.
     node = start(tmp_path, "--ros-args", *arguments)
     node.until("/command: nobody publishes it so far")
     bag_files.mcap(tmp_path / "drive.mcap", bag_files.motion(20))
-    words = player(tmp_path, "left", "/command", "/camera")
+    words = player(tmp_path, "left", "/command", "/command", "/camera")
     with subprocess.Popen([*words[:3], str(tmp_path / "second.jsonl"), *words[4:]]):
-        played(tmp_path, bag_files.motion(20), "left")
+        subprocess.run(words, check=True, timeout=LONGEST)
     log = node.until("/command: nobody publishes it any more")
     assert "/command: 2 publishers" in log
     assert "/level: is of type std_msgs/msg/Float64, which has no header.stamp, position[slide]" in log

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from array import array
+import operator
 from collections import deque
 from collections.abc import Mapping, Sequence
 from ctypes import Array, c_double
@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import ALWAYS, FloatArray, IndexArray, IntArray, TimeArray
+from ..arrays import ALWAYS, IndexArray, IntArray, TimeArray
 from ..errors import PumafuseError
 from ..filter.events import COMMAND, Results
 from ..filter.outcome import Outcome
@@ -62,11 +62,11 @@ class Recent:
 
     def restart(self) -> None:
         """Begin anew."""
-        self._stamp, self._source, self._given, self._value = array("q"), array("q"), array("q"), array("d")
+        self._rows = list[tuple[int, int, int, bytes]]()  # stamp, source, given axes as bits, values
         self._latest, self._start = [ALWAYS] * len(self._sensors), dict[str, float]()
 
     def keep(self, stamp: int, source: int, given: int, values: Array[c_double]) -> None:
-        """Keep an event; of a dense sensor some."""
+        """Keep an event: its values [m or rad], (A,), of axes given as bits; of a dense sensor some."""
         if source == COMMAND:
             if len(self._start) < len(self._axes):
                 begun = {name: values[axis] for axis, name in enumerate(self._axes) if given >> axis & 1}
@@ -75,21 +75,19 @@ class Recent:
             return
         else:
             self._latest[source] = stamp
-        self._stamp.append(stamp)
-        self._source.append(source)
-        self._given.append(given)
-        self._value.frombytes(bytes(values))
+        self._rows.append((stamp, source, given, bytes(values)))
 
     def forget(self, after: int) -> None:
         """Take back what is stamped after ``after`` [ns]."""
-        self._cut(ALWAYS, after)
+        self._rows = [row for row in self._rows if row[0] <= after]
         self._latest = [min(stamp, after) for stamp in self._latest]
 
     def segment(self, now: int) -> Segment | None:
         """What came in the span before ``now`` [ns]; None where that is too little. What is older is forgotten."""
-        stamp, source, given, value = self._cut(now - _SPAN_NS, now)
-        order = np.argsort(stamp, kind="stable")
-        stamp, source, given, value = stamp[order], source[order], given[order], value[order]
+        self._rows = [row for row in self._rows if now - _SPAN_NS < row[0] <= now]
+        ordered = sorted(self._rows, key=operator.itemgetter(0))
+        stamp, source, given = np.array([row[:3] for row in ordered], dtype=np.int64).reshape(-1, 3).T
+        value = np.frombuffer(bytearray().join(row[3] for row in ordered)).reshape(-1, len(self._axes))
         commands = source == COMMAND
         if not commands.any() or stamp[-1] - stamp[commands][0] < _SHORTEST_NS:
             return None
@@ -111,16 +109,6 @@ class Recent:
             return build(run, self._config)
         except PumafuseError:  # of what is there nothing can be made
             return None
-
-    def _cut(self, after: int, until: int) -> tuple[TimeArray, IntArray, IntArray, FloatArray]:
-        """Keep what is stamped after one time and until another [ns]; that, in the order in which it came."""
-        stamp, source, given = (np.array(one, dtype=np.int64) for one in (self._stamp, self._source, self._given))
-        value = np.array(self._value).reshape(-1, len(self._axes))
-        kept = (stamp > after) & (stamp <= until)
-        stamp, source, given, value = stamp[kept], source[kept], given[kept], value[kept]
-        self._stamp, self._source, self._given = (array("q", one.tobytes()) for one in (stamp, source, given))
-        self._value = array("d", value.tobytes())
-        return stamp, source, given, value
 
 
 @dataclass

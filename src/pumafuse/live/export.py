@@ -109,5 +109,4 @@ def _exact(number: float) -> str:
 
 
 def _comment(text: str) -> str:
-    """A text that may stand in a comment."""
     return text.replace("*/", "* /").replace("/*", "/ *")

@@ -209,7 +209,6 @@ class Reader:
         return None if self._next is None else self._next.time_ns
 
     def _event(self, row: Any, received: int) -> Iterator[Event]:
-        """The event of a row, if it is one of the source's."""
         if not self._met(row):
             return
         values: dict[str, Any] = {axis: sum(one(row) for one in numbers) for axis, numbers in self._values.items()}

@@ -98,7 +98,6 @@ class UdpListener:
         return f"{text}, {self._refused} refused" if self._refused else text
 
     def _lines(self, most: int) -> list[bytes]:
-        """The lines of at most so many datagrams."""
         return [line for datagram in self._backlog.take(most) for line in datagram.split(b"\n")]
 
     def _receive(self, most: int) -> None:

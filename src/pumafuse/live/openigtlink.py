@@ -63,7 +63,6 @@ class OpenIgtLinkSource(EventClient):
             yield list(self._events(message))
 
     def _events(self, message: _Message) -> Iterator[Event]:
-        """The event of each device of a message."""
         stamp = time.time_ns() if self._on_receipt or not message.stamp else message.stamp
         for device, pose in _poses(message):
             values = self._values(pose if message.seen else [math.nan] * len(pose))

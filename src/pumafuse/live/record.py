@@ -170,7 +170,6 @@ class Recorder:
                 return folder
 
     def _clear(self) -> None:
-        """Begin a run without rows."""
         self._pending: list[_Row] = []
         self._newest: dict[str | None, int] = {}  # stamp of each source
         self._seen: dict[str | None, set[str]] = {}  # axes of each source
@@ -287,7 +286,6 @@ class Writer:
             self.rows += job.number
 
     def _begin(self, folder: Path) -> None:
-        """Begin a run in a folder."""
         self._folder, self._manifest = folder, ""
         self._sizes: dict[str, int] = {}  # of each file, as far as its rows are complete
 

@@ -225,7 +225,6 @@ class CommandedTurn:
         return stamp + min(self._delay) if place else ALWAYS
 
     def _after(self, place: int, axis: int) -> Record:
-        """What an axis does after a command."""
         motion = self._motion[place - 1][axis].copy() if place else at_rest()
         given, relative = self._commands(slice(place, place + 1), axis)
         follow(self._axes[axis], motion, given, relative, np.empty(0, np.int64))
