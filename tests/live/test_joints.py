@@ -62,7 +62,7 @@ def joints_at(time: np.ndarray) -> np.ndarray:
     return 0.4 * np.sin(time[:, None] * np.linspace(0.7, 1.9, 6) + phase) + [0.1, -0.6, 0.9, 0.2, 0.5, -0.3]
 
 
-def run_of(folder: Path, seconds: float = 6.0, stray: int | None = None) -> pf.Run:
+def run_of(folder: Path, seconds: float = 5.0, stray: int | None = None) -> pf.Run:
     """A recorded run in joints, whose tracker tells no orientation; one value of j4 is nobody's, if asked for."""
     rng = np.random.default_rng(4)
     given = np.arange(0, round(seconds * 1e9), 28_000_000)

@@ -79,7 +79,7 @@ def seen(sensor: pf.Sensor, at: np.ndarray, turned: Rotation, rng: np.random.Gen
     return point + rng.normal(0.0, 1e-4, point.shape), noise * (stands.inv() * turned * on_tool)
 
 
-def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 6.0, noisy: bool = False) -> pf.Run:
+def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 4.1, noisy: bool = False) -> pf.Run:
     """A run of commands and of all sensors, of which the tracker tells no orientation; ``noisy``: some rows more."""
     rng, lag = np.random.default_rng(8), 0.086
     given = np.sort(
