@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from hypothesis import given, settings
 import pumafuse as pf
 from pumafuse.arrays import ALWAYS, FloatArray
 from pumafuse.filter import window
-from streams import MS, T, any_stream, check_in_any_order, counted, differences, events_of, feed
+from streams import MS, Event, T, any_stream, check_in_any_order, counted, delayed, differences, events_of, feed
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 GAIN = pf.Gain(slope=0.05, intercept=0.98)
@@ -146,6 +148,29 @@ def test_any_clock_gives_the_same_estimates(stamp: int) -> None:
 # ---- any stream -----------------------------------------------------------------------------------------------------
 
 
+@settings(max_examples=40)
+@given(any_stream())
+def test_any_order_of_arrival_gives_the_same_window(
+    drawn: tuple[pf.FusionConfig, pf.Run, int],
+) -> None:
+    """Estimates and counts are those of the events by stamp; only of one stamp and source the order counts.
+
+    Which axes are in doubt is told by what has come so far.
+    """
+    (config, run, seed), events = drawn, events_of(drawn[1])
+    in_order, shuffled = (pf.LiveEstimator(config, window=20.0, start=run.start) for _ in range(2))
+    for event in events:
+        feed(in_order, event)
+    queues: dict[tuple[int, str], list[Event]] = {}
+    for event in events:
+        queues.setdefault((event.stamp, event.sensor), []).append(event)
+    for event in delayed(events, 5.0, seed):  # ties keep their order: whoever comes, the first of its queue goes
+        feed(shuffled, queues[event.stamp, event.sensor].pop(0))
+    assert counted(shuffled) == counted(in_order)
+    for time in range(events[0].stamp, events[-1].stamp + 100 * MS, 130 * MS):
+        assert replace(shuffled.estimate(time), doubtful=()) == replace(in_order.estimate(time), doubtful=())
+
+
 @settings(max_examples=35)
 @given(any_stream())
 def test_a_window_of_a_millisecond_is_enough_for_a_stream_in_order(
@@ -162,7 +187,7 @@ def test_a_window_of_a_millisecond_is_enough_for_a_stream_in_order(
     assert counted(narrow) == counted(wide)
 
 
-@settings(max_examples=80)
+@settings(max_examples=60)
 @given(any_stream())
 def test_any_stream_is_fused_as_offline(drawn: tuple[pf.FusionConfig, pf.Run, int]) -> None:
     """In any order of arrival: the same outcomes and, at every command, the same bits."""
