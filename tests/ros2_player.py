@@ -1,9 +1,9 @@
 """A process of its own that plays a bag of ROS 2 and writes down what `pumafuse live` publishes; run as a script.
 
-    python ros2_player.py BAG OUT [NODE]
+    python ros2_player.py BAG OUT NODE TOPIC...
 
-Each message goes out when it was recorded, by this computer's clock: the bag is of the near future. OUT gets a JSON
-object a line: of a topic its stamp [ns] and numbers.
+Messages go out at the pace of their recording, once the node tells that it is there and listens to the topics, each of
+which has as many publishers as it is named. OUT gets a JSON object a line: of a topic its stamp [ns] and numbers.
 """
 
 from __future__ import annotations
@@ -11,17 +11,18 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pumafuse.logs.bags import Faults, records_of
 
-BEFORE_NS = 2 * 10**9  # the node looks for publishers twice a second
-AFTER_S = 1.5  # diagnostics come once a second
+LONGEST = 30.0  # s that anything here may take
+DIAGNOSTICS = 2  # that come after the last message, one a second: then all estimates have come
 
 
-def play(bag: Path, out: Path, name: str) -> None:
+def play(bag: Path, out: Path, name: str, topics: Sequence[str]) -> None:
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -65,16 +66,25 @@ def play(bag: Path, out: Path, name: str) -> None:
     executor = rclpy.executors.SingleThreadedExecutor()
     executor.add_node(node)
 
-    def wait(until: float) -> None:
-        while (left := until - time.time()) > 0.0:
-            executor.spin_once(timeout_sec=left)
+    def wait(until: float, enough: Callable[[], bool] = lambda: False) -> None:
+        while not enough() and (left := until - time.time()) > 0.0:
+            executor.spin_once(timeout_sec=min(left, 0.05))
 
+    def told() -> int:
+        return sum(one["topic"] == "diagnostics" for one in written)
+
+    def are_there(topic: str) -> bool:
+        return publishers[topic].get_subscription_count() and node.count_publishers(topic) >= topics.count(topic)
+
+    wait(time.time() + LONGEST, lambda: told() > 0 and all(map(are_there, topics)))
+    later = time.time() - records[0].time / 1e9
     for record in records:
-        wait(record.time / 1e9)
+        wait(record.time / 1e9 + later)
         publishers[record.channel.topic].publish(record.payload)
-    wait(time.time() + AFTER_S)
+    enough = told() + DIAGNOSTICS
+    wait(time.time() + LONGEST, lambda: told() >= enough)
     out.write_text("".join(json.dumps(one) + "\n" for one in written))
 
 
 if __name__ == "__main__":
-    play(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3] if len(sys.argv) > 3 else "pumafuse")
+    play(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3], sys.argv[4:])

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.arrays import NO_STAMP
+from pumafuse.live.record import Recorder
 from pumafuse.live.sources import replayed
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import Lines
@@ -31,7 +35,8 @@ class Event(NamedTuple):
 def events_of(run: pf.Run) -> list[Event]:
     """All rows of a run in the order of their stamps, measurements before commands of the same instant."""
     found = []
-    for sensor, source in [("", run.command), *run.sensors.items()]:
+    for sensor, one in [("", run.command), *run.sensors.items()]:
+        source = one.in_joints()
         columns = {axis: value.tolist() for axis, value in source.values.items()}
         if source.orientation is not None:
             columns["orientation"] = source.orientation.tolist()
@@ -44,12 +49,19 @@ def events_of(run: pf.Run) -> list[Event]:
     return sorted(found, key=lambda event: (event.stamp, event.sensor == ""))
 
 
-def wired(run: pf.Run, seconds: float) -> list[bytes]:
-    """A run's first seconds on the wire."""
+def wired(run: pf.Run, seconds: float = math.inf) -> list[bytes]:
+    """A run's first seconds on the wire: joints in degrees, positions in mm."""
+    joints = () if run.command.joints is None else run.command.joints.chain.joints
     found = []
     for event in events_of(run):
         if event.stamp < seconds * 1e9:
-            values = {axis: value * 1e3 for axis, value in event.values.items()}
+            values = {
+                axis: math.degrees(value) if axis in joints else value * 1e3
+                for axis, value in event.values.items()
+                if axis not in ("orientation", "noise")
+            }
+            values |= {"q": event.values["orientation"]} if "orientation" in event.values else {}
+            values |= {"noise": event.values["noise"]} if "noise" in event.values else {}
             body = {"sensor": event.sensor, **values} if event.sensor else {"command": values}
             found.append(json.dumps({"t_ns": event.stamp, **body}).encode())
     return found
@@ -158,6 +170,41 @@ def replay_is_as_live(run: pf.Run, config: pf.FusionConfig) -> None:
         assert last[axis].position_sd == track.position_sd[-1]
 
 
+def estimates_are_as_live(run: pf.Run, config: pf.FusionConfig) -> pf.Estimates:
+    """Assert that the estimate at each command of a stream in order is that of `fuse --as-live`, which is returned."""
+    offline, live = pf.fuse(run, config, mode="as-live"), pf.LiveEstimator(config, start=run.start)
+    found = [
+        live.estimate(event.stamp)
+        for event in events_of(run)
+        if feed(live, event).outcome is pf.Outcome.FUSED and not event.sensor
+    ]
+    assert [estimate.stamp for estimate in found] == (offline.origin + np.rint(offline.time * 1e9)).astype(int).tolist()
+    for axis, track in offline.axes.items():
+        assert [estimate[axis].position for estimate in found] == track.position.tolist()
+        assert [estimate[axis].position_sd for estimate in found] == track.position_sd.tolist()
+    return offline
+
+
+def record_is_as_live(folder: Path, run: pf.Run, config: pf.FusionConfig) -> tuple[pf.Run, pf.Estimates, list[dict]]:
+    """Assert that what goes out for lines of a run is, to the bit, its record as live; these, and what went out."""
+    recorder = Recorder(folder, config, dict(run.start), lambda _: None)
+    live, written = pf.LiveEstimator(config, start=run.start, event_log=recorder), list[bytes]()
+    stream = Stream(live, written.extend, lambda _: None)
+    for one in wired(run):
+        stream.take([one])
+        recorder.tick(live.sure)
+    recorder.close(live.sure)
+    found = pf.Run.read(folder)
+    assert found.notes == ()
+    offline = pf.fuse(found, msgspec.structs.replace(config, robot=None), mode="as-live")
+    given = [json.loads(line) for line in written]
+    for axis, track in offline.axes.items():
+        unit, scale = ("deg", 180.0 / math.pi) if config.arm.axes[axis].kind == "angle" else ("mm", 1e3)
+        assert [one[axis][f"position_{unit}"] for one in given] == (track.position * scale).tolist()
+        assert [one[axis][f"sd_{unit}"] for one in given] == (track.position_sd * scale).tolist()
+    return found, offline, given
+
+
 def fused_in_any_order(
     run: pf.Run, offline: pf.Estimates, live: pf.LiveEstimator, longest: float
 ) -> dict[str, dict[str, int]]:
@@ -240,6 +287,11 @@ class Both:
 
     def feed(self, piece: bytes) -> None:
         self.stream.take(self.lines.cut(piece))
+
+    def replay(self, run: pf.Run) -> None:
+        for events in replayed(run, self.live.config, np.inf):
+            self.stream.take(events)
+        self.stream.end()
 
     def end(self) -> None:
         self.stream.take(self.lines.rest())

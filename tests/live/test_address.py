@@ -33,12 +33,28 @@ def test_sources_are_parsed(text: str, expected: Address) -> None:
         *("replay:a?speed=0", "replay:a?speed=fast", "replay:a?x=1"),
         *("udp:127.0.0.1:5005", "udp://127.0.0.1", "udp://127.0.0.1:66000", "udp://127.0.0.1:port"),
         *("udp://user@127.0.0.1:5005", "udp://127.0.0.1:5005/path", "udp://[127.0.0.1:5005"),
-        *("tcp://:5005", "tcp://127.0.0.1:0"),
+        *("tcp://:5005", "tcp://127.0.0.1:0", "igtl:a"),
     ],
 )
 def test_other_sources_are_refused(text: str) -> None:
     """With what is accepted."""
     with pytest.raises(pf.ConfigError, match="source"):
+        Address.parse(text)
+
+
+@pytest.mark.parametrize("text", ["igtl://", "igtl://a/b", "igtl://a:b", "igtl://a?time=sent"])
+def test_servers_of_poses_are_refused(text: str) -> None:
+    """With what is expected."""
+    with pytest.raises(pf.ConfigError, match="expected igtl://HOST"):
+        Address.parse(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["rtde:run.toml", "rtde:run.toml?host=", "rtde:?host=a", "rtde:run.toml?port=3", "rtde:run.toml?host=a/b"]
+)
+def test_robots_without_a_host_are_refused(text: str) -> None:
+    """With what is expected."""
+    with pytest.raises(pf.ConfigError, match=r"expected rtde:run\.toml\?host=HOST"):
         Address.parse(text)
 
 

@@ -48,30 +48,29 @@ def test_a_command_of_the_right_time_rules_out_a_reset() -> None:
     for step in range(4):
         assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
         if step == 1:
-            clock.confirm()
+            clock.other = []
 
 
-def pair() -> tuple[pf.LiveEstimator, pf.LiveEstimator]:
-    """An estimator that gets wrong stamps, too, and one that does not."""
-    return pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)
-
-
-@pytest.mark.parametrize("off", [30.0, -30.0, 86_400.0 * 365])
-def test_one_sensor_of_another_clock_disturbs_nobody(off: float) -> None:
-    """A sensor whose clock is wrong from the beginning on: the estimate is that without it, and the filter goes on."""
-    live, alone = pair()
+@pytest.mark.parametrize(
+    "off", [{"camera": 30.0}, {"camera": -30.0}, {"camera": 86_400.0 * 365}, {"tracker": 30.0, "camera": 60.0}]
+)
+def test_sensors_of_other_clocks_disturb_nobody(off: dict[str, float]) -> None:
+    """Wrong from the beginning on: no restart, and the estimate is that without them. Two do not confirm each other."""
+    live, alone = pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)
     for step in range(501):
         t = 0.028 * step
         for one in (live, alone):
             one.command(t, radial=0.5 + 1e-4 * step)
-            one.measurement(t + 0.01, "tracker", radial=0.5 + 1e-4 * step)
+            if "tracker" not in off:
+                one.measurement(t + 0.01, "tracker", radial=0.5 + 1e-4 * step)
         if step < 500:
-            live.measurement(t + 0.012 + off, "camera", radial=0.9)
-    assert live.estimate(14.0)["radial"] == alone.estimate(14.0)["radial"]
+            for sensor, by in off.items():
+                live.measurement(t + 0.012 + by, sensor, radial=0.9)
+    assert live.estimate(14.0) == alone.estimate(14.0)
     assert live.segment == 0
-    outcomes = live.health().sensors["camera"].outcomes
-    assert outcomes["too_late" if off < 0 else "invalid"] == 500
-    assert live.health().sensors["tracker"].outcomes["fused"] == 501
+    health = live.health()
+    assert health.sensors["camera"].outcomes["too_late" if off["camera"] < 0 else "invalid"] == 500
+    assert "tracker" in off or health.sensors["tracker"].outcomes["fused"] == 501
 
 
 def test_a_wild_command_is_taken_back() -> None:
@@ -105,21 +104,6 @@ def test_a_measurement_cannot_contradict_a_command() -> None:
     assert abs(live.estimate()["radial"].position - 0.51) < 1e-3
     assert 690 < health.sensors["tracker"].outcomes["too_late"] < 700
     assert notices == []
-
-
-def test_two_sensors_that_are_wrong_do_not_confirm_each_other() -> None:
-    """One 30 s ahead, one 60 s ahead, and right commands: no restart, and the estimate is that of the commands."""
-    live, alone = pair()
-    for step in range(501):
-        t = 0.028 * step
-        for one in (live, alone):
-            one.command(t, radial=0.5 + 1e-4 * step)
-        if step < 500:
-            live.measurement(t + 30.0, "tracker", radial=0.9)
-            live.measurement(t + 60.0, "camera", radial=0.1)
-    assert live.segment == 0
-    assert live.estimate(14.0) == alone.estimate(14.0)
-    assert live.health().sensors["camera"].outcomes["invalid"] == 500
 
 
 def test_an_axis_that_only_a_wild_command_gave_is_forgotten() -> None:
@@ -212,8 +196,10 @@ def streamed(
     return live, notices, worst
 
 
-@pytest.mark.parametrize("rate", [10.0, 100.0, 1000.0])
-@pytest.mark.parametrize("by", [0.12, 0.3, 0.5, 0.9, 1.8])
+@pytest.mark.parametrize(
+    ("by", "rate"),
+    [(0.12, 10.0), (0.9, 10.0), (0.12, 100.0), (0.3, 100.0), (0.5, 100.0), (1.8, 100.0), (0.3, 1000.0)],
+)
 def test_all_clocks_that_are_set_back_begin_a_segment(by: float, rate: float) -> None:
     """As by NTP or a leap second: said with its size, nothing is lost nor counted twice, and estimates go on."""
     live, notices, worst = streamed({"": by, "tracker": by}, rate=rate)
@@ -221,8 +207,6 @@ def test_all_clocks_that_are_set_back_begin_a_segment(by: float, rate: float) ->
     assert "all clocks were set back by" in told
     assert float(told.split(" by ")[1].split(" s at")[0]) == pytest.approx(by, abs=0.002)
     assert live.segment == 1 and worst < 5e-4
-    _, _, undisturbed = streamed({}, rate=rate)
-    assert undisturbed < 5e-4
     health = live.health()
     assert health.commands["fused"] == sum(health.commands.values()) == 358
     tracker = health.sensors["tracker"]

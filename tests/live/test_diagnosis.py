@@ -196,7 +196,7 @@ def test_the_wire_says_which_axes_are_doubtful() -> None:
 GOOD = ("fast-arm", "panel-tracker-outage", "panel-vision", "saturating-servo", "smooth-disturbance", "tool-with-play")
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", GOOD)
 def test_a_good_stream_says_nothing(name: str, seed: int) -> None:
     """With outliers, outages, play and limits that the model has."""

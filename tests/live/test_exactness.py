@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
@@ -12,31 +13,43 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.run import Source
-from streams import counted, delayed, differences, events_of, feed, fused_in_any_order, outcomes_of
+from streams import (
+    counted,
+    delayed,
+    differences,
+    estimates_are_as_live,
+    events_of,
+    feed,
+    fused_in_any_order,
+    outcomes_of,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 RUNS = sorted(path.stem for path in SCENARIOS.glob("*.toml") if "[trajectory]" in path.read_text(encoding="utf-8"))
 
 
-def recorded(name: str) -> tuple[pf.Run, pf.FusionConfig]:
-    """A run whose commands' stamps are believed, as a stream's are, and a configuration with the run's frame."""
+@cache
+def recorded(name: str, seconds: float = 1e9) -> tuple[pf.Run, pf.FusionConfig]:
+    """The first seconds of a run whose commands' stamps are believed, as a stream's are; its frame is configured."""
     if name == "scan1":
         data = files("pumafuse") / "data"
-        return pf.Run.read(str(data / "scan1")), pf.FusionConfig.load(str(data / "fusion.toml"))
-    simulated = pf.simulate(pf.Scenario.load(SCENARIOS / f"{name}.toml"))
-    run, config = replace(simulated.run, clock="stamps"), simulated.config
-    return run, config if run.frame is None else msgspec.structs.replace(config, frame=run.frame)
+        run, config = pf.Run.read(str(data / "scan1")), pf.FusionConfig.load(str(data / "fusion.toml"))
+    else:
+        simulated = pf.simulate(pf.Scenario.load(SCENARIOS / f"{name}.toml"))
+        run, config = replace(simulated.run, clock="stamps"), simulated.config
+        config = config if run.frame is None else msgspec.structs.replace(config, frame=run.frame)
+    until = run.command.stamp[0] + seconds * 1e9
+    command, *sensors = (one.rows(one.stamp <= until) for one in (run.command, *run.sensors.values()))
+    return replace(run, command=command, sensors=dict(zip(run.sensors, sensors, strict=True)), reference=None), config
 
 
 @pytest.mark.parametrize("longest", [pytest.param(0.0, marks=pytest.mark.long), 1.2])
 @pytest.mark.parametrize("name", ["scan1", *RUNS])
 def test_in_any_order(name: str, longest: float) -> None:
     """Each event up to 1.2 s late, a tenth of them twice: the offline estimates once measurements are in."""
-    run, config = recorded(name)
-    offline = pf.fuse(run, config)
-    live = pf.LiveEstimator(config, start=run.start)
-    fused_in_any_order(run, offline, live, longest)
+    run, config = recorded(name, 10.0 if longest else 1e9)
+    fused_in_any_order(run, pf.fuse(run, config), pf.LiveEstimator(config, start=run.start), longest)
 
 
 BENT = ["saturating-servo", "tool-with-play", "sagging-lever"]
@@ -45,17 +58,7 @@ BENT = ["saturating-servo", "tool-with-play", "sagging-lever"]
 @pytest.mark.parametrize("name", ["scan1", "panel-vision", "cylindrical-cartesian", *BENT])
 def test_estimates_at_the_time_are_as_live(name: str) -> None:
     """Fed in order, the estimate at each command is that of `fuse --as-live`."""
-    run, config = recorded(name)
-    offline, live = pf.fuse(run, config, mode="as-live"), pf.LiveEstimator(config, start=run.start)
-    found = [
-        live.estimate(event.stamp)
-        for event in events_of(run)
-        if feed(live, event).outcome is pf.Outcome.FUSED and not event.sensor
-    ]
-    assert [estimate.stamp for estimate in found] == (offline.origin + np.rint(offline.time * 1e9)).astype(int).tolist()
-    for axis, track in offline.axes.items():
-        assert [estimate[axis].position for estimate in found] == track.position.tolist()
-        assert [estimate[axis].position_sd for estimate in found] == track.position_sd.tolist()
+    estimates_are_as_live(*recorded(name, 10.0))
 
 
 def test_the_frame_is_where_the_first_command_is_however_late_it_comes() -> None:
@@ -80,12 +83,12 @@ def test_a_clock_set_back_begins_a_segment_as_offline() -> None:
         return replace(source, stamp=np.concatenate((source.stamp, again)), values=values)
 
     doubled = replace(run, command=twice(run.command), sensors={n: twice(s) for n, s in run.sensors.items()})
-    doubled = replace(doubled, reference=None, start={})
+    doubled = replace(doubled, start={})
     offline = pf.fuse(doubled, config)
     assert offline.segment.max() == 1
     notices: list[str] = []
     live = pf.LiveEstimator(config, start=doubled.start, on_notice=notices.append)
-    first = events_of(replace(run, reference=None, start={}))
+    first = events_of(replace(run, start={}))
     for event in first:
         feed(live, event)
     second = [event._replace(stamp=event.stamp - int(20e9)) for event in first]

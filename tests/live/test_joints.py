@@ -19,13 +19,18 @@ import pumafuse as pf
 from executable import EXECUTABLE
 from pumafuse.fusion.config import Placement
 from pumafuse.fusion.placing import with_tool
-from pumafuse.live.record import Recorder
-from pumafuse.live.stream import Stream
 from pumafuse.live.wire import LineDecoder
 from pumafuse.logs.clock import without_strays
 from pumafuse.logs.manifest import chain_of
 from pumafuse.model.arm import Joint
-from streams import Event, delayed, differences, feed, replay_is_as_live
+from streams import (
+    delayed,
+    differences,
+    estimates_are_as_live,
+    events_of,
+    replay_is_as_live,
+    wired,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 URDF = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"
@@ -57,7 +62,7 @@ def joints_at(time: np.ndarray) -> np.ndarray:
     return 0.4 * np.sin(time[:, None] * np.linspace(0.7, 1.9, 6) + phase) + [0.1, -0.6, 0.9, 0.2, 0.5, -0.3]
 
 
-def run_of(folder: Path, seconds: float = 6.0, stray: int | None = None) -> pf.Run:
+def run_of(folder: Path, seconds: float = 5.0, stray: int | None = None) -> pf.Run:
     """A recorded run in joints, whose tracker tells no orientation; one value of j4 is nobody's, if asked for."""
     rng = np.random.default_rng(4)
     given = np.arange(0, round(seconds * 1e9), 28_000_000)
@@ -89,58 +94,42 @@ def run_of(folder: Path, seconds: float = 6.0, stray: int | None = None) -> pf.R
     return replace(run, sensors={**run.sensors, "tracker": tracker})
 
 
-def events_of(run: pf.Run) -> list[Event]:
-    """All rows as they come on the wire, measurements before commands of the same instant."""
-    found = []
-    for sensor, source in [("", run.command), *run.sensors.items()]:
-        one = source.in_joints()
-        for row, stamp in enumerate(one.stamp.tolist()):
-            found.append(Event(stamp, sensor, {axis: float(value[row]) for axis, value in one.values.items()}))
-    return sorted(found, key=lambda event: (event.stamp, event.sensor == ""))
-
-
 def known(run: pf.Run, arm: pf.ArmModel = ARM) -> pf.FusionConfig:
     return with_tool(pf.FusionConfig(arm=arm, sensors=SENSORS), run)
 
 
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> pf.Run:
+    return run_of(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="module")
+def config(run: pf.Run) -> pf.FusionConfig:
+    return known(run)
+
+
 @pytest.mark.parametrize("longest", [0.0, 1.2])
 @pytest.mark.parametrize("later", [True, False])
-def test_in_any_order(longest: float, later: bool, tmp_path: Path) -> None:
-    """Each event up to 1.2 s late, a tenth twice: the offline estimates, also where joints answer later."""
-    run = run_of(tmp_path)
+def test_in_any_order(longest: float, later: bool, run: pf.Run) -> None:
+    """Each event up to 1.2 s late, a tenth twice: the offline estimates, also where joints answer later.
+
+    Late commands change the poses of others, which are the same commands: of each one is counted.
+    """
     config = known(run, ARM if later else msgspec.structs.replace(ARM, joints={}))
     offline, live = pf.fuse(run, config), pf.LiveEstimator(config)
     events = events_of(run)
     arrivals = delayed(events, longest, seed=5, twice=0.1) if longest else events
     assert differences(live, arrivals, offline, longest + 0.25) == []
-    assert live.health().sensors["tracker"].outcomes["fused"] > 1000
-
-
-def test_each_command_counts_once(tmp_path: Path) -> None:
-    """Late commands change the poses of others, which are the same commands: of each one is counted."""
-    run = run_of(tmp_path)
-    live = pf.LiveEstimator(known(run))
-    for event in delayed(events_of(run), 1.2, seed=5):
-        feed(live, event)
-    assert live.health().commands["fused"] == len(run.command.stamp)
+    health = live.health()
+    assert health.sensors["tracker"].outcomes["fused"] > 1000
+    assert health.commands["fused"] == len(run.command.stamp)
 
 
 def test_estimates_at_the_time_are_as_live(tmp_path: Path) -> None:
-    """Fed in order, the estimate at each command is that of `fuse --as-live`, with a stray command among them."""
+    """With a stray command among them; also of the run replayed as a stream."""
     run = run_of(tmp_path, stray=120)
-    config = known(run)
-    offline, live = pf.fuse(run, config, mode="as-live"), pf.LiveEstimator(config)
-    assert offline.command_counts["stray"] == 1
-    taken = {round(time * 1e9) + offline.origin for time in offline.time.tolist()}
-    found = []
-    for event in events_of(run):
-        result = feed(live, event)
-        if not event.sensor:
-            assert (result.outcome is pf.Outcome.FUSED) == (event.stamp in taken)
-            found += [live.estimate(event.stamp)] if result.outcome is pf.Outcome.FUSED else []
-    for axis, track in offline.axes.items():
-        assert [estimate[axis].position for estimate in found] == track.position.tolist()
-        assert [estimate[axis].position_sd for estimate in found] == track.position_sd.tolist()
+    assert estimates_are_as_live(run, known(run)).command_counts["stray"] == 1
+    replay_is_as_live(run, known(run))
 
 
 def test_a_stray_joint_takes_its_pose_with_it(tmp_path: Path) -> None:
@@ -157,47 +146,8 @@ def test_a_stray_joint_takes_its_pose_with_it(tmp_path: Path) -> None:
     np.testing.assert_array_equal(later.values["x"][~run.command.stray], clean.values["x"])
 
 
-def lines_of(run: pf.Run) -> list[bytes]:
-    """A run on the wire: joints in degrees, positions in mm."""
-    found = []
-    for stamp, sensor, values in events_of(run):
-        body = {axis: math.degrees(value) if axis in JOINTS else value * 1e3 for axis, value in values.items()}
-        found.append(
-            json.dumps({"t_ns": stamp, **({"sensor": sensor, **body} if sensor else {"command": body})}).encode()
-        )
-    return found
-
-
-def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
-    """Lines in degrees: every estimate that went out is, to the last bit, that of the record as live."""
-    run = run_of(tmp_path)
-    config = known(run)
-    recorder = Recorder(tmp_path / "record", config, {}, lambda _: None)
-    live, written = pf.LiveEstimator(config, event_log=recorder), list[bytes]()
-    Stream(live, written.extend, lambda _: None).take(lines_of(run))
-    recorder.close(live.sure)
-    found = pf.Run.read(tmp_path / "record")
-    assert found.notes == ()
-    assert found.command.joints is not None and found.sensors["tracker"].joints is None
-    offline = pf.fuse(found, msgspec.structs.replace(config, robot=None), mode="as-live")
-    given = [json.loads(line) for line in written]
-    assert len(given) == len(run.command.stamp)
-    for axis, track in offline.axes.items():
-        unit, scale = ("deg", 180.0 / math.pi) if axis.startswith("r") else ("mm", 1e3)
-        assert [one[axis][f"position_{unit}"] for one in given] == (track.position * scale).tolist()
-        assert [one[axis][f"sd_{unit}"] for one in given] == (track.position_sd * scale).tolist()
-
-
-def test_a_replay_is_as_live(tmp_path: Path) -> None:
-    """A run that is replayed as a stream gives the estimates of `fuse`, a stray command in it or not."""
-    run = run_of(tmp_path, stray=120)
-    replay_is_as_live(run, known(run))
-
-
-def test_a_configuration_keeps_its_robot(tmp_path: Path) -> None:
+def test_a_configuration_keeps_its_robot(tmp_path: Path, config: pf.FusionConfig) -> None:
     """Saved and loaded again, from anywhere, it reads joints to the same poses; what is saved says the same again."""
-    run = run_of(tmp_path)
-    config = known(run)
     (tmp_path / "saved").mkdir()
     config.save(tmp_path / "saved")
     again = pf.FusionConfig.load(tmp_path / "saved" / "fusion.toml")
@@ -222,10 +172,10 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_joints_that_are_no_pose_are_refused(case: str, tmp_path: Path) -> None:
+def test_joints_that_are_no_pose_are_refused(case: str, config: pf.FusionConfig) -> None:
     """With a reason, of commands and of measurements; nothing of such an event is used."""
     values, reason = BAD[case]
-    live = pf.LiveEstimator(known(run_of(tmp_path, seconds=1.0)))
+    live = pf.LiveEstimator(config)
     live.command(0.0, **dict.fromkeys(JOINTS, 0.1))
     before = live.estimate(0.1)
     for result in (live.command(0.1, **values), live.measurement(0.1, "encoders", **values)):
@@ -234,17 +184,16 @@ def test_joints_that_are_no_pose_are_refused(case: str, tmp_path: Path) -> None:
     assert live.estimate(0.1) == before
 
 
-def test_a_name_that_is_none_is_answered_with_those_of_joints_too(tmp_path: Path) -> None:
+def test_a_name_that_is_none_is_answered_with_those_of_joints_too(config: pf.FusionConfig) -> None:
     """A command that calls a joint by its column."""
-    live = pf.LiveEstimator(known(run_of(tmp_path, seconds=1.0)))
+    live = pf.LiveEstimator(config)
     result = live.command(0.0, j1_deg=0.1)
     assert result.outcome is pf.Outcome.UNKNOWN
     assert "unknown axis 'j1_deg'" in result.reason and "j1" in result.reason.split(";", 1)[1]
 
 
-def test_a_robot_that_does_not_fit_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_robot_that_does_not_fit_is_refused_in_one_line(config: pf.FusionConfig) -> None:
     """An arm without x, y, z; a tool without a reference orientation; a joint that the chain has not."""
-    config = known(run_of(tmp_path, seconds=1.0))
     flat = pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"), robot=config.robot)
     strange = msgspec.structs.replace(ARM, joints={"j9": Joint(later=0.01)})
     for one, words in (
@@ -267,14 +216,18 @@ def test_joints_on_the_wire() -> None:
         LineDecoder(ARM.kind_of, framed=False, joints={"t": "angle"})
 
 
-def test_lines_in_joints_as_a_user_gives_them(tmp_path: Path) -> None:
+def test_lines_in_joints_as_a_user_gives_them(tmp_path: Path, run: pf.Run, config: pf.FusionConfig) -> None:
     """`[robot]` in fusion.toml is all that `pumafuse live` needs: the estimates are those of the record as live."""
-    run = run_of(tmp_path, seconds=2.0)
     (tmp_path / "saved").mkdir()
-    known(run).save(tmp_path / "saved")
+    config.save(tmp_path / "saved")
     words = [EXECUTABLE, "live", "stdin", "-c", tmp_path / "saved" / "fusion.toml", "--record", tmp_path / "record"]
-    done = subprocess.run(words, input=b"\n".join(lines_of(run)) + b"\n", capture_output=True, timeout=120, check=True)
+    done = subprocess.run(words, input=b"\n".join(wired(run)) + b"\n", capture_output=True, timeout=120, check=True)
     assert b"not heeded" not in done.stderr
-    offline = pf.fuse(pf.Run.read(tmp_path / "record"), known(run), mode="as-live")
-    found = [json.loads(line)["x"]["position_mm"] for line in done.stdout.splitlines()]
-    assert found == (offline.axes["x"].position * 1e3).tolist()
+    found = pf.Run.read(tmp_path / "record")
+    assert found.notes == () and len(found.command.stamp) == len(run.command.stamp)
+    assert found.command.joints is not None and found.sensors["tracker"].joints is None
+    offline, given = pf.fuse(found, config, mode="as-live"), [json.loads(line) for line in done.stdout.splitlines()]
+    for axis, track in offline.axes.items():
+        unit, scale = ("deg", 180.0 / math.pi) if axis.startswith("r") else ("mm", 1e3)
+        assert [one[axis][f"position_{unit}"] for one in given] == (track.position * scale).tolist()
+        assert [one[axis][f"sd_{unit}"] for one in given] == (track.position_sd * scale).tolist()

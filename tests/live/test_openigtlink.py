@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 import pumafuse as pf
 import turning
 from listening import live
-from pumafuse.errors import ConfigError
 from pumafuse.live.address import Address
 from pumafuse.live.openigtlink import OpenIgtLinkSource
 from pumafuse.live.wire import Event
@@ -35,6 +34,7 @@ SERVER = Path(__file__).parents[1] / "igtl_server.py"
 STAMP = 1_700_000_000.25  # s: its fraction is exact on the wire
 TURN = Rotation.from_rotvec([0.3, -1.1, 0.7])
 POINT = np.array([120.5, -40.25, 7.0])  # mm, exact in 32 bits
+SECONDS = 2.0  # of the tool's motion
 TURNING = ["x", "y", "z", "orientation"]
 
 
@@ -50,7 +50,10 @@ def configured(folder: Path) -> Path:
 
 
 def taken(
-    sent: bytes, config: pf.FusionConfig, option: str = "", enough: Callable[[list[Event]], bool] = bool
+    sent: bytes,
+    config: pf.FusionConfig,
+    option: str = "",
+    enough: Callable[[list[Event], list[str]], object] = lambda found, _: found,
 ) -> tuple[list[Event], list[str]]:
     """The events of what a server sends before it hangs up, and the notices."""
     notices, found = list[str](), list[Event]()
@@ -61,7 +64,7 @@ def taken(
         with server.accept()[0] as connection:
             threading.Thread(target=connection.sendall, args=(sent,)).start()
             until = time.monotonic() + 30.0
-            while not enough(found) and time.monotonic() < until:
+            while not enough(found, notices) and time.monotonic() < until:
                 found += source.get()
             with contextlib.suppress(OSError):  # it has hung up
                 connection.shutdown(socket.SHUT_RDWR)
@@ -126,7 +129,7 @@ def test_points_have_no_orientation(config: pf.FusionConfig) -> None:
 def test_several_devices_and_commands(config: pf.FusionConfig) -> None:
     """A list is an event each, in its order; the device ``command`` is the commands."""
     sent = transform("command") + message("TDATA", listed("left", COLUMNS) + listed("right", COLUMNS))
-    events, _ = taken(sent, config, enough=lambda found: len(found) == 3)
+    events, _ = taken(sent, config, enough=lambda found, _: len(found) == 3)
     assert [event.sensor for event in events] == ["", "left", "right"]
     assert all(list(event.values) == TURNING for event in events)
 
@@ -176,8 +179,7 @@ def test_images_are_passed_over(config: pf.FusionConfig) -> None:
 )
 def test_what_is_no_openigtlink_is_said(sent: bytes, words: str, config: pf.FusionConfig) -> None:
     """One sentence, no event."""
-    over = time.monotonic() + 1.0
-    events, notices = taken(sent, config, enough=lambda _: time.monotonic() > over)
+    events, notices = taken(sent, config, enough=lambda _, said: any(words in one for one in said))
     assert events == []
     assert sum(words in notice for notice in notices) == 1
 
@@ -190,7 +192,7 @@ BODIES = st.sampled_from([b"", bytes(12), bytes(48), bytes(28), b"\xff" * 48, by
     st.integers(0, 4),
     st.binary(max_size=60),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60)
 def test_whatever_a_server_sends_ends_in_a_sentence(
     config: pf.FusionConfig, messages: list[tuple[str, bytes]], version: int, rest: bytes
 ) -> None:
@@ -202,13 +204,6 @@ def test_whatever_a_server_sends_ends_in_a_sentence(
     theirs.close()
     source._read(ours)
     assert all(set(event.values) <= {*TURNING} for event in source.stop())
-
-
-@pytest.mark.parametrize("text", ["igtl://", "igtl://a/b", "igtl://a:b", "igtl://a?time=sent", "igtl:a"])
-def test_wrong_addresses(text: str) -> None:
-    """What is expected is said."""
-    with pytest.raises(ConfigError, match="igtl://HOST"):
-        Address.parse(text)
 
 
 def test_what_is_not_taken_in_is_shed(config: pf.FusionConfig) -> None:
@@ -237,7 +232,9 @@ def test_a_server_in_another_process(tmp_path: Path) -> None:
             matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), point * 1e3
             poses.append((stamp, name, matrix.tolist()))
     poses.sort(key=lambda one: (one[0], one[1] == "command"))  # as --as-live has them
-    (tmp_path / "poses.json").write_text(json.dumps([one for one in poses if one[1] != "truth"]))
+    (tmp_path / "poses.json").write_text(
+        json.dumps([one for one in poses if one[1] != "truth" and one[0] < turning.START + SECONDS])
+    )
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     command = [sys.executable, str(SERVER), str(port), str(tmp_path / "poses.json")]
@@ -246,10 +243,10 @@ def test_a_server_in_another_process(tmp_path: Path) -> None:
         subprocess.Popen(command) as server,
         live(f"igtl://127.0.0.1:{port}", configured(tmp_path), *options) as process,
     ):
-        lines = [json.loads(line) for line in process.received(200)]
+        lines = [json.loads(line) for line in process.received(round(50 * SECONDS))]
         server.wait(60)
         log = process.end()
-    assert "590 events, 0 lost" in log
+    assert f"{round(150 * SECONDS) - 10} events, 0 lost" in log
     est = pf.fuse(pf.Run.read(tmp_path / "record"), pf.FusionConfig.load(tmp_path / "fusion.toml"), mode="as-live")
     for axis in "xyz":
         assert [line[axis]["position_mm"] / 1e3 for line in lines] == pytest.approx(est[axis].position, abs=1e-12)

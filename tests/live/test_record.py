@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -18,9 +18,8 @@ from hypothesis import given, settings
 import pumafuse as pf
 from pumafuse.live import record
 from pumafuse.live.record import Recorder
-from pumafuse.live.stream import Stream
 from pumafuse.logs.frames import Cylindrical
-from streams import FIELDS, TRACKED, Event, T, any_stream, delayed, events_of, feed
+from streams import FIELDS, TRACKED, T, any_stream, delayed, events_of, feed, record_is_as_live
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 
@@ -71,34 +70,14 @@ def recorded(tmp_path: Path) -> Recorded:
     return Recorded(tmp_path / "record")
 
 
-def full(*_: object) -> int:
-    """What a full disk does with a write."""
-    raise OSError(errno.ENOSPC, "No space left on device")
-
-
-def in_mm(event: Event) -> Event:
-    """The event as it is when its positions have come as mm."""
-    return event._replace(values={axis: value * 1e3 / 1e3 for axis, value in event.values.items()})
-
-
 def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
-    """The shipped run as lines: every estimate that went out is, to the last bit, that of the record as live."""
+    """Twenty seconds of the shipped run as lines."""
     data = files("pumafuse") / "data"
     run, config = pf.Run.read(str(data / "scan1")), pf.FusionConfig.load(str(data / "fusion.toml"))
-    recorded, written = Recorded(tmp_path / "record", config, dict(run.start)), list[bytes]()
-    stream = Stream(recorded.live, written.extend, recorded.notices.append)
-    for stamp, sensor, values in events_of(run):
-        body = {axis: value * 1e3 for axis, value in values.items()}
-        named = {"sensor": sensor, **body} if sensor else {"command": body}
-        stream.take([json.dumps({"t_ns": stamp, **named}).encode()])
-        recorded.tick()
-    found = recorded.close()
-    assert found.notes == ()
-    offline = pf.fuse(found, config, mode="as-live")
-    given = [json.loads(line) for line in written]
-    for axis, track in offline.axes.items():
-        assert [one[axis]["position_mm"] for one in given] == (track.position * 1e3).tolist()
-        assert [one[axis]["sd_mm"] for one in given] == (track.position_sd * 1e3).tolist()
+    until = run.command.stamp[0] + 20 * 10**9
+    sensors = {name: one.rows(one.stamp <= until) for name, one in run.sensors.items()}
+    command = run.command.rows(run.command.stamp <= until)
+    record_is_as_live(tmp_path / "record", replace(run, command=command, sensors=sensors), config)
 
 
 @pytest.mark.long
@@ -110,7 +89,8 @@ def test_a_record_fuses_to_the_last_estimates(tmp_path_factory, drawn) -> None:
     start = dict.fromkeys(run.axes, 0.5)  # else an axis that is first commanded late differs, as documented
     recorded = Recorded(tmp_path_factory.mktemp("live") / "record", config, start)
     for event in delayed(events_of(run), 0.3, seed, twice=0.1):
-        feed(recorded.live, in_mm(event))
+        values = {axis: value * 1e3 / 1e3 for axis, value in event.values.items()}  # as they are that came as mm
+        feed(recorded.live, event._replace(values=values))
         recorded.tick()
     offline = pf.fuse(recorded.close(), config)
     last = recorded.live.estimate(offline.origin + round(offline.time[-1] * 1e9))
@@ -175,17 +155,6 @@ def test_a_reset_clock_begins_another_record(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "record.2" / "commands.csv").read_text() == "mine"
 
 
-def test_every_folder_of_a_record_is_said(tmp_path: Path) -> None:
-    """A clock that is reset three times: three lines, and the last folder in the summary."""
-    recorded = Recorded(tmp_path / "record")
-    for number in range(4):
-        recorded.go(60, begin=50_000 - 10_000 * number)
-    recorded.close()
-    said = [text for text in recorded.notices if "another clock" in text]
-    assert [text.rpartition("/")[2] for text in said] == ["record.2", "record.3", "record.4"]
-    assert recorded.recorder.summary().startswith(f"{tmp_path / 'record'} to record.4, 4 folders: ")
-
-
 def test_an_axis_without_a_number_is_none_of_the_run(recorded: Recorded) -> None:
     """Commands and measurements whose other axis is always null: a run of one axis, which fuses."""
     recorded.live.measurement(0, "tracker", radial=np.nan)
@@ -240,50 +209,40 @@ def test_every_float_comes_back(tmp_path: Path) -> None:
 def test_a_full_disk_is_reported_and_nothing_is_written_twice(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk takes a few bytes of a row and then nothing for a while; when it has room again all rows are there."""
+    """The disk takes a few bytes of a row and then nothing for a while; when it has room again all rows are there.
+
+    A second time it is reported as soon, though less than a minute is between them.
+    """
     monkeypatch.setattr(record, "_TRIED_AGAIN", 0.01)
-    recorded.go(10)
-    recorded.written(20)
-    room, write = [7], os.write
+    room, write = [0], os.write
 
     def nearly_full(descriptor: int, data: bytes) -> int:
         if not room[0]:
-            full()
+            raise OSError(errno.ENOSPC, "No space left on device")
         written = write(descriptor, data[: room[0]])
         room[0] -= written
         return written
 
-    monkeypatch.setattr(os, "write", nearly_full)
-    for begin in range(1, 6):
-        recorded.go(10, begin=begin * 10)
-        recorded.tick()
-    recorded.noticed("No space left on device")
-    pf.fuse(pf.Run.read(recorded.folder), TRACKED)
-    for _ in range(20):
-        recorded.tick()
-    monkeypatch.setattr(os, "write", write)
-    recorded.noticed("written again")
-    found = recorded.close()
-    assert sum("cannot be written" in text for text in recorded.notices) == 1
-    assert sum("written again" in text for text in recorded.notices) == 1
-    assert found.notes == ()
-    assert found.command.stamp.tolist() == [step * T for step in range(60)]
-    assert len(found.sensors["tracker"].stamp) == 60
+    def said(words: str) -> int:
+        return sum(words in text for text in recorded.notices)
 
-
-def test_a_second_full_disk_is_reported_at_once_too(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As soon as the first one, though less than a minute is between them."""
-    monkeypatch.setattr(record, "_TRIED_AGAIN", 0.01)
-    write = os.write
-    for time_of in range(2):
-        recorded.go(10, begin=20 * time_of)
-        recorded.written(20 + 40 * time_of)
-        monkeypatch.setattr(os, "write", full)
-        recorded.go(10, begin=20 * time_of + 10)
-        recorded.tick_until(lambda seen=time_of: sum("No space left" in text for text in recorded.notices) == seen + 1)
+    for before in range(2):
+        recorded.go(10, begin=20 * before)
+        recorded.written(20 + 40 * before)
+        room[0] = 7
+        monkeypatch.setattr(os, "write", nearly_full)
+        recorded.go(10, begin=20 * before + 10)
+        recorded.tick_until(lambda seen=before: said("No space left on device") == seen + 1)
+        pf.fuse(pf.Run.read(recorded.folder), TRACKED)
+        for _ in range(20):
+            recorded.tick()
         monkeypatch.setattr(os, "write", write)
-        recorded.tick_until(lambda seen=time_of: sum("written again" in text for text in recorded.notices) == seen + 1)
-    assert recorded.close().command.stamp.tolist() == [step * T for step in range(40)]
+        recorded.tick_until(lambda seen=before: said("written again") == seen + 1)
+    found = recorded.close()
+    assert said("cannot be written") == said("written again") == 2
+    assert found.notes == ()
+    assert found.command.stamp.tolist() == [step * T for step in range(40)]
+    assert len(found.sensors["tracker"].stamp) == 40
 
 
 def test_a_trouble_that_lasts_is_reported_every_minute(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -352,7 +311,7 @@ def test_only_an_empty_folder_is_recorded_into(tmp_path: Path) -> None:
 
 
 def test_a_clock_that_is_reset_for_ever_fills_few_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Folders are bounded in number, every row is in one of them, and the last one fuses, too."""
+    """Folders are bounded in number, each is said, every row is in one of them, and the last one fuses, too."""
     monkeypatch.setattr("pumafuse.live.record._MOST_FOLDERS", 3)
     recorded = Recorded(tmp_path / "record")
     for segment in range(8):
@@ -362,3 +321,6 @@ def test_a_clock_that_is_reset_for_ever_fills_few_folders(tmp_path: Path, monkey
     assert [len(run.command.stamp) for run in runs] == [10, 10, 60]
     assert len(pf.fuse(runs[-1], TRACKED).segments) == 6
     assert sum("folders are enough" in text for text in recorded.notices) == 1
+    said = [text for text in recorded.notices if "another clock" in text]
+    assert [text.rpartition("/")[2] for text in said] == ["record.2", "record.3"]
+    assert recorded.recorder.summary().startswith(f"{tmp_path / 'record'} to record.3, 3 folders: ")

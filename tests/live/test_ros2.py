@@ -24,13 +24,12 @@ import pytest
 
 import bag_files
 import pumafuse as pf
-from executable import EXECUTABLE
-from ros2_player import BEFORE_NS
+from executable import EXECUTABLE, pumafuse, refused
 
 pytestmark = pytest.mark.skipif(find_spec("rclpy") is None, reason="there are wheels of ROS 2 for Linux alone")
 PLAYER = Path(__file__).parents[1] / "ros2_player.py"
 LONGEST = 60.0  # s that anything here may take
-STARTS = 3 * 10**9  # ns
+BEGIN = bag_files.START_NS
 
 
 @pytest.fixture(autouse=True)
@@ -52,14 +51,16 @@ class Node:
         assert self.process.stderr is not None
         assert "listening at" in (first := self.process.stderr.readline()), first + self.process.stderr.read()
 
-    def until(self, words: str) -> None:
+    def until(self, words: str) -> str:
         """Read the log up to a sentence with these words."""
         assert self.process.stderr is not None
-        last = threading.Timer(LONGEST, self.process.kill)
+        last, log = threading.Timer(LONGEST, self.process.kill), ""
         last.start()
-        said = any(words in line for line in self.process.stderr)
+        while words not in log and (line := self.process.stderr.readline()):
+            log += line
         last.cancel()
-        assert said, f"it ended without '{words}'"
+        assert words in log, f"it ended without '{words}'"
+        return log
 
     def end(self) -> str:
         """Ask for an end; what was logged since."""
@@ -95,19 +96,25 @@ def cell(folder: Path, run: str = bag_files.ROS) -> None:
     (folder / "run.toml").write_text(run.format(file="drive.mcap"))
 
 
-def of_now(samples: list[bag_files.Sample]) -> list[bag_files.Sample]:
-    """The same, to be played in some seconds."""
-    later = time.time_ns() + STARTS + BEFORE_NS - samples[0].stamp
-    return [replace(one, stamp=one.stamp + later, logged=one.logged + later) for one in samples]
-
-
-def played(folder: Path, samples: list[bag_files.Sample], *node: str) -> list[dict[str, Any]]:
+def played(folder: Path, samples: list[bag_files.Sample], node: str = "pumafuse") -> list[dict[str, Any]]:
     """Play a bag of them; what was published meanwhile."""
     bag_files.mcap(folder / "drive.mcap", samples)
-    out = folder / "published.jsonl"
-    words = [sys.executable, str(PLAYER), str(folder / "drive.mcap"), str(out), *node]
-    subprocess.run(words, check=True, timeout=LONGEST)
-    return [json.loads(line) for line in out.read_text().splitlines()]
+    return what_is_published(folder, node, "/command", "/camera")
+
+
+def publish(folder: Path, sent: list[bag_files.Sent]) -> list[dict[str, Any]]:
+    """Play messages; what was published meanwhile."""
+    bag_files.messages(folder / "drive.mcap", sent)
+    return what_is_published(folder, "pumafuse", sent[-1][0])
+
+
+def player(folder: Path, *arguments: str) -> list[str]:
+    return [sys.executable, str(PLAYER), str(folder / "drive.mcap"), str(folder / "published.jsonl"), *arguments]
+
+
+def what_is_published(folder: Path, *arguments: str) -> list[dict[str, Any]]:
+    subprocess.run(player(folder, *arguments), check=True, timeout=LONGEST)
+    return [json.loads(line) for line in (folder / "published.jsonl").read_text().splitlines()]
 
 
 STAMPED = bag_files.ROS[: bag_files.ROS.index("[sensors.level]")]  # without what is stamped when it is received
@@ -118,10 +125,10 @@ def test_poses_are_those_of_the_bag_fused_as_live(tmp_path: Path, start: Callabl
     """To the last bit, with covariance and frame; the record fuses to the same; diagnostics tell of each sensor."""
     cell(tmp_path, STAMPED)
     node = start(tmp_path, "--record", str(tmp_path / "record"))
-    published = played(tmp_path, of_now(bag_files.motion(100)))
+    published = played(tmp_path, bag_files.motion(60))
     log = node.end()
-    assert "100 fused; 100 estimates" in log
-    assert "/pumafuse: 300 events, 0 lost" in log
+    assert "60 fused; 60 estimates" in log
+    assert "/pumafuse: 180 events, 0 lost" in log
     config = pf.FusionConfig.load(tmp_path / "fusion.toml")
     for source in (tmp_path, tmp_path / "record"):
         est = pf.fuse(pf.Run.read(source), config, mode="as-live")
@@ -142,50 +149,30 @@ def test_poses_are_those_of_the_bag_fused_as_live(tmp_path: Path, start: Callabl
     assert first["pumafuse: estimates"][:2] == [3, "no command yet"]  # STALE
 
 
-def test_remapping_names_and_parameters(tmp_path: Path, start: Callable[..., Node]) -> None:
-    """--ros-args names the node, moves a topic and the estimates, and gives the frame."""
-    run = STAMPED.replace('topic = "/command"', 'topic = "/orders"')
-    cell(tmp_path, run)
+def test_publishers_come_late_leave_and_return(tmp_path: Path, start: Callable[..., Node]) -> None:
+    """Each is said, as two of commands and a wrong type are; --ros-args move topics and the node, and give a frame."""
+    cell(tmp_path, STAMPED.replace('topic = "/command"', 'topic = "/orders"').replace("/joints", "/level"))
     arguments = ["-r", "__node:=left", "-r", "/orders:=/command", "-p", "frame_id:=cell"]
     node = start(tmp_path, "--ros-args", *arguments)
-    published = played(tmp_path, of_now(bag_files.motion(20)), "left")
-    assert "20 fused; 20 estimates" in node.end()
-    poses = [one for one in published if one["topic"] == "pose"]
-    assert len(poses) == 20
-    assert {one["frame"] for one in poses} == {"cell"}
-
-
-def test_publishers_come_late_leave_and_return(tmp_path: Path, start: Callable[..., Node]) -> None:
-    """Each is said, and what the second one brings is taken."""
-    cell(tmp_path, STAMPED)
-    node = start(tmp_path)
     node.until("/command: nobody publishes it so far")
-    played(tmp_path, of_now(bag_files.motion(20)))
-    node.until("/command: nobody publishes it any more")
-    played(tmp_path, of_now(bag_files.motion(20)))
-    assert "40 fused; 40 estimates" in node.end()
-
-
-def test_what_is_said_of_wrong_types_and_two_publishers(tmp_path: Path, start: Callable[..., Node]) -> None:
-    """A type without the fields asked for, and two publishers of commands."""
-    cell(tmp_path, STAMPED.replace("/joints", "/level"))
-    node = start(tmp_path)
-    samples = of_now(bag_files.motion(60))
-    bag_files.mcap(tmp_path / "second.mcap", samples)
-    words = [sys.executable, str(PLAYER), str(tmp_path / "second.mcap"), str(tmp_path / "second.jsonl")]
-    with subprocess.Popen(words):
-        played(tmp_path, samples)
-    log = node.end()
-    assert "/level: is of type std_msgs/msg/Float64, which has no header.stamp, position[slide]" in log
+    bag_files.mcap(tmp_path / "drive.mcap", bag_files.motion(20))
+    words = player(tmp_path, "left", "/command", "/command", "/camera")
+    with subprocess.Popen([*words[:3], str(tmp_path / "second.jsonl"), *words[4:]]):
+        subprocess.run(words, check=True, timeout=LONGEST)
+    log = node.until("/command: nobody publishes it any more")
     assert "/command: 2 publishers" in log
+    assert "/level: is of type std_msgs/msg/Float64, which has no header.stamp, position[slide]" in log
+    later = [replace(one, stamp=one.stamp + 10**9) for one in bag_files.motion(20)]
+    poses = [one for one in played(tmp_path, later, "left") if one["topic"] == "pose"]
+    assert "40 fused" in node.end()
+    assert [one["stamp"] for one in poses] == [one.stamp for one in later if one.topic == "/command"]
+    assert {one["frame"] for one in poses} == {"cell"}
 
 
 @pytest.mark.parametrize(
     ("options", "code", "words"),
     [
-        (["ros2:{}/run.toml", "--ros-args", "-r", "wrong"], 1, "--ros-args: "),
         (["ros2:{}/nowhere.toml"], 1, "nowhere.toml"),
-        (["ros2:{}"], 1, "topic 'no topic' is no name of ROS 2"),
         (["ros2:{}/run.toml", "ros2:{}/run.toml"], 1, "one node is enough"),
         (["stdin", "ros2:{}/run.toml"], 1, "stdin: is a source alone"),
         (["stdin", "--ros-args", "-r", "a:=b"], 2, "goes with a source ros2:run.toml"),
@@ -193,28 +180,35 @@ def test_what_is_said_of_wrong_types_and_two_publishers(tmp_path: Path, start: C
 )
 def test_wrong_arguments(tmp_path: Path, options: list[str], code: int, words: str) -> None:
     """One line each."""
-    cell(tmp_path, STAMPED.replace("/joints", "no topic") if options == ["ros2:{}"] else STAMPED)
+    cell(tmp_path, STAMPED)
     given = [one.format(tmp_path) for one in options]
-    command = [str(EXECUTABLE), "live", "-c", str(tmp_path / "fusion.toml"), *given]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=LONGEST, stdin=subprocess.DEVNULL
-    )
-    assert done.returncode == code
-    assert words in done.stderr
+    assert words in pumafuse("live", "-c", tmp_path / "fusion.toml", *given, code=code).stderr
+
+
+@pytest.mark.parametrize(
+    ("run", "options", "words"),
+    [
+        (STAMPED, ["--ros-args", "-r", "wrong"], "--ros-args: "),
+        (STAMPED.replace("/joints", "no topic"), [], "topic 'no topic' is no name of ROS 2"),
+    ],
+)
+def test_what_ros_refuses(tmp_path: Path, run: str, options: list[str], words: str) -> None:
+    """One line each, in a process that has ROS."""
+    cell(tmp_path, run)
+    command = [str(EXECUTABLE), "live", "-c", str(tmp_path / "fusion.toml"), f"ros2:{tmp_path}", *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LONGEST)
+    assert done.returncode == 1 and words in done.stderr
     assert "Traceback" not in done.stderr
 
 
 def test_without_ros_the_way_to_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where its libraries are not found, and where a source has no topic."""
-    monkeypatch.delenv("LD_LIBRARY_PATH")
+    monkeypatch.setitem(sys.modules, "rclpy", None)
     cell(tmp_path)
-    command = [str(EXECUTABLE), "live", f"ros2:{tmp_path / 'run.toml'}", "-c", str(tmp_path / "fusion.toml")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LONGEST)
-    assert done.returncode == 1
-    assert "pip install 'pumafuse[ros2]'" in done.stderr
+    words = "live", f"ros2:{tmp_path / 'run.toml'}", "-c", tmp_path / "fusion.toml"
+    assert "pip install 'pumafuse[ros2]'" in refused(*words)
     (tmp_path / "run.toml").write_text((tmp_path / "run.toml").read_text().replace('topic = "/level"', ""))
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=LONGEST)
-    assert "sensor 'level' has no topic" in done.stderr
+    assert "sensor 'level' has no topic" in refused(*words)
 
 
 ANGLE = """
@@ -254,32 +248,24 @@ def lever(folder: Path, **run: str) -> None:
         (folder / f"{name}.toml").write_text(text)
 
 
-def states(begin: int, count: int, stamps: int) -> list[bag_files.Sent]:
-    """An encoder at 50 Hz from an instant [ns] on that stands at 0.2 rad, a turn too far; ``stamps`` begin at [ns]."""
+def states(begin: int, count: int) -> list[bag_files.Sent]:
+    """An encoder at 50 Hz from an instant [ns] on that stands at 0.2 rad, a turn too far."""
     kind, value = "sensor_msgs/msg/JointState", 0.2 + 2.0 * np.pi
     every = [(20_000_000 * k, {"name": ["lift", "elbow"], "position": [9.0, value]}) for k in range(count)]
-    return [("/joint_states", kind, begin + t, {"header": bag_files.header(stamps + t), **one}) for t, one in every]
-
-
-def publish(folder: Path, sent: list[bag_files.Sent]) -> list[dict[str, Any]]:
-    """Play messages; what was published meanwhile."""
-    bag_files.messages(folder / "drive.mcap", sent)
-    words = [sys.executable, str(PLAYER), str(folder / "drive.mcap"), str(folder / "published.jsonl")]
-    subprocess.run(words, check=True, timeout=LONGEST)
-    return [json.loads(line) for line in (folder / "published.jsonl").read_text().splitlines()]
+    return [("/joint_states", kind, begin + t, {"header": bag_files.header(0), **one}) for t, one in every]
 
 
 def test_joints_by_a_trajectory(tmp_path: Path, start: Callable[..., Node]) -> None:
     """A path is commanded as time goes by from when it comes; the joint is published at each command."""
-    lever(tmp_path, time="path.time_ns", column="path.position[elbow]", stamps="header.stamp")
-    node, begin = start(tmp_path, "--record", str(tmp_path / "record")), time.time_ns() + STARTS + BEFORE_NS
+    lever(tmp_path, time="path.time_ns", column="path.position[elbow]", stamps="log_time")
+    node = start(tmp_path, "--record", str(tmp_path / "record"))
     points = [(0.0, 0.0), (1.0, 0.4)]
     rest = {"velocities": [], "accelerations": [], "effort": []}
     made = [{**rest, "positions": [at], "time_from_start": bag_files.stamp(round(t * 1e9))} for t, at in points]
     goal = {"header": bag_files.header(0), "joint_names": ["elbow"], "points": made}
     sent = [
-        ("/go", "trajectory_msgs/msg/JointTrajectory", begin, goal),
-        *states(begin + 100_000_000, 65, begin + 99_000_000),
+        ("/go", "trajectory_msgs/msg/JointTrajectory", BEGIN, goal),
+        *states(BEGIN + 100_000_000, 65),
     ]
     joints = [one for one in publish(tmp_path, sent) if one["topic"] == "joints"]
     assert "251 fused; 251 estimates" in node.end()
@@ -295,14 +281,14 @@ def test_the_time_of_a_simulation(tmp_path: Path, start: Callable[..., Node]) ->
     """What has no stamp is stamped by /clock, which runs at half the pace of the day."""
     lever(tmp_path, time="log_time", column="data[0]", stamps="log_time")
     node = start(tmp_path, "--record", str(tmp_path / "record"), "--ros-args", "-p", "use_sim_time:=true")
-    begin, sent = time.time_ns() + STARTS + BEFORE_NS, states(0, 0, 0)
+    sent = list[bag_files.Sent]()
     for k in range(200):
         clock = bag_files.stamp(100 * 10**9 + 5_000_000 * k)
-        sent.append(("/clock", "rosgraph_msgs/msg/Clock", begin + 10_000_000 * k, {"clock": clock}))
+        sent.append(("/clock", "rosgraph_msgs/msg/Clock", BEGIN + 10_000_000 * k, {"clock": clock}))
     for k in range(80):
-        at = begin + 400_000_000 + 20_000_000 * k + 1_000_000
+        at = BEGIN + 400_000_000 + 20_000_000 * k + 1_000_000
         sent.append(("/go", "std_msgs/msg/Float64MultiArray", at, {"data": [0.1]}))
-    publish(tmp_path, [*sent, *states(begin + 400_000_000 + 3_000_000, 80, 0)])
+    publish(tmp_path, [*sent, *states(BEGIN + 403_000_000, 80)])
     node.end()
     run = pf.Run.read(tmp_path / "record")
     for source in (run.command, run.sensors["encoder"]):
@@ -357,8 +343,8 @@ def test_from_a_bag_to_the_node_nothing_is_edited(tmp_path: Path, start: Callabl
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
     line = next(one for one in done.stdout.splitlines() if one.startswith("or as a node of ROS 2: "))
     assert line.split()[-4:] == ["live", f"ros2:{tmp_path}/mine/run.toml", "-c", f"{tmp_path}/mine/fusion.toml"]
-    node, begin = start(tmp_path / "mine"), time.time_ns() + 3 * STARTS + BEFORE_NS  # beside other long tests
-    sent, where = moved(begin, 8.0, 1.0)
+    node = start(tmp_path / "mine")
+    sent, where = moved(BEGIN, 8.0, 1.0)
     joints = [one for one in publish(tmp_path, sent) if one["topic"] == "joints"]
     log = node.end()
     assert "800 fused; 800 estimates" in log

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -16,11 +16,19 @@ import pumafuse as pf
 from pumafuse.fusion.config import Placement
 from pumafuse.fusion.placing import with_tool
 from pumafuse.live.export import header
-from pumafuse.live.record import Recorder
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import BadLine, Event, LineDecoder
 from pumafuse.logs.frames import Rotated
-from streams import delayed, differences, events_of, feed, fused_in_any_order, replay_is_as_live
+from streams import (
+    delayed,
+    differences,
+    estimates_are_as_live,
+    events_of,
+    fused_in_any_order,
+    record_is_as_live,
+    replay_is_as_live,
+    wired,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 LENGTH = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04), gain=pf.Gain(slope=0.001))
@@ -71,7 +79,7 @@ def seen(sensor: pf.Sensor, at: np.ndarray, turned: Rotation, rng: np.random.Gen
     return point + rng.normal(0.0, 1e-4, point.shape), noise * (stands.inv() * turned * on_tool)
 
 
-def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 6.0, noisy: bool = False) -> pf.Run:
+def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 4.1, noisy: bool = False) -> pf.Run:
     """A run of commands and of all sensors, of which the tracker tells no orientation; ``noisy``: some rows more."""
     rng, lag = np.random.default_rng(8), 0.086
     given = np.sort(
@@ -116,14 +124,9 @@ def test_an_orientation_without_noise_is_not_used_live_either() -> None:
     mocap = msgspec.structs.replace(CONFIG.sensors["mocap"], sd=lengths)
     config = msgspec.structs.replace(KNOWN, sensors={**KNOWN.sensors, "mocap": mocap})
     replay_is_as_live(RUN, config)
-    source = without_attitude(RUN)
-    some, none = (pf.fuse(run, config, mode="as-live") for run in (RUN, source))
+    mute = replace(RUN, sensors={**RUN.sensors, "mocap": replace(RUN.sensors["mocap"], orientation=None)})
+    some, none = (pf.fuse(run, config, mode="as-live") for run in (RUN, mute))
     np.testing.assert_array_equal(some["x"].position, none["x"].position)
-
-
-def without_attitude(run: pf.Run) -> pf.Run:
-    """The run without what the mocap tells of orientations."""
-    return replace(run, sensors={**run.sensors, "mocap": replace(run.sensors["mocap"], orientation=None)})
 
 
 @ALL_RUNS
@@ -147,52 +150,18 @@ def test_in_any_order(longest: float, run: pf.Run) -> None:
 
 def test_estimates_at_the_time_are_as_live() -> None:
     """Fed in order, the estimate at each command is that of `fuse --as-live`."""
-    offline, live = pf.fuse(RUN, KNOWN, mode="as-live"), pf.LiveEstimator(KNOWN)
-    found = [
-        live.estimate(event.stamp)
-        for event in events_of(RUN)
-        if feed(live, event).outcome is pf.Outcome.FUSED and not event.sensor
-    ]
-    for axis, track in offline.axes.items():
-        assert [estimate[axis].position for estimate in found] == track.position.tolist()
-        assert [estimate[axis].position_sd for estimate in found] == track.position_sd.tolist()
-
-
-def lines_of(run: pf.Run) -> list[bytes]:
-    """A run on the wire, in mm."""
-    found = []
-    for stamp, sensor, values in events_of(run):
-        body = {
-            "q" if axis == "orientation" else axis: value if axis in ("orientation", "noise") else value * 1e3
-            for axis, value in values.items()
-        }
-        found.append(
-            json.dumps({"t_ns": stamp, **({"sensor": sensor, **body} if sensor else {"command": body})}).encode()
-        )
-    return found
+    estimates_are_as_live(RUN, KNOWN)
 
 
 @ALL_RUNS
 def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path, run: pf.Run) -> None:
-    """Lines with orientations: every estimate that went out is, to the last bit, that of the record as live."""
-    recorder = Recorder(tmp_path / "record", KNOWN, {}, lambda _: None)
-    live, written = pf.LiveEstimator(KNOWN, event_log=recorder), list[bytes]()
-    Stream(live, written.extend, lambda _: None).take(lines_of(run))
-    recorder.close(live.sure)
-    found = pf.Run.read(tmp_path / "record")
-    assert found.notes == ()
+    """Lines with orientations, which go out as quaternions."""
+    found, offline, given = record_is_as_live(tmp_path / "record", run, KNOWN)
     assert found.sensors["tracker"].orientation is None
-    offline = pf.fuse(found, KNOWN, mode="as-live")
-    given = [json.loads(line) for line in written]
-    for axis, track in offline.axes.items():
-        unit, scale = ("deg", 180.0 / math.pi) if axis.startswith("r") else ("mm", 1e3)
-        assert [one[axis][f"position_{unit}"] for one in given] == (track.position * scale).tolist()
-        assert [one[axis][f"sd_{unit}"] for one in given] == (track.position_sd * scale).tolist()
     vector = np.column_stack([offline.axes[axis].position for axis in ("rx", "ry", "rz")])
     expected = Rotation.from_rotvec(vector) * Rotation.from_rotvec(KNOWN.tool.reference)
-    assert (Rotation.from_quat([one["q"] for one in given]) * expected.inv()).magnitude() == pytest.approx(
-        0.0, abs=1e-12
-    )
+    off = Rotation.from_quat([one["q"] for one in given]) * expected.inv()
+    assert off.magnitude() == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_replay_is_as_live() -> None:
@@ -202,25 +171,13 @@ def test_a_replay_is_as_live() -> None:
     replay_is_as_live(run, KNOWN)
 
 
-class Watching:
-    """What a live view is given."""
-
-    def __init__(self) -> None:
-        self.events: list[Event] = []
-
-    def event(self, event: Event, _: pf.UpdateResult) -> None:
-        self.events.append(event)
-
-    def estimate(self, estimate: pf.LiveEstimate) -> None:
-        pass
-
-
 def test_a_live_view_sees_the_tool_along_the_bases_axes() -> None:
     """Of each sensor, wherever it stands: within what an arm that lags is off the motion that it measured."""
-    watching = Watching()
-    Stream(pf.LiveEstimator(KNOWN), lambda _: None, lambda _: None, watchers=[watching]).take(lines_of(RUN))
+    watcher = Mock()
+    Stream(pf.LiveEstimator(KNOWN), lambda _: None, lambda _: None, watchers=[watcher]).take(wired(RUN))
+    seen_events: list[Event] = [call.args[0] for call in watcher.event.call_args_list]
     for sensor, latency in (("mocap", 0.012), ("tracker", 0.005), ("camera", 0.03)):
-        events = [event for event in watching.events if event.sensor == sensor and event.t > 1e9]
+        events = [event for event in seen_events if event.sensor == sensor and event.t > 1e9]
         measured = np.array([[event.values[axis] for axis in "xyz"] for event in events])
         expected = pose(np.array([event.t for event in events]) / 1e9 - latency - 0.086)[0]
         assert np.abs(measured - expected).max() < 3e-3
@@ -295,20 +252,12 @@ def test_without_a_reference_orientation_a_row_with_q_says_what_to_write() -> No
         pf.LiveEstimator(KNOWN, start={"rx": 0.1})
 
 
-def test_a_row_without_all_of_x_y_z_is_invalid() -> None:
-    """A sensor in a frame of its own that gives two coordinates tells nothing of any of the base's axes."""
+@pytest.mark.parametrize("seen", [{"x": 1.0, "y": 0.2}, {"x": 0.0, "y": 0.0, "z": 0.0}])
+def test_a_row_that_tells_no_point_is_invalid(seen: dict[str, float]) -> None:
+    """Of a sensor in a frame of its own: two coordinates, or the zeros that it writes while its target is lost."""
     live = pf.LiveEstimator(KNOWN)
     live.command(0.0, x=0.5, y=0.2, z=0.1, orientation=Q)
-    result = live.measurement(0.1, "tracker", x=1.0, y=0.2)
-    assert dict(result.axes) == dict.fromkeys("xyz", pf.Outcome.INVALID)
-
-
-def test_zeros_of_a_sensor_that_lost_its_target_are_invalid() -> None:
-    """It writes 0, 0, 0 in its own frame, where nothing is: that tells nothing of the tool."""
-    live = pf.LiveEstimator(KNOWN)
-    live.command(0.0, x=0.5, y=0.2, z=0.1, orientation=Q)
-    result = live.measurement(0.1, "tracker", x=0.0, y=0.0, z=0.0)
-    assert dict(result.axes) == dict.fromkeys("xyz", pf.Outcome.INVALID)
+    assert dict(live.measurement(0.1, "tracker", **seen).axes) == dict.fromkeys("xyz", pf.Outcome.INVALID)
 
 
 def test_a_command_that_turns_too_far_is_refused() -> None:

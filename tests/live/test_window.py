@@ -47,7 +47,7 @@ def test_a_dense_stream_has_more_room(command_hz: float, measurement_hz: float) 
 
 def test_the_first_room_serves_for_ever() -> None:
     """A usual stream stays in the memory that was there at first, however long it is; what is old leaves it."""
-    run, config = run_of(120.0, 36.0, 200.0), config_of()
+    run, config = run_of(60.0, 36.0, 200.0), config_of()
     live = pf.LiveEstimator(config)
     assert differences(live, events_of(run), pf.fuse(run, config), 0.1) == []
     assert live._window.port.room == window.FIRST_ROWS
@@ -148,7 +148,7 @@ def test_any_clock_gives_the_same_estimates(stamp: int) -> None:
 # ---- any stream -----------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=150)
+@settings(max_examples=40)
 @given(any_stream())
 def test_any_order_of_arrival_gives_the_same_window(
     drawn: tuple[pf.FusionConfig, pf.Run, int],
@@ -171,7 +171,7 @@ def test_any_order_of_arrival_gives_the_same_window(
         assert replace(shuffled.estimate(time), doubtful=()) == replace(in_order.estimate(time), doubtful=())
 
 
-@settings(max_examples=100)
+@settings(max_examples=35)
 @given(any_stream())
 def test_a_window_of_a_millisecond_is_enough_for_a_stream_in_order(
     drawn: tuple[pf.FusionConfig, pf.Run, int],
@@ -187,7 +187,7 @@ def test_a_window_of_a_millisecond_is_enough_for_a_stream_in_order(
     assert counted(narrow) == counted(wide)
 
 
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(any_stream())
 def test_any_stream_is_fused_as_offline(drawn: tuple[pf.FusionConfig, pf.Run, int]) -> None:
     """In any order of arrival: the same outcomes and, at every command, the same bits."""

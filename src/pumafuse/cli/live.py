@@ -28,13 +28,11 @@ from ..live import network
 from ..live.address import LISTENERS, NETWORK, OF_A_RUN, POSES, Address
 from ..live.estimator import LiveEstimator
 from ..live.health import Health
-from ..live.network import UdpSender
+from ..live.network import Remote, Several, UdpSender
 from ..live.record import Recorder
 from ..live.results import LiveEstimate
-from ..live.ros2 import Ros2Source
-from ..live.ros2_estimates import Ros2Estimates
+from ..live.ros2 import Ros2Estimates, Ros2Source
 from ..live.rtde import RtdeSource
-from ..live.several import Remote, Several
 from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream, Watcher
 from ..live.wire import Event

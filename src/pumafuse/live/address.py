@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import socket
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
-from typing import TypeAlias, TypedDict
+from typing import TypeAlias
 from urllib.parse import urlsplit
 
 from ..errors import ConfigError
@@ -30,31 +30,18 @@ _SOURCES = (
 
 @dataclass(frozen=True)
 class Address:
-    """A source as the command line names it.
+    """A source as the command line names it."""
 
-    Attributes:
-        kind: ``stdin``, ``replay``, ``ros2``, ``rtde``, ``igtl``, ``udp``, ``tcp-listen`` or ``tcp``.
-        path: Of the run to replay, or of a ``run.toml`` that names topics or columns.
-        speed: Seconds of the run in one second; infinite: as fast as it can be.
-        host: Of a network source, empty where none is given.
-        port: Of a network source.
-        on_receipt: Whether poses are stamped when they are received.
-    """
-
-    kind: str
-    path: str = ""
-    speed: float = 1.0
-    host: str = ""
-    port: int = 0
-    on_receipt: bool = False
+    kind: str  # ``stdin``, ``replay``, ``ros2``, ``rtde``, ``igtl``, ``udp``, ``tcp-listen`` or ``tcp``
+    path: str = ""  # of the run to replay, or of a ``run.toml`` that names topics or columns
+    speed: float = 1.0  # seconds of the run in one second; infinite: as fast as it can be
+    host: str = ""  # of a network source, empty where none is given
+    port: int = 0  # of a network source
+    on_receipt: bool = False  # whether poses are stamped when they are received
 
     @staticmethod
     def parse(text: str) -> Address:
-        """Parse a source, as in ``udp://127.0.0.1:5005`` or ``replay:RUN?speed=4``.
-
-        Raises:
-            ConfigError: It is no source; says what is accepted.
-        """
+        """Parse a source, as in ``udp://127.0.0.1:5005`` or ``replay:RUN?speed=4``."""
         kind, colon, rest = text.partition(":")
         if text == "stdin":
             return Address("stdin")
@@ -76,22 +63,13 @@ class Address:
         return f"{self.kind}://{host_port(self.host, self.port)}"
 
 
-class _Place(TypedDict):
-    host: str
-    port: int
-
-
 def host_port(host: str, port: int) -> str:
     """A host and port as people write them."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def receiver(text: str) -> SocketAddress:
-    """The socket address of ``udp://HOST:PORT``, to send to.
-
-    Raises:
-        ConfigError: It is no such address, or the host is unknown.
-    """
+    """The socket address of ``udp://HOST:PORT``, to send to."""
     where = f"--out '{text}'"
     address = _network_address(text, where) if text.startswith("udp://") else None
     if address is None or not address.host or not address.port:
@@ -100,16 +78,7 @@ def receiver(text: str) -> SocketAddress:
 
 
 def listener(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[SocketAddress, Allowed]:
-    """Where a source listens, and which senders it accepts: on loopback all, elsewhere only those that are allowed.
-
-    Args:
-        address: The source.
-        listen: An address to listen on instead, which need not be loopback.
-        allow: Networks that are accepted then, as in ``192.168.1.0/24``, and nobody else.
-
-    Raises:
-        ConfigError: An address is none, or is not loopback without ``listen``.
-    """
+    """Where a source listens, and which senders it accepts: on loopback all, elsewhere only those that are allowed."""
     networks = [_network(text) for text in allow]
     where = f"source '{address.text}'"
     family, place = _resolve(listen or address.host or _LOOPBACK, address.port, where)
@@ -160,27 +129,30 @@ def _replay(text: str, rest: str) -> Address:
 def _rtde(text: str, rest: str) -> Address:
     path, _, option = rest.rpartition("?")
     name, _, place = option.partition("=")
-    expected = f"source '{text}': expected rtde:run.toml?host=HOST or HOST:PORT, the address of the robot's controller"
-    if not path or name != "host" or not place:
-        raise ConfigError(expected)
-    return Address("rtde", path, **_server(place, _RTDE, expected))
+    server = _server(place, _RTDE) if path and name == "host" else None
+    if server is None:
+        raise ConfigError(
+            f"source '{text}': expected rtde:run.toml?host=HOST or HOST:PORT, the address of the robot's controller"
+        )
+    return replace(server, kind="rtde", path=path)
 
 
 def _poses(text: str, rest: str) -> Address:
     place, question, option = rest.removeprefix("//").partition("?")
-    expected = f"source '{text}': expected igtl://HOST or igtl://HOST:PORT, and ?time=received for times of receipt"
-    if not place or (question and option != "time=received"):
-        raise ConfigError(expected)
-    return Address(POSES, **_server(place, _IGTL, expected), on_receipt=bool(question))
+    server = _server(place, _IGTL)
+    if server is None or (question and option != "time=received"):
+        raise ConfigError(
+            f"source '{text}': expected igtl://HOST or igtl://HOST:PORT, and ?time=received for times of receipt"
+        )
+    return replace(server, kind=POSES, on_receipt=bool(question))
 
 
-def _server(place: str, port: int, expected: str) -> _Place:
-    """Host and port of HOST or HOST:PORT."""
+def _server(place: str, port: int) -> Address | None:
+    """The server at HOST or HOST:PORT, if that is one."""
     try:
-        found = _network_address(f"tcp://{place}" if ":" in place else f"tcp://{place}:{port}", "")
+        return _network_address(f"tcp://{place}" if ":" in place else f"tcp://{place}:{port}", "")
     except ConfigError:
-        raise ConfigError(expected) from None
-    return {"host": found.host, "port": found.port}
+        return None
 
 
 def _network_address(text: str, where: str) -> Address:

@@ -22,27 +22,14 @@ T = TypeVar("T")
 
 
 class Backlog(Generic[T]):
-    """Items that wait.
-
-    Attributes:
-        received: How many have come.
-        dropped: How many were dropped, as too many waited.
-        shed: How many were shed, as they waited for too long.
-    """
+    """Items that wait."""
 
     def __init__(
         self, what: str, log: RateLimitedLog, is_command: Callable[[T], bool], size: Callable[[T], int]
     ) -> None:
-        """Nothing waits.
-
-        Args:
-            what: What items are called in sentences, in the plural.
-            log: Takes the sentences.
-            is_command: Whether an item has a command, and is not shed.
-            size: Of an item [bytes].
-        """
+        """Nothing waits of ``what``, in the plural; those with a command are not shed; ``size`` is in bytes."""
         self.what, self.name = what, ""
-        self.received = self.dropped = self.shed = 0
+        self.received = self.dropped = self.shed = 0  # dropped: as too many waited; shed: as they waited for too long
         self._log, self._is_command, self._size = log, is_command, size
         self._waiting, self._bytes = deque[tuple[float, T]](), 0  # when each came [s], and what
         self._since, self._oldest = 0.0, 0.0  # since when they are old, how old they were at most [s]
@@ -50,6 +37,11 @@ class Backlog(Generic[T]):
 
     def __len__(self) -> int:
         return len(self._waiting)
+
+    @property
+    def shed_words(self) -> str:
+        """How many were shed, for the end of a sentence."""
+        return f", {self.shed} shed" if self.shed else ""
 
     def append(self, now: float, item: T) -> None:
         """Let an item wait that has come at ``now`` [s]."""

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import enum
 import operator
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import REACH_NS
+from ..arrays import ALWAYS, REACH_NS
 from ..fusion.segments import LONGEST_TAIL_NS
 
 Time: TypeAlias = float | int  # float seconds, or int nanoseconds
@@ -23,13 +24,16 @@ Time: TypeAlias = float | int  # float seconds, or int nanoseconds
 LEAST_NS = 1_000_000_000  # a window is no shorter: the stamps of several senders differ, and commands may pause
 RESET_AFTER = 3  # commands in a row that have another time: the clock was reset
 
+_COMMANDS = 3  # in a row that are set back, with a sensor that is, too, until all clocks are …
+_ALONE = 8  # … and where no sensor measures
+_ROWS = 5  # of a sensor in a row that are set back, until its clock is
+_LEAST, _MOST = 0.5, 1.5  # of the usual interval, within which a row goes on after the one before
+_FEW = 20  # intervals of which the usual one is a mean, and rows in order before those that are set back
+_SLOWER = 1.1  # by a longer one the usual one grows: a source that is slower now has no holes after a while
+
 
 def nanoseconds(t: Time) -> int:
-    """Int ns of float seconds or int nanoseconds.
-
-    Raises:
-        ValueError: No finite number, or out of reach of int64 ns; says which.
-    """
+    """Int ns of float seconds or int nanoseconds."""
     try:
         if isinstance(t, bool):
             raise TypeError
@@ -52,27 +56,21 @@ class Verdict(enum.Enum):
 
 
 class Clock:
-    """The newest stamp of a stream, and whether it is in doubt.
-
-    Attributes:
-        window: How far a stamp may be behind the newest one, or ahead of it without a doubt [ns]: one limit, or what
-            is plainly right ahead would put all others too far behind. At least a second.
-        newest: The newest stamp that is accepted, int ns; None at first.
-        low: Stamps from here …
-        high: … to here are plainly right [ns]; none is while there is a doubt.
-        other: Stamps of the commands in a row that have another time.
-        ahead_of: Whose stamp raised the latest doubt: a sensor's name, None for a command.
-    """
+    """The newest stamp of a stream, and whether it is in doubt."""
 
     def __init__(self, window: int) -> None:
-        """Begin without a time."""
+        """Begin without a time.
+
+        How far a stamp may be behind the newest one, and ahead of it without a doubt, is one ``window`` [ns]: else what
+        is plainly right ahead would put all others too far behind.
+        """
         self.window = max(window, LEAST_NS)
-        self.newest: int | None = None
-        self.low, self.high = 1, 0
-        self.ahead_of: str | None = None
+        self.newest: int | None = None  # that is accepted [ns]
+        self.low, self.high = 1, 0  # stamps within are plainly right [ns]; none is while there is a doubt
+        self.ahead_of: str | None = None  # whose stamp raised the latest doubt: a sensor, None for a command
         self._sure: int | None = None  # the newest stamp before a jump ahead that is still in doubt
         self._jumped, self._commands = 0, 0  # where it jumped to, and how many commands have confirmed it
-        self.other: list[int] = []
+        self.other: list[int] = []  # stamps of the commands in a row that have another time, until one is plainly right
 
     @property
     def doubtful(self) -> bool:
@@ -118,17 +116,8 @@ class Clock:
         self.newest = newest
         self.low, self.high = newest - self.window, newest + self.window
 
-    def confirm(self) -> None:
-        """Forget commands that had another time, as one has come that is plainly right."""
-        self.other = []
-
     def judge(self, stamp: int, source: str | None) -> Verdict:
-        """Judge a stamp that is not between ``low`` and ``high``, and move on to it if it is accepted.
-
-        Args:
-            stamp: Int ns.
-            source: The sensor that gave it; None for a command.
-        """
+        """Judge a stamp that is not between ``low`` and ``high``, and move on to it if it is accepted."""
         assert self.newest is not None
         command = source is None
         if self._sure is not None and self._sure - self.window <= stamp < self.newest - self.window:
@@ -160,3 +149,92 @@ class Clock:
             if len(self.other) >= RESET_AFTER:
                 return Verdict.RESET
         return Verdict.BEHIND if stamp < self.newest else Verdict.AHEAD
+
+
+@dataclass(slots=True)
+class _Source:
+    """The stamps of the commands, or of a sensor."""
+
+    last: int = ALWAYS  # the stamp of the row that came last [ns]
+    newest: int = ALWAYS  # the newest stamp [ns]
+    hole: int = ALWAYS  # where rows were missing last: none are after it [ns]
+    usual: float = 0.0  # the usual interval [ns]; 0 before any
+    in_order: int = 0  # how many rows in a row have come in order
+    in_a_row: int = 0  # how many rows in a row go on behind the newest one where there were rows
+    since: int = 0  # which event of all was the first of these
+    event: int = 0  # which one was the last row
+    back: float = 0.0  # by how much they are set back [ns]
+    at: int = ALWAYS  # the newest stamp then [ns]
+    told: int = 0  # the ``since`` that was told of
+
+    def take(self, stamp: int, event: int) -> None:
+        """Take the stamp [ns] of the next row, which is the ``event``-th of all."""
+        step, self.last, self.event = stamp - self.last, stamp, event
+        if stamp > self.newest:
+            if 0 < step <= _MOST * self.usual:
+                self.usual += (step - self.usual) / _FEW
+            elif self.usual or self.newest == ALWAYS:
+                self.hole, self.usual = stamp, _SLOWER * self.usual
+            else:
+                self.usual = step
+            self.newest, self.in_order, self.in_a_row = stamp, self.in_order + 1, 0
+            return
+        if step < 0 and self.in_order >= _FEW and stamp > self.hole:
+            self.in_a_row, self.since, self.back, self.at = 1, event, self.usual - step, self.newest
+        elif self.in_a_row and _LEAST * self.usual <= step <= _MOST * self.usual and stamp < self.newest:
+            self.in_a_row += 1
+        else:
+            self.in_a_row = 0
+        self.in_order = 0
+
+    def went_on(self, since: int) -> bool:
+        """Whether its last row, since an event, is its newest."""
+        return self.event >= since and self.last == self.newest
+
+    def went_back(self, since: int) -> bool:
+        """Whether its last row, since an event, is behind its newest; or before it, if it goes on behind."""
+        return self.last < self.newest and (self.event >= since or self.in_a_row > 0)
+
+
+class SetBack:
+    """Notices clocks that are set back by less than the window: their stamps go on where there were rows before.
+
+    A row that only came late fills a hole. Where a clock was set back, one row after the other is stamped behind the
+    newest one of its source at its usual interval, and nothing was missing there.
+    """
+
+    def __init__(self, sensors: int) -> None:
+        self._count = sensors
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew by another clock."""
+        self._sources, self._events = [_Source() for _ in range(self._count + 1)], 0
+
+    def take(self, source: int, stamp: int) -> bool:
+        """Take the stamp [ns] of the next event of ``COMMAND`` or a sensor; whether it is worth to ask for more."""
+        self._events += 1
+        one, commands = self._sources[source], self._sources[-1]
+        one.take(stamp, self._events)
+        return one.in_a_row > 0 or commands.in_a_row > 0
+
+    @property
+    def commands(self) -> int:
+        """How many commands in a row go on behind the newest one."""
+        return self._sources[-1].in_a_row
+
+    def of_all(self) -> float:
+        """By how much all clocks were set back [ns], once that shows; else 0."""
+        *sensors, commands = self._sources
+        went_on = any(one.went_on(commands.since) and commands.back > one.usual > 0.0 for one in sensors)
+        went_back = any(one.went_back(commands.since) for one in sensors)
+        shows = commands.in_a_row >= (_COMMANDS if went_back else _ALONE) and not went_on
+        return commands.back if shows else 0.0
+
+    def of_sensor(self, sensor: int) -> float:
+        """By how much the clock of a sensor alone was set back [ns], once, when that shows; else 0."""
+        one, commands = self._sources[sensor], self._sources[-1]
+        if one.in_a_row < _ROWS or one.told == one.since or not commands.went_on(one.since):
+            return 0.0
+        one.told = one.since
+        return one.back if abs(one.at - commands.at) > one.back else 0.0

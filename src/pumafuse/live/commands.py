@@ -32,14 +32,7 @@ class Commands:
         self._ends = [(math.inf, -math.inf) for _ in start]
 
     def add(self, stamp: int, codes: bytes, values: Sequence[float], oldest: int) -> None:
-        """Add the values [m] of a command that were fused, in the place of what the axis had at that stamp [ns].
-
-        Args:
-            stamp: Int ns.
-            codes: What became of each value.
-            values: [m].
-            oldest: Nobody will ask for what was before [ns].
-        """
+        """Add the values [m] of a command that were fused, in the place of what the axis had at that stamp [ns]."""
         for axis, (given, code, value) in enumerate(zip(self._given, codes, values, strict=True)):
             if code != _FUSED:
                 continue
@@ -87,7 +80,6 @@ class CommandWatch:
     """Says when commands leave what the arm model is valid for, come at another interval, or are missing."""
 
     def __init__(self, arm: ArmModel, frame: Frame | None, log: RateLimitedLog) -> None:
-        """Watch the commands of an arm; ``log`` gets the sentences."""
         self._arm, self._log = arm, log
         self._cylindrical = isinstance(frame, Cylindrical)
         self._knows_interval, self._senders = False, False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from array import array
+import operator
 from collections import deque
 from collections.abc import Mapping, Sequence
 from ctypes import Array, c_double
@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import ALWAYS, FloatArray, IndexArray, IntArray, TimeArray
+from ..arrays import ALWAYS, IndexArray, IntArray, TimeArray
 from ..errors import PumafuseError
 from ..filter.events import COMMAND, Results
 from ..filter.outcome import Outcome
@@ -56,25 +56,17 @@ class Recent:
     """What came of commands and measurements in the last seconds, in the arm's axes."""
 
     def __init__(self, config: FusionConfig) -> None:
-        """Nothing yet."""
         self._config, self._axes, self._sensors = config, tuple(config.arm.axes), tuple(config.sensors)
         self._settled = round(max(settled(config, axis) for axis in self._axes) * 1e9)
         self.restart()
 
     def restart(self) -> None:
         """Begin anew."""
-        self._stamp, self._source, self._given, self._value = array("q"), array("q"), array("q"), array("d")
+        self._rows = list[tuple[int, int, int, bytes]]()  # stamp, source, given axes as bits, values
         self._latest, self._start = [ALWAYS] * len(self._sensors), dict[str, float]()
 
     def keep(self, stamp: int, source: int, given: int, values: Array[c_double]) -> None:
-        """Keep an event; of a dense sensor some.
-
-        Args:
-            stamp: Int ns.
-            source: ``COMMAND``, or which sensor.
-            given: Its axes, as bits.
-            values: [m or rad], (A,).
-        """
+        """Keep an event: its values [m or rad], (A,), of axes given as bits; of a dense sensor some."""
         if source == COMMAND:
             if len(self._start) < len(self._axes):
                 begun = {name: values[axis] for axis, name in enumerate(self._axes) if given >> axis & 1}
@@ -83,21 +75,19 @@ class Recent:
             return
         else:
             self._latest[source] = stamp
-        self._stamp.append(stamp)
-        self._source.append(source)
-        self._given.append(given)
-        self._value.frombytes(bytes(values))
+        self._rows.append((stamp, source, given, bytes(values)))
 
     def forget(self, after: int) -> None:
         """Take back what is stamped after ``after`` [ns]."""
-        self._cut(ALWAYS, after)
+        self._rows = [row for row in self._rows if row[0] <= after]
         self._latest = [min(stamp, after) for stamp in self._latest]
 
     def segment(self, now: int) -> Segment | None:
         """What came in the span before ``now`` [ns]; None where that is too little. What is older is forgotten."""
-        stamp, source, given, value = self._cut(now - _SPAN_NS, now)
-        order = np.argsort(stamp, kind="stable")
-        stamp, source, given, value = stamp[order], source[order], given[order], value[order]
+        self._rows = [row for row in self._rows if now - _SPAN_NS < row[0] <= now]
+        ordered = sorted(self._rows, key=operator.itemgetter(0))
+        stamp, source, given = np.array([row[:3] for row in ordered], dtype=np.int64).reshape(-1, 3).T
+        value = np.frombuffer(bytearray().join(row[3] for row in ordered)).reshape(-1, len(self._axes))
         commands = source == COMMAND
         if not commands.any() or stamp[-1] - stamp[commands][0] < _SHORTEST_NS:
             return None
@@ -120,32 +110,15 @@ class Recent:
         except PumafuseError:  # of what is there nothing can be made
             return None
 
-    def _cut(self, after: int, until: int) -> tuple[TimeArray, IntArray, IntArray, FloatArray]:
-        """Keep what is stamped after one time and until another [ns]; that, in the order in which it came."""
-        stamp, source, given = (np.array(one, dtype=np.int64) for one in (self._stamp, self._source, self._given))
-        value = np.array(self._value).reshape(-1, len(self._axes))
-        kept = (stamp > after) & (stamp <= until)
-        stamp, source, given, value = stamp[kept], source[kept], given[kept], value[kept]
-        self._stamp, self._source, self._given = (array("q", one.tobytes()) for one in (stamp, source, given))
-        self._value = array("d", value.tobytes())
-        return stamp, source, given, value
-
 
 @dataclass
 class _Trouble:
-    """A fault that a look has found.
+    """A fault that a look has found."""
 
-    Attributes:
-        fault: As the last look has found it.
-        travel: How far apart the commands of its axes were then [m or rad].
-        found: In how many looks in a row it was found.
-        missed: In how many looks in a row it was not, though they would have shown it.
-    """
-
-    fault: Fault
-    travel: float = 0.0
-    found: int = 0
-    missed: int = 0
+    fault: Fault  # as the last look has found it
+    travel: float = 0.0  # how far apart the commands of its axes were then [m or rad]
+    found: int = 0  # in how many looks in a row it was found
+    missed: int = 0  # in how many looks in a row it was not, though they would have shown it
 
     @property
     def is_said(self) -> bool:
@@ -154,16 +127,9 @@ class _Trouble:
 
 
 class Diagnosis:
-    """Says once what is wrong with a stream, and once that it is over.
-
-    Attributes:
-        recent: What came in the last seconds.
-        due: When to look again [ns].
-        doubtful: Axes of which the estimate is not to be believed as far as its standard deviation says.
-    """
+    """Says once what is wrong with a stream, and once that it is over."""
 
     def __init__(self, config: FusionConfig, log: RateLimitedLog) -> None:
-        """Diagnose streams of a configuration; ``log`` gets the sentences."""
         self._config, self._log = config, log
         self._axes, self._sensors = tuple(config.arm.axes), tuple(config.sensors)
         self.recent = Recent(config)

@@ -21,7 +21,7 @@ from ..fusion.setup import live_model
 from ..logs.frames import CARTESIAN, Placed
 from ..space.rotations import TURNING
 from ..units import Kind
-from .clock import Clock, Time, Verdict, nanoseconds
+from .clock import Clock, SetBack, Time, Verdict, nanoseconds
 from .commands import Commands, CommandWatch, number
 from .diagnosis import Diagnosis
 from .frame_start import FrameStart
@@ -30,7 +30,6 @@ from .joints import Joints
 from .rate_limit import RateLimitedLog
 from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
 from .screening import NEWS, CommandScreen, HoldWatch, Screened
-from .set_back import SetBack
 from .tool import NO_TOOL, NOISE, ORIENTATION, Row, axes_of, check_tool, row_noise, tool_of
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
@@ -315,14 +314,12 @@ class LiveEstimator:
             return self._refuse(sensor, values, _UNKNOWN, why, self._refused)
         clock = self._clock
         if not clock.low <= stamp <= clock.high:
-            told = self._judged(_Event(stamp, sensor, values))
-            if told is not None:
+            if (told := self._judged(_Event(stamp, sensor, values))) is not None:
                 return told
         elif clock.newest is not None and stamp > clock.newest:
             clock.settle(stamp)
         if sensor is None and self._aside:
-            clock.confirm()
-            self._aside = []
+            clock.other, self._aside = [], []
         if self._event_log is not None:
             self._event_log.append(stamp, sensor, values)
         result = self._take_in_time(stamp, sensor, values, parsed)
@@ -334,11 +331,15 @@ class LiveEstimator:
         self, stamp: int, sensor: str | None, values: Mapping[str, Any], parsed: Mapping[str, Any]
     ) -> UpdateResult:
         """Take an event whose stamp is right, as it came and as it is used."""
-        if sensor is None:  # of joints these are screened: a pose is of all of them
-            return self._take_screened(stamp, values if not self.joints.keys().isdisjoint(values) else parsed)
-        if stamp > self._screen.until:
-            self._settle(self._screen.believed())
-        return self._enter(stamp, sensor, parsed)
+        if sensor is not None:
+            if stamp > self._screen.until:
+                self._settle(self._screen.believed())
+            return self._enter(stamp, sensor, parsed)
+        self._counts.outcomes[COMMAND, _STRAY] += 1  # as long as it waits for the next
+        in_joints = not self.joints.keys().isdisjoint(values)  # which are screened: a pose is of all of them
+        settled = self._settle(self._screen.take(stamp, values if in_joints else parsed))
+        waits = "leaps by many times the usual step: not used unless the next one is there, too"
+        return settled.get(stamp) or refused(values, _STRAY, waits)
 
     def _watch_clocks(self, event: _Event, result: UpdateResult) -> UpdateResult:
         """Say that a sensor's clock was set back within the window, and start anew where all clocks were."""
@@ -368,11 +369,7 @@ class LiveEstimator:
         return self._begin_segment([one for one, _ in self._behind])
 
     def _parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """An event's values with a pose in the place of joints, and a commanded orientation as axes.
-
-        Raises:
-            ValueError: It cannot be used; says why.
-        """
+        """An event's values with a pose in the place of joints, and a commanded orientation as axes."""
         if self._joints is not None and (told := self._joints.told(values)) is not None:
             values = self._joints.posed(values, told)
         if self._tool is not None:
@@ -380,13 +377,6 @@ class LiveEstimator:
         if ORIENTATION in values:
             raise ValueError(NO_TOOL)
         return values
-
-    def _take_screened(self, stamp: int, values: Mapping[str, Any]) -> UpdateResult:
-        """Take a command that is in time, or let it wait for the next."""
-        self._counts.outcomes[COMMAND, _STRAY] += 1
-        settled = self._settle(self._screen.take(stamp, values))
-        waits = "leaps by many times the usual step: not used unless the next one is there, too"
-        return settled.get(stamp) or refused(values, _STRAY, waits)
 
     def _settle(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
         """Enter commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
@@ -539,16 +529,17 @@ class LiveEstimator:
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any], judged: bool = False) -> UpdateResult:
         """Give an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
         window, counts, given, stranger = self._window, self._counts, 0, ""
-        new, told = window.value, None
-        noise = 1.0
-        if sensor is not None and not judged and self._spreads:
-            window.spread[:] = self._no_spread
-        if sensor is not None and not judged and NOISE in values:
-            noise, self._spreads = row_noise(values), True
-            values = {name: value for name, value in values.items() if name != NOISE}
-        if self._tool is not None and sensor is not None and not judged:
-            told = self._tool.of_tool(sensor, stamp, values)
-            values = told.values
+        new, told, noise, tool = window.value, None, 1.0, self._tool
+        measured = None if judged else sensor  # whose row it is that comes for the first time
+        if measured is not None:
+            if self._spreads:
+                window.spread[:] = self._no_spread
+            if NOISE in values:
+                noise, self._spreads = row_noise(values), True
+                values = {name: value for name, value in values.items() if name != NOISE}
+            if tool is not None:
+                told = tool.of_tool(measured, stamp, values)
+                values = told.values
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
@@ -562,17 +553,17 @@ class LiveEstimator:
         oldest = self._oldest()
         if stamp < oldest:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
-        if told is not None and sensor is not None and self._tool is not None:
+        if told is not None:
             for name in told.spread.keys() & self._bits.keys():
                 window.spread[self._bits[name]] = told.spread[name]
         if noise != 1.0:
             window.spread[:] = [noise * factor for factor in window.spread]
-        if told is not None and told.seen is not None and sensor is not None and self._tool is not None:
-            self._tool.keep(sensor, Row(stamp, told.seen, [*new, *window.spread], noise), oldest)
-        if sensor is not None and not judged:
-            held, released = self._held(stamp, sensor, given)
+        if measured is not None:
+            if tool is not None and told is not None and told.seen is not None:
+                tool.keep(measured, Row(stamp, told.seen, [*new, *window.spread], noise), oldest)
+            held, released = self._held(stamp, measured, given)
             if released or held:
-                return self._without_held(stamp, sensor, given, held, released)
+                return self._without_held(stamp, measured, given, held, released)
         if not given:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
@@ -593,8 +584,14 @@ class LiveEstimator:
             diagnosis.look(window, self._clock.sure)
         if sensor is None:
             if not judged:
-                self._count_command(stamp, values, result.outcome)
-            self._keep_command(stamp, values, codes, oldest)
+                counts.outcomes[COMMAND, result.outcome] += 1
+                if result.outcome is _FUSED:
+                    self._doubtful += self._clock.doubtful
+                    self._watch.intervals(stamp, values)
+            self._commands.add(stamp, codes, window.value[:], oldest)
+            self._watch.limits(self._commands)
+            if self._tool is not None:
+                self._place_again(self._tool.command(stamp, values, oldest))
             return result
         if not judged:
             counts.came(source, stamp, self._clock.sure)
@@ -641,20 +638,6 @@ class LiveEstimator:
                 )
         return held, released
 
-    def _count_command(self, stamp: int, values: Mapping[str, Any], outcome: Outcome) -> None:
-        """Count a command that is in the window, and when it came."""
-        self._counts.outcomes[COMMAND, outcome] += 1
-        if outcome is _FUSED:
-            self._doubtful += self._clock.doubtful
-            self._watch.intervals(stamp, values)
-
-    def _keep_command(self, stamp: int, values: Mapping[str, Any], codes: bytes, oldest: int) -> None:
-        """Keep and watch where a command that is in the window has the arm go."""
-        self._commands.add(stamp, codes, self._window.value[:], oldest)
-        self._watch.limits(self._commands)
-        if self._tool is not None:
-            self._place_again(self._tool.command(stamp, values, oldest))
-
     def _place_again(self, since: int | None) -> None:
         """Put measurements that the commands place where they are by now, those valid from an instant [ns] on."""
         if self._tool is None or since is None:
@@ -676,22 +659,18 @@ class LiveEstimator:
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any], noise: float = 1.0) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
-        window, given = self._window, 0
-        placed = self._frame_start.in_axes(
-            {name: number(values[name]) for name in CARTESIAN if name in values},
-            None if sensor is None else np.array([self._tangential(stamp)]),
-        )
+        window, given, near = self._window, 0, None
+        if sensor is not None:
+            told = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
+            near = np.array([told or 0.0])
+        point = {name: number(values[name]) for name in CARTESIAN if name in values}
+        placed = self._frame_start.in_axes(point, near)
         for name, component in placed.items():
             axis = self._bits[name]
             window.value[axis], spread = component
             window.spread[axis] = noise * spread
             given |= 1 << axis
         return given
-
-    def _tangential(self, stamp: int) -> float:
-        """Where the tangential axis is commanded to be at ``stamp`` [ns], as far as is known [m]."""
-        found = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
-        return 0.0 if found is None else found
 
     def _say_contradiction(self, stamp: int, sensor: str) -> None:
         """Say which other sensor one contradicts, by how much, and since when."""

@@ -46,13 +46,7 @@ static const pf_model {name}_model = {{{upper}_AXES, {upper}_SENSORS, {name}_axi
 
 
 def header(config: FusionConfig, name: str, source: str) -> str:
-    """The text of a header with the numbers that :class:`.LiveEstimator` gives to the filter.
-
-    Args:
-        config: Arm, noise and sensors, of which there is one at least.
-        name: What each name in it begins with: letters, digits and underscores, no digit first.
-        source: Where the configuration is from.
-    """
+    """The text of a header with the numbers that :class:`.LiveEstimator` gives to the filter."""
     axes, sensors, upper = tuple(config.arm.axes), tuple(config.sensors), name.upper()
     axis, sensor, view = live_model(config)
     return _HEADER.format(
@@ -115,5 +109,4 @@ def _exact(number: float) -> str:
 
 
 def _comment(text: str) -> str:
-    """A text that may stand in a comment."""
     return text.replace("*/", "* /").replace("/*", "/ *")

@@ -13,18 +13,13 @@ from ..logs.frames import CARTESIAN, Frame, Placed, Rotated
 
 
 class FrameStart:
-    """A frame that starts at the start level, or at the first command.
-
-    Attributes:
-        placed: The frame with its start; None until that is known.
-        since: Stamp of the command that gave the start, int ns; None where no command had to.
-    """
+    """A frame that starts at the start level, or at the first command."""
 
     def __init__(self, frame: Frame | None, axes: tuple[str, ...]) -> None:
         """Wait for a start, unless the frame is rotated: then it needs none."""
         self._frame, self._axes = frame, axes
         self.placed: Placed | None = placed_at(frame, 0.0, 0.0, "") if isinstance(frame, Rotated) else None
-        self.since: int | None = None
+        self.since: int | None = None  # stamp of the command that gave the start [ns]
         self._last = 0.0  # tangential position of the command before [m]
 
     @property
@@ -33,11 +28,7 @@ class FrameStart:
         return self._frame is not None and self.placed is None
 
     def start(self, level: Mapping[str, float]) -> dict[str, float]:
-        """Convert a start level to axes [m]; its x and y start the frame.
-
-        Raises:
-            PumafuseError: It is of no axis, gives half a position, or one on the base's axis.
-        """
+        """Convert a start level to axes [m]; its x and y start the frame."""
         found = {name: value for name, value in level.items() if name in self._axes}
         rest = {name: value for name, value in level.items() if name not in found}
         if rest and (self._frame is None or not rest.keys() <= set(CARTESIAN) or ("x" in rest) != ("y" in rest)):
@@ -47,20 +38,14 @@ class FrameStart:
         return found | {axis: value for axis, (value, _) in self.in_axes(rest, None).items()}
 
     def place(self, stamp: int, x: float, y: float) -> None:
-        """Start the frame at a command's x and y [m].
-
-        Raises:
-            RunError: That is on the base's axis.
-        """
+        """Start the frame at a command's x and y [m]."""
         assert self._frame is not None
         self.placed, self.since = placed_at(self._frame, x, y, "command"), stamp
 
     def in_axes(self, values: Mapping[str, float], near: FloatArray | None) -> dict[str, tuple[float, float]]:
         """Convert x, y, z [m] to axes: for each its position [m], and the factor by which its noise grows.
 
-        Args:
-            values: x, y and z [m] as far as they are given; NaN on both axes for x without y.
-            near: For a measurement the commanded tangential position [m], (1,); None for a command.
+        A measurement comes with the commanded tangential position [m], (1,); x without y is NaN on both axes.
         """
         found: dict[str, tuple[float, float]] = {}
         if self.placed is not None and ("x" in values or "y" in values):

@@ -111,16 +111,11 @@ class Counts:
 
     That may change as long as they are there; it is read once they have left, in the order of time: what came late is
     in then.
-
-    Attributes:
-        rows: That came, (S,).
-        outcomes: Number of components by sensor, last of commands, and outcome, (S + 1, 8).
     """
 
     def __init__(self, sensors: int) -> None:
-        """Nothing yet."""
-        self.rows: IntArray = np.zeros(sensors, dtype=np.int64)
-        self.outcomes: IntArray = np.zeros((sensors + 1, len(Outcome)), dtype=np.int64)
+        self.rows: IntArray = np.zeros(sensors, dtype=np.int64)  # that came, (S,)
+        self.outcomes: IntArray = np.zeros((sensors + 1, len(Outcome)), dtype=np.int64)  # of sensors, last of commands
         self._intervals = [_Intervals() for _ in range(sensors)]
         self.restart()
 
@@ -165,14 +160,7 @@ class Counts:
         self._second[self._second > after // _SECOND] = ALWAYS
 
     def health(self, sensor: int, outcomes: IntArray, newest: int | None, stale_ns: int) -> SensorHealth:
-        """The health of a sensor, by what :meth:`counted` gives.
-
-        Args:
-            sensor: Which one.
-            outcomes: What was refused of it before it came to the window, (8,).
-            newest: The newest stamp of all, int ns; None before any event.
-            stale_ns: After how long a silent sensor is stale [ns].
-        """
+        """The health of a sensor, by what :meth:`counted` gives and by what was refused before, (8,)."""
         last, places = int(self._last[sensor]), slice(sensor * _SECONDS, (sensor + 1) * _SECONDS)
         silent = None if newest is None or last == ALWAYS else max((newest - last) / 1e9, 0.0)
         now, second = newest or 0, self._second[places]

@@ -24,18 +24,9 @@ Told = tuple[float, ...]  # the joints of a chain, in their order [rad or m]
 
 
 class Joints:
-    """What joints tell of the tool, and the commands in joints by all that have come, in whatever order.
-
-    Attributes:
-        kinds: What each joint moves by.
-    """
+    """What joints tell of the tool, and the commands in joints by all that have come, in whatever order."""
 
     def __init__(self, config: FusionConfig) -> None:
-        """No command yet.
-
-        Raises:
-            PumafuseError: The robot of the configuration is none, or does not move the arm's axes.
-        """
         assert config.robot is not None
         self._chain = chain_of(config.robot)
         self.kinds: Mapping[str, Kind] = self._chain.kinds
@@ -57,11 +48,7 @@ class Joints:
         self._given, self._told = list[int](), list[Told]()
 
     def told(self, values: Mapping[str, Any]) -> Told | None:
-        """Where an event tells the joints to be; None if it tells of none.
-
-        Raises:
-            ValueError: It lacks some, gives one that no robot has, or a pose as well.
-        """
+        """Where an event tells the joints to be; None if it tells of none."""
         if self.kinds.keys().isdisjoint(values):
             return None
         found = tuple(number(values.get(joint)) for joint in self.kinds)
@@ -88,11 +75,6 @@ class Joints:
 
         A joint that answers later is told later, on the line from command to command, as
         :meth:`pumafuse.logs.run.Source.delayed` has it.
-
-        Args:
-            stamp: Int ns.
-            told: Its joints.
-            oldest: Nobody will give what was before [ns].
         """
         place = bisect_left(self._given, stamp)
         again = place < len(self._given) and self._given[place] == stamp

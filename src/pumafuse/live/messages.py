@@ -18,7 +18,7 @@ from ..arrays import FloatArray
 from ..errors import ConfigError
 from ..logs import bags
 from ..logs.columns import LOG_TIME, NAMES, SPLIT_STAMPS, holders, leaf
-from ..logs.manifest import Column, CommandEntry, Orientation, SourceEntry, Time
+from ..logs.manifest import Column, CommandEntry, Manifest, Orientation, SourceEntry, Time
 from ..logs.recordings import PATH, TRANSFORMS, CommandedPath, begin_of, trajectory_in
 from ..logs.run import PAUSE, Source
 from ..units import ANGLES, LENGTHS, TIMES, divisor, ending
@@ -139,25 +139,13 @@ def _stamp(time: Time, where: str) -> Callable[[Any, int], float | int]:
 
 
 class Reader:
-    """What messages of one topic say of one source of a run.
+    """What messages of one topic say of one source of a run: a sensor, or the commands, which have no name.
 
-    Attributes:
-        name: Of the sensor; empty for the commands.
-        entry: What ``run.toml`` says of it.
+    The commands' reader keeps the last ones by axis [m or rad]: an angle of a sensor that goes on begins at the turn
+    that is nearest to them.
     """
 
     def __init__(self, name: str, entry: SourceEntry, commanded: dict[str, float]) -> None:
-        """Prepare to read.
-
-        Args:
-            name: Of the sensor; empty for the commands.
-            entry: What ``run.toml`` says of it.
-            commanded: The last command by axis [m or rad], which the commands' reader keeps: a sensor's angle that goes
-                on begins at the turn that is nearest.
-
-        Raises:
-            ConfigError: A column has no unit, or there are no stamps that a stream could have.
-        """
         where = f"sensors.{name}" if name else "command"
         self.name, self.entry = name, entry
         self._stamp, self._met = _stamp(entry.time, where), _condition(entry.where)
@@ -180,11 +168,7 @@ class Reader:
         self._next: SimpleNamespace | None = None  # of the path; then come the others
 
     def lacks(self, empty: Any) -> list[str]:
-        """The fields that a type of messages has not, of which this is an empty one.
-
-        Raises:
-            ConfigError: Its stamps are numbers, of which nobody says the unit.
-        """
+        """The fields that a type of messages has not, of which this is an empty one."""
         parts = _rows(empty, self._asks_whole)
         if self._is_of_paths:
             return [] if trajectory_in(bags.plain(empty)) is not None else [PATH]
@@ -203,11 +187,7 @@ class Reader:
         return lacking
 
     def events(self, message: Any, received: int) -> Iterator[Event]:
-        """The events of a message that was received at an instant [ns].
-
-        Raises:
-            ValueError: It is no trajectory, where ``run.toml`` asks for one.
-        """
+        """The events of a message that was received at an instant [ns]."""
         if self._is_of_paths:
             self._follow(message, received)
             return
@@ -229,7 +209,6 @@ class Reader:
         return None if self._next is None else self._next.time_ns
 
     def _event(self, row: Any, received: int) -> Iterator[Event]:
-        """The event of a row, if it is one of the source's."""
         if not self._met(row):
             return
         values: dict[str, Any] = {axis: sum(one(row) for one in numbers) for axis, numbers in self._values.items()}
@@ -289,6 +268,12 @@ class Reader:
         rows = (SimpleNamespace(time_ns=time, name=path.joints, position=at) for time, at in path.rows())
         self._coming = chain(takewhile(lambda row: row.time_ns < begin, left), rows)
         self._next = next(self._coming, None)
+
+
+def readers_of(listed: Manifest) -> list[Reader]:
+    """The readers of all sources of a ``run.toml``; of one instant commands come last."""
+    commanded, entries = dict[str, float](), {**listed.sensors, "": listed.command}
+    return [Reader(name, entry, commanded) for name, entry in entries.items()]
 
 
 def _number(get: Getter, row: Any) -> FloatArray:

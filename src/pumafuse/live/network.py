@@ -15,10 +15,10 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
-from typing import TypeAlias
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Protocol, TypeAlias, TypeVar
 
-from ..errors import RunError
+from ..errors import ConfigError, RunError
 from .address import Address, Allowed, SocketAddress, host_port, listener, receiver
 from .backlog import MOST, Backlog
 from .rate_limit import RateLimitedLog
@@ -28,7 +28,7 @@ from .wire import Event, Lines
 _LARGEST = 65_536  # bytes of a datagram, or of a piece of a connection
 _MOST_RECEIVED = 1024  # datagrams that are read from the socket at once
 _MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
-_EVENT = 500  # bytes of an event, about
+EVENT_BYTES = 500  # of an event, about
 _COMMAND = b'"command"'  # in a datagram with a command
 _RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
@@ -37,20 +37,14 @@ _MOST_PIECES = 16  # of all connections that wait
 _HANDED_OVER = 0.02  # s in which a thread that waited for room hands over its piece
 _FIRST_WAIT, _LONGEST_WAIT = 0.5, 30.0  # s until a connection is tried again
 _PATIENCE = 10.0  # s for a connection to be made
+_SILENT = RateLimitedLog(lambda _: None)  # at the end: a thread that writes while the process ends would stop it
+
+Items: TypeAlias = Sequence[bytes | Event]
+_Piece = TypeVar("_Piece", bound=Items)
 
 
-def source(address: Address, listen: str | None, allow: list[str], notify: Callable[[str], None]) -> Source:
-    """The source of an address.
-
-    Args:
-        address: Of kind ``udp``, ``tcp-listen`` or ``tcp``.
-        listen: See :func:`pumafuse.live.address.listener`.
-        allow: As well.
-        notify: Takes a sentence for the log.
-
-    Raises:
-        ConfigError: The address may not be listened on.
-    """
+def source(address: Address, listen: str | None, allow: list[str], notify: Callable[[str], None]) -> Remote:
+    """The source of an address."""
     if address.kind == "tcp":
         return TcpClient(address, notify)
     place, allowed = listener(address, listen, allow)
@@ -64,7 +58,6 @@ class UdpListener:
     """Lines from datagrams of one or more lines."""
 
     def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
-        """Prepare; :meth:`start` opens the socket."""
         self._place, self._allowed = place, allowed
         self._notify, self._log = notify, RateLimitedLog(notify)
         self._backlog = Backlog[bytes]("datagrams", self._log, lambda datagram: _COMMAND in datagram, len)
@@ -72,11 +65,7 @@ class UdpListener:
         self._dropped_before = self._refused = self._reported = 0
 
     def start(self) -> None:
-        """Open the socket.
-
-        Raises:
-            RunError: The system refuses.
-        """
+        """Open the socket."""
         self._socket = socket.socket(self._place[0], socket.SOCK_DGRAM)
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
@@ -105,12 +94,10 @@ class UdpListener:
         """How many came, and how many were lost or refused."""
         waited = self._backlog
         taken = waited.received - waited.dropped - waited.shed
-        text = f"{self._name}: {taken} datagrams taken in, {self._lost()} lost"
-        text += f", {waited.shed} shed" if waited.shed else ""
+        text = f"{self._name}: {taken} datagrams taken in, {self._lost()} lost{waited.shed_words}"
         return f"{text}, {self._refused} refused" if self._refused else text
 
     def _lines(self, most: int) -> list[bytes]:
-        """The lines of at most so many datagrams."""
         return [line for datagram in self._backlog.take(most) for line in datagram.split(b"\n")]
 
     def _receive(self, most: int) -> None:
@@ -145,14 +132,11 @@ class _Tcp:
 
     def get(self) -> list[bytes]:
         """Some of one connection; none after a tenth of a second without any."""
-        try:
-            return self._pieces.get(timeout=QUIET)
-        except queue.Empty:
-            return []
+        return _some(self._pieces)
 
     def stop(self) -> list[bytes]:
         """What has come and was not given yet; the connections end with the process."""
-        self._log = RateLimitedLog(lambda _: None)  # a thread that writes while the process ends would stop it
+        self._log = _SILENT
         found: list[bytes] = []
         with contextlib.suppress(queue.Empty):
             for _ in range(_MOST_PIECES + _MOST_CONNECTIONS):  # and one that each thread holds; a flood has no end
@@ -163,16 +147,10 @@ class _Tcp:
 def _read_lines(
     connection: socket.socket, put: Callable[[list[bytes]], None], heard: Callable[[], object] = lambda: None
 ) -> bool:
-    """Read a connection to its end, a last line without its end, too; whether there was anything.
-
-    Args:
-        connection: It is closed then.
-        put: Takes lines.
-        heard: Called when something has come for the first time.
-    """
+    """Read a connection to its end, a last line without its end, too; whether there was anything."""
     lines, some = Lines(), False
     with connection, contextlib.suppress(OSError):
-        keep_alive(connection)
+        _keep_alive(connection)
         while piece := connection.recv(_LARGEST):
             if not some:
                 heard()
@@ -188,18 +166,13 @@ class TcpListener(_Tcp):
     """Lines from all who connect."""
 
     def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
-        """Prepare; :meth:`start` listens."""
         super().__init__(notify)
         self._place, self._allowed = place, allowed
         self._open, self._silent = set[socket.socket](), dict[socket.socket, None]()
         self._accepted = self._refused = 0
 
     def start(self) -> None:
-        """Listen.
-
-        Raises:
-            RunError: The system refuses.
-        """
+        """Listen."""
         self._socket = socket.socket(self._place[0], socket.SOCK_STREAM)
         if os.name == "posix":  # elsewhere two could listen at one port
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -250,41 +223,29 @@ class TcpListener(_Tcp):
         self._log.write("gone", f"the connection from {peer} has ended")
 
 
-class Connection:
-    """A connection to a server, made again whenever it ends.
+class _Client:
+    """A connection to a server, made again whenever it ends."""
 
-    Attributes:
-        name: The server's address.
-        log: Takes sentences, until :meth:`stop`.
-    """
-
-    def __init__(self, address: Address, read: Callable[[socket.socket], bool], notify: Callable[[str], None]) -> None:
-        """Prepare; :meth:`start` connects.
-
-        Args:
-            address: Of the server.
-            read: Reads a connection to its end, and closes it; whether there was anything.
-            notify: Takes a sentence for the log.
-        """
-        self.name, self.log = address.text, RateLimitedLog(notify)
-        self._place, self._read = (address.host, address.port), read
+    def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
+        self._name, self._log = address.text, RateLimitedLog(notify)
+        self._place = (address.host, address.port)
         self._made, self._open = 0, False
         self._stopped = threading.Event()
 
     def start(self) -> None:
         """Begin to connect."""
-        _in_a_thread(self.stay_connected)
-
-    def stop(self) -> None:
-        """Make no connection any more, and be silent; one that is open ends with the process."""
-        self._stopped.set()
-        self.log = RateLimitedLog(lambda _: None)  # a thread that writes while the process ends would stop it
+        _in_a_thread(self._stay_connected)
 
     def summary(self) -> str:
         """How often the connection was made, and whether it is there."""
-        return f"{self.name}: connections made: {self._made}, {'open' if self._open else 'none open'}"
+        return f"{self._name}: connections made: {self._made}, {'open' if self._open else 'none open'}"
 
-    def stay_connected(self) -> None:
+    def _end(self) -> None:
+        """Make no connection any more, and be silent; one that is open ends with the process."""
+        self._stopped.set()
+        self._log = _SILENT
+
+    def _stay_connected(self) -> None:
         """Connect and read, again and again, with waits that double as long as nothing comes."""
         wait = _FIRST_WAIT
         while not self._stopped.is_set():
@@ -292,54 +253,53 @@ class Connection:
                 connection = socket.create_connection(self._place, _PATIENCE)
             except (OSError, UnicodeError) as error:
                 reason = getattr(error, "strerror", None) or "no answer"
-                self.log.write("unreachable", f"{self.name}: cannot be reached: {reason}; tried again in {wait:g} s")
+                self._log.write("unreachable", f"{self._name}: cannot be reached: {reason}; tried again in {wait:g} s")
             else:
                 connection.settimeout(None)
                 self._made, self._open = self._made + 1, True
-                self.log.write("connected", f"{self.name}: connected")
+                self._log.write("connected", f"{self._name}: connected")
                 if self._read(connection):
                     wait = _FIRST_WAIT
                 self._open = False
-                self.log.write("ended", f"{self.name}: the connection has ended; made again in {wait:g} s")
+                self._log.write("ended", f"{self._name}: the connection has ended; made again in {wait:g} s")
             self._stopped.wait(wait)
             wait = min(2.0 * wait, _LONGEST_WAIT)
 
+    def _read(self, connection: socket.socket) -> bool:
+        """Read a connection to its end, and close it; whether there was anything."""
+        raise NotImplementedError
 
-class TcpClient(_Tcp):
+
+class TcpClient(_Client, _Tcp):
     """Lines from a server."""
 
     def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
-        """Prepare; :meth:`start` connects."""
-        super().__init__(notify)
-        self._connection = Connection(address, lambda one: _read_lines(one, self._pieces.put), notify)
-
-    def start(self) -> None:
-        """Begin to connect."""
-        self._connection.start()
-
-    def summary(self) -> str:
-        """How often the connection was made, and whether it is there."""
-        return self._connection.summary()
+        _Tcp.__init__(self, notify)
+        _Client.__init__(self, address, notify)
 
     def stop(self) -> list[bytes]:
         """What has come and was not given yet; no connection is made any more."""
-        self._connection.stop()
+        self._end()
         return super().stop()
 
+    def _read(self, connection: socket.socket) -> bool:
+        return _read_lines(connection, self._pieces.put)
 
-class EventClient:
+
+class Refused(Exception):  # noqa: N818 - what a server does, and never leaves the thread that reads
+    """A server sends what it should not, or does not do what it was asked; the text says what."""
+
+
+class EventClient(_Client):
     """Events of a server that does not speak in lines; what comes faster than it is taken in waits in a backlog."""
 
-    def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
-        """Prepare; :meth:`start` connects."""
-        self._connection = Connection(address, self._read, notify)
-        self._backlog = Backlog[Event]("events", self._connection.log, lambda event: not event.sensor, lambda _: _EVENT)
-        self._backlog.name = self._name = self._connection.name
-        self._came = threading.Condition()
+    REFUSED = ""  # before the reason why nothing is read any more
 
-    def start(self) -> None:
-        """Begin to connect."""
-        self._connection.start()
+    def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
+        super().__init__(address, notify)
+        self._backlog = Backlog[Event]("events", self._log, lambda event: not event.sensor, lambda _: EVENT_BYTES)
+        self._backlog.name = self._name
+        self._came = threading.Condition()
 
     def get(self) -> list[Event]:
         """Some events in the order in which they came; none after a tenth of a second without any."""
@@ -351,42 +311,107 @@ class EventClient:
 
     def stop(self) -> list[Event]:
         """The events that have come and were not given yet; no connection is made any more."""
-        self._connection.stop()
+        self._end()
         with self._came:
             return self._backlog.take(MOST)
 
     def summary(self) -> str:
         """How often the connection was made, how many events came, and how many were lost."""
         waited = self._backlog
-        text = f"{self._connection.summary()}; {waited.received} events, {waited.dropped} lost"
-        return f"{text}, {waited.shed} shed" if waited.shed else text
-
-    def _put(self, events: Iterable[Event]) -> None:
-        """Let events wait until they are taken in."""
-        now = time.monotonic()
-        with self._came:
-            for event in events:
-                self._backlog.append(now, event)
-            self._came.notify()
-
-    def _say(self, about: str, text: str) -> None:
-        """A sentence for the log, not too often about one thing."""
-        self._connection.log.write(about, f"{self._name}: {text}")
+        return f"{super().summary()}; {waited.received} events, {waited.dropped} lost{waited.shed_words}"
 
     def _read(self, connection: socket.socket) -> bool:
-        """Read a connection to its end, and close it; whether there was anything."""
+        some = False
+        with connection, contextlib.suppress(OSError):
+            _keep_alive(connection)
+            try:
+                for events in self._received(connection):
+                    now = time.monotonic()
+                    with self._came:
+                        for event in events:
+                            self._backlog.append(now, event)
+                        self._came.notify()
+                    some = True
+            except (Refused, ConfigError, struct.error) as error:
+                self._log.write("refused", f"{self._name}: {self.REFUSED}{error}")
+        return some
+
+    def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
+        """The events of each message; what is refused, or too short, is raised as Refused or struct.error."""
         raise NotImplementedError
 
 
-Source: TypeAlias = UdpListener | TcpListener | TcpClient
+class Remote(Protocol):
+    """A source that is listened to until the end is asked for."""
+
+    def start(self) -> None:
+        """Begin to listen; a PumafuseError where that cannot be."""
+
+    def get(self) -> Items:
+        """Some lines or events; none after a tenth of a second without any."""
+        ...
+
+    def stop(self) -> Items:
+        """Those that have come and were not given yet."""
+        ...
+
+    def summary(self) -> str:
+        """How many came."""
+        ...
+
+
+class Several:
+    """Sources, as a robot's controller and a tracker, each asked by a thread of its own: what comes, in its order."""
+
+    def __init__(self, sources: Sequence[Remote]) -> None:
+        self._sources = sources
+        self._pieces = queue.Queue[Items](_MOST_PIECES)
+        self._ended = threading.Event()
+        self._error: Exception | None = None
+
+    def start(self) -> None:
+        """Begin to listen."""
+        for source in self._sources:
+            source.start()
+        self._threads = [_in_a_thread(self._ask, one) for one in self._sources]
+
+    def get(self) -> Items:
+        """Some of one source; none after a tenth of a second without any. What a source has raised is raised."""
+        if self._error is not None:
+            raise self._error
+        return _some(self._pieces)
+
+    def stop(self) -> Items:
+        """Those that have come and were not given yet."""
+        self._ended.set()
+        found = list[bytes | Event]()
+        while any(thread.is_alive() for thread in self._threads) or not self._pieces.empty():
+            found += _some(self._pieces)
+        return [*found, *(item for source in self._sources for item in source.stop())]
+
+    def summary(self) -> str:
+        """How many came from each."""
+        return "; ".join(filter(None, (source.summary() for source in self._sources)))
+
+    def _ask(self, source: Remote) -> None:
+        try:
+            while not self._ended.is_set():
+                if items := source.get():
+                    self._pieces.put(items)
+        except Exception as error:  # it is the thread that takes what comes that is to end by it
+            self._error = error
+
+
+def _some(pieces: queue.Queue[_Piece]) -> _Piece | list[Any]:
+    """The next piece; nothing after a tenth of a second without any."""
+    try:
+        return pieces.get(timeout=QUIET)
+    except queue.Empty:
+        return []
 
 
 def _listen(listening: socket.socket, kind: str, place: tuple[str, int], notify: Callable[[str], None]) -> str:
-    """Let a socket listen; returns its address as people write it.
-
-    Raises:
-        RunError: The system refuses.
-    """
+    """Let a socket listen; returns its address as people write it."""
     try:
         listening.bind(place)
         if kind == "tcp-listen":
@@ -399,12 +424,14 @@ def _listen(listening: socket.socket, kind: str, place: tuple[str, int], notify:
     return name
 
 
-def _in_a_thread(work: Callable[..., None], *given: object) -> None:
+def _in_a_thread(work: Callable[..., None], *given: object) -> threading.Thread:
     """Do what may wait for long in a thread that ends with the process."""
-    threading.Thread(target=work, args=given, name="network", daemon=True).start()
+    thread = threading.Thread(target=work, args=given, name="network", daemon=True)
+    thread.start()
+    return thread
 
 
-def keep_alive(connection: socket.socket) -> None:
+def _keep_alive(connection: socket.socket) -> None:
     """Find within half a minute that the other side is gone without a word."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):
@@ -416,11 +443,6 @@ class UdpSender:
     """Sender of estimates as datagrams of one line each, whether anybody receives them or not."""
 
     def __init__(self, text: str) -> None:
-        """Open a socket to send to ``udp://HOST:PORT``.
-
-        Raises:
-            ConfigError: It is no such address.
-        """
         family, self._place = receiver(text)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)

@@ -7,7 +7,6 @@ device ``command`` tells where the arm is sent.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import socket
 import struct
@@ -22,7 +21,7 @@ from ..fusion.config import FusionConfig
 from ..logs.frames import CARTESIAN
 from ..units import MM
 from .address import Address
-from .network import EventClient, keep_alive
+from .network import EventClient, Refused
 from .tool import ORIENTATION, takes_orientation
 from .wire import Event
 
@@ -38,10 +37,6 @@ _COMMAND = "command"  # the device
 _STATUS, _SEEN = "TransformStatus", "OK"  # a metadatum: whether the tracker sees the device
 
 
-class _Refused(Exception):  # noqa: N818 - what a server does, and never leaves this module
-    """The server sends what is no OpenIGTLink; the text says what."""
-
-
 class _Message(NamedTuple):
     """A message whose header has been read."""
 
@@ -53,39 +48,21 @@ class _Message(NamedTuple):
 
 
 class OpenIgtLinkSource(EventClient):
-    """Events of a server of poses."""
+    """Events of a server of poses: x, y, z as far as these are axes, and an orientation of a tool that turns."""
+
+    REFUSED = "no OpenIGTLink: "
 
     def __init__(self, address: Address, config: FusionConfig, notify: Callable[[str], None]) -> None:
-        """Prepare; :meth:`start` connects.
-
-        Args:
-            address: Of the server, and whether rows are stamped when they are received.
-            config: Says what rows may give: x, y, z as far as these are axes, and an orientation of a tool that turns.
-            notify: Takes a sentence for the log.
-        """
         super().__init__(address, notify)
         in_space = config.frame is not None or any(sensor.is_placed for sensor in config.sensors.values())
         self._axes = [in_space or axis in config.arm.axes for axis in CARTESIAN]
         self._turns, self._on_receipt = takes_orientation(config), address.on_receipt
 
-    def _read(self, connection: socket.socket) -> bool:
-        some = False
-        with connection, contextlib.suppress(OSError):
-            keep_alive(connection)
-            try:
-                for message in _messages(connection.makefile("rb")):
-                    self._put(list(self._events(message)))
-                    some = True
-            except (_Refused, struct.error) as error:
-                self._say("refused", f"no OpenIGTLink: {error}")
-        return some
+    def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
+        for message in _messages(connection.makefile("rb")):
+            yield list(self._events(message))
 
     def _events(self, message: _Message) -> Iterator[Event]:
-        """The event of each device of a message.
-
-        Raises:
-            struct.error: Its body is too short.
-        """
         stamp = time.time_ns() if self._on_receipt or not message.stamp else message.stamp
         for device, pose in _poses(message):
             values = self._values(pose if message.seen else [math.nan] * len(pose))
@@ -114,22 +91,18 @@ def _quaternion(pose: list[float]) -> tuple[float, ...] | None:
 
 
 def _messages(stream: BinaryIO) -> Iterator[_Message]:
-    """The messages of poses, until the connection ends; others, as images, are passed over.
-
-    Raises:
-        _Refused: It is no OpenIGTLink.
-    """
+    """The messages of poses, until the connection ends; others, as images, are passed over."""
     with stream:
         while len(head := stream.read(_HEAD.size)) == _HEAD.size:
             version, kind, device, seconds, fraction, size, _ = _HEAD.unpack(head)
             if version not in (1, 2, 3):
-                raise _Refused(f"a header of version {version}")
+                raise Refused(f"a header of version {version}")
             name = _text(kind)
             if name not in _POSES and name not in _LISTS:
                 _pass_over(stream, size)
                 continue
             if size > _LARGEST:
-                raise _Refused(f"a {name} of {size} bytes")
+                raise Refused(f"a {name} of {size} bytes")
             body = stream.read(size)
             if len(body) < size:
                 return
@@ -145,11 +118,7 @@ def _pass_over(stream: BinaryIO, size: int) -> None:
 
 
 def _without_metadata(body: bytes) -> tuple[bytes, bool]:
-    """The content of a body of version 2 or later, and whether its metadata say that the device is seen.
-
-    Raises:
-        struct.error: It is too short.
-    """
+    """The content of a body of version 2 or later, and whether its metadata say that the device is seen."""
     before, index, texts = _EXTENDED.unpack_from(body)
     end = len(body) - index - texts
     seen, at = True, end + index
@@ -162,11 +131,7 @@ def _without_metadata(body: bytes) -> tuple[bytes, bool]:
 
 
 def _poses(message: _Message) -> Iterator[tuple[str, list[float]]]:
-    """Each device of a message and the numbers of its pose.
-
-    Raises:
-        struct.error: The content has not that many bytes.
-    """
+    """Each device of a message and the numbers of its pose."""
     if (layout := _LISTS.get(message.kind)) is not None:
         one = _NAME.size + layout.size
         for at in range(0, len(message.content), one):

@@ -12,7 +12,6 @@ class RateLimitedLog:
     """Passes on the first message of a kind, the tenth, the hundredth and so on."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
-        """Start counting; ``notify`` takes the lines that are passed on."""
         self._notify = notify
         self._counts: dict[str, int] = {}
 

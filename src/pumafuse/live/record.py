@@ -54,28 +54,12 @@ class Recorder:
 
     A clock of the controller that was reset begins another run, beside the first: ``DIR.2``, ``DIR.3``, and so on, up
     to a hundred; a controller that is reset for ever fills no disk with folders.
-
-    Attributes:
-        late: Rows that were left out, as they stood more than 1 s behind an earlier one of their source, which a
-            recorded run's clock may not.
-        lost: Rows that were not recorded as the disk refused for too long.
     """
 
     def __init__(
         self, folder: Path, config: FusionConfig, start: Mapping[str, float], notify: Callable[[str], None]
     ) -> None:
-        """Make the folder and wait for rows.
-
-        Args:
-            folder: New, or empty.
-            config: Gives the sensors, the axes, and the frame.
-            start: Level [m or rad] of axes that do not rest at their first command before it.
-            notify: Takes a sentence for the log.
-
-        Raises:
-            FolderError: The folder holds something, or cannot be made.
-            RunError: A sensor or axis has a name that a recorded run cannot have.
-        """
+        """Make the folder, which is new or empty, and wait for rows."""
         turns = takes_orientation(config)
         axes = [axis for axis in config.arm.axes if not (turns and axis in TURNING)]
         for sensor in config.sensors:
@@ -89,7 +73,8 @@ class Recorder:
         self._columns = {axis: f"{axis}_{SI[kind].unit}" for axis, kind in kinds.items()}
         self._frame, self._start, self._notify = config.frame, dict(start), notify
         self._first = self._folder = folder = folder.absolute()
-        self.late = self.lost = self._given = 0
+        self.late = 0  # rows left out, more than 1 s behind an earlier one of their source: no recorded run's may be
+        self.lost = self._given = 0  # rows that the disk refused for too long, and that the writer has got
         self._log = RateLimitedLog(notify)
         self._segment = self._folders = 1
         check_writable(folder, force=False, markers=(), ours=lambda _: False)
@@ -98,7 +83,7 @@ class Recorder:
         header = ",".join((_TIME, *self._columns.values(), *self._turning, NOISE)).encode() + b"\n"
         beside = {} if self._robot is None else {ROBOT_FILE: text_of(Path(self._robot.urdf))}
         self._writer = Writer(header, beside)
-        self._due, self._reported, self._troubled = 0.0, -math.inf, False
+        self._due, self._reported = 0.0, -math.inf
         self._clear()
 
     def begin_segment(self) -> None:
@@ -116,13 +101,7 @@ class Recorder:
         self._clear()
 
     def append(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> None:
-        """Add an event.
-
-        Args:
-            stamp: Int ns.
-            sensor: None for a command.
-            values: By axis [m or rad], an orientation, and by what the noise is scaled.
-        """
+        """Add an event."""
         cells = {axis: _cell(values[axis]) for axis in self._columns if axis in values}
         turned = [repr(number(one)) for one in values[ORIENTATION]] if ORIENTATION in values else []
         noise = _cell(values.get(NOISE))
@@ -143,11 +122,7 @@ class Recorder:
         self._pending = [row for row in self._pending if row.stamp <= after]
 
     def tick(self, sure: int | None) -> None:
-        """Hand over twice a second what is to be written, and report whether it can be.
-
-        Args:
-            sure: The newest stamp [ns] that nothing will take back; None before any.
-        """
+        """Hand over twice a second what is to be written, and report whether it can be."""
         if (now := time.monotonic()) < self._due:
             return
         self._due = now + _FLUSHED
@@ -173,10 +148,10 @@ class Recorder:
         trouble = self._writer.trouble
         if trouble and now - self._reported >= _REPORTED_AGAIN:
             self._notify(f"record: cannot be written: {trouble}; {self._state()}; estimates go on")
-            self._reported, self._troubled = now, True
-        elif not trouble and self._troubled:
+            self._reported = now
+        elif not trouble and self._reported > -math.inf:
             self._notify(f"record: is written again; {self._state()}")
-            self._reported, self._troubled = -math.inf, False
+            self._reported = -math.inf
 
     def _state(self) -> str:
         written = self._writer.rows
@@ -195,7 +170,6 @@ class Recorder:
                 return folder
 
     def _clear(self) -> None:
-        """Begin a run without rows."""
         self._pending: list[_Row] = []
         self._newest: dict[str | None, int] = {}  # stamp of each source
         self._seen: dict[str | None, set[str]] = {}  # axes of each source
@@ -265,37 +239,20 @@ class Recorder:
 
 
 class Job(NamedTuple):
-    """Rows to be written.
+    """Rows to be written."""
 
-    Attributes:
-        folder: Where; made if it is not there.
-        rows: Whole lines for the end of each file, by its name; what is written is removed.
-        manifest: The text of ``run.toml``, written if it has changed.
-        number: How many rows these are.
-    """
-
-    folder: Path
-    rows: dict[str, bytes]
-    manifest: str
-    number: int
+    folder: Path  # where; made if it is not there
+    rows: dict[str, bytes]  # whole lines for the end of each file, by its name; what is written is removed
+    manifest: str  # the text of ``run.toml``, written if it has changed
+    number: int  # how many rows these are
 
 
 class Writer:
-    """Thread that writes a record, and waits for the disk.
-
-    Attributes:
-        trouble: Why the disk refuses, or that the folder had gone; empty while all is well.
-        rows: How many are written.
-    """
+    """Thread that writes a record, and waits for the disk."""
 
     def __init__(self, header: bytes, beside: Mapping[str, str]) -> None:
-        """Start to wait for jobs.
-
-        Args:
-            header: The first line of every file.
-            beside: Texts of files beside ``run.toml``, by their names.
-        """
-        self.trouble, self.rows = "", 0
+        """Start to wait for jobs; ``header`` begins every file, ``beside`` are texts of files beside ``run.toml``."""
+        self.trouble, self.rows = "", 0  # why the disk refuses, or that the folder had gone; how many are written
         self._header, self._beside = header, beside
         self._begin(Path())
         self._jobs = queue.SimpleQueue[Job | None]()
@@ -329,7 +286,6 @@ class Writer:
             self.rows += job.number
 
     def _begin(self, folder: Path) -> None:
-        """Begin a run in a folder."""
         self._folder, self._manifest = folder, ""
         self._sizes: dict[str, int] = {}  # of each file, as far as its rows are complete
 

@@ -1,24 +1,37 @@
-"""A node of ROS 2 as a source of events: the topics that a ``run.toml`` names.
+"""A node of ROS 2: a source of events from the topics that a ``run.toml`` names, and estimates as topics.
 
 Types of messages are those that publishers have, so a topic is subscribed to once somebody publishes it. Subscriptions
 take what reliable publishers send and what sensors do (best effort). What comes in a burst waits in a :mod:`.backlog`,
-in the order of its receipt.
+in the order of its receipt. Estimates go out as ``~/pose``, ``~/joints`` and ``~/diagnostics``.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 from ..errors import ConfigError, reason, suggestion
+from ..filter.outcome import Outcome
+from ..fusion.pose import covariance_in_log, turning_covariance
 from ..logs.bags import DAMAGE
+from ..logs.frames import CARTESIAN
 from ..logs.manifest import Manifest
+from ..model.arm import CANONICAL_AXES
+from ..space.rotations import TURNING
+from ..units import MS
 from .backlog import MOST, Backlog
-from .messages import Reader
+from .estimator import LiveEstimator
+from .health import Health, SensorHealth
+from .messages import Reader, readers_of
+from .network import EVENT_BYTES
 from .rate_limit import RateLimitedLog
+from .results import LiveEstimate, UpdateResult
 from .sources import QUIET
 from .wire import Event
 
@@ -29,64 +42,38 @@ _DEPTH = 1000  # messages of a topic that the middleware keeps
 _MOST_AT_ONCE = 64  # events taken in before the node looks for messages again
 _LOOK = 0.5  # s between two looks at who publishes
 _ALONE = 5.0  # s without a publisher until that is said
-_BYTES = 500  # about, of an event
+_EVERY = 1.0  # s between two diagnostics
+_UNKNOWN = 1e6  # rad², of an orientation that nobody tells
+_KEPT = 10  # estimates for a slow receiver
 
 
+@dataclass
 class Topic:
-    """A topic that is listened to.
+    """A topic that is listened to."""
 
-    Attributes:
-        name: As ``run.toml`` has it.
-        readers: Of the sources that are in its messages.
-        subscription: None until somebody publishes it.
-        kind: The type of messages that is subscribed to.
-        publishers: How many there were at the last look; None before anybody was.
-        lost: How many messages the middleware has lost.
-    """
-
-    def __init__(self, name: str, readers: Sequence[Reader]) -> None:
-        self.name, self.readers = name, readers
-        self.subscription: Any = None
-        self.kind = ""
-        self.publishers: int | None = None
-        self.lost = 0
+    name: str  # as run.toml has it
+    readers: Sequence[Reader]  # of the sources that are in its messages
+    subscription: Any = None  # once somebody publishes it
+    kind: str = ""  # of messages that is subscribed to
+    publishers: int | None = None  # at the last look; None before anybody was
+    lost: int = 0  # messages, by the middleware
 
 
 class Ros2Source:
-    """Events from the topics of a running robot.
-
-    Attributes:
-        node: The node.
-        frame: In which the commands are, by their messages; empty where these do not say.
-        simulated: Whether time is that of a simulation.
-    """
+    """Events from the topics of a running robot, whose commands, and time, may be those of a frame and a simulation."""
 
     def __init__(self, listed: Manifest, arguments: Sequence[str], notify: Callable[[str], None]) -> None:
-        """Make the node; :meth:`start` begins to listen, :meth:`close` ends it.
-
-        Args:
-            listed: What ``run.toml`` says.
-            arguments: ``--ros-args`` and what is behind it.
-            notify: Takes a sentence for the log.
-
-        Raises:
-            ConfigError: There is no ROS 2, it refuses the arguments, or a source of ``run.toml`` has no topic, or none
-                that a node could read.
-        """
-        entries, commanded = (
-            {**listed.sensors, "": listed.command},
-            dict[str, float](),
-        )  # commands of an instant last
-        for name, entry in entries.items():
+        """Make the node, with ``--ros-args`` and what is behind it; :meth:`close` ends it."""
+        for name, entry in {**listed.sensors, "": listed.command}.items():
             if not entry.topic:
                 who = f"sensor '{name}' has" if name else "the commands have"
                 raise ConfigError(f"run.toml: {who} no topic; give the running robot's, as in topic = '/joint_states'")
-        readers = [Reader(name, entry, commanded) for name, entry in entries.items()]
+        readers = readers_of(listed)
         names = dict.fromkeys(one.entry.topic for one in readers)
         self._topics = [Topic(name, [one for one in readers if one.entry.topic == name]) for name in names]
         self._command = readers[-1]
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._backlog = Backlog[Event]("messages", self._log, lambda event: not event.sensor, lambda _: _BYTES)
+        self._backlog = Backlog[Event]("messages", self._log, lambda event: not event.sensor, lambda _: EVENT_BYTES)
         self._burst = list[tuple[int, Event]]()  # by when each was received [ns]
         self._rclpy, no_signals = load("rclpy"), load("rclpy.signals").SignalHandlerOptions.NO  # pumafuse has its own
         try:
@@ -140,8 +127,7 @@ class Ros2Source:
         """How many events came, and how many messages were lost."""
         waited = self._backlog
         lost = sum(topic.lost for topic in self._topics) + waited.dropped
-        text = f"{waited.name}: {waited.received} events, {lost} lost"
-        return f"{text}, {waited.shed} shed" if waited.shed else text
+        return f"{waited.name}: {waited.received} events, {lost} lost{waited.shed_words}"
 
     def clock(self) -> int:
         """The time of the node's clock [ns]."""
@@ -166,7 +152,6 @@ class Ros2Source:
         self._burst.clear()
 
     def _take(self, topic: Topic, message: Any, info: Mapping[str, Any]) -> None:
-        """Take in a message."""
         received = self.clock() if self.simulated else info["received_timestamp"]
         for reader in topic.readers:
             try:
@@ -177,7 +162,6 @@ class Ros2Source:
             self.frame = getattr(getattr(message, "header", None), "frame_id", "")
 
     def _resolved(self, topic: Topic) -> str:
-        """The name of a topic after remapping."""
         return self.node.resolve_topic_name(topic.name)
 
     def _look(self, now: float) -> None:
@@ -233,17 +217,130 @@ class Ros2Source:
             return
 
     def _lost(self, topic: Topic, status: Any) -> None:
-        """Count what the middleware has lost."""
         topic.lost += status.total_count_change
         self._log.write(f"{topic.name} lost", f"{topic.name}: {topic.lost} messages lost on the way")
 
 
-def load(module: str) -> Any:
-    """A module of ROS 2.
+class Ros2Estimates:
+    """A watcher of a stream that publishes its estimates."""
 
-    Raises:
-        ConfigError: It is not here.
-    """
+    def __init__(self, source: Ros2Source, live: LiveEstimator) -> None:
+        self._source, self._live, node = source, live, source.node
+        poses, joints = load("geometry_msgs.msg"), load("sensor_msgs.msg")
+        self._diagnostic, axes = load("diagnostic_msgs.msg"), live.axes
+        in_space = CARTESIAN if live.config.frame is None else CANONICAL_AXES
+        self._joints = [axis for axis in axes if axis not in (*in_space, *TURNING)]
+        self._pose: Any = None
+        self._state: Any = None
+        if set(in_space) <= set(axes):
+            self._pose = poses.PoseWithCovarianceStamped()
+            self._publish_pose = node.create_publisher(type(self._pose), "~/pose", _KEPT).publish
+        if self._joints:
+            self._state = joints.JointState()
+            self._publish_joints = node.create_publisher(type(self._state), "~/joints", _KEPT).publish
+        array = self._diagnostic.DiagnosticArray
+        self._publish_diagnostics = node.create_publisher(array, "~/diagnostics", _KEPT).publish
+        self._told = 0.0
+
+    def event(self, event: Event, result: UpdateResult) -> None:
+        """Nothing is published of what came."""
+
+    def estimate(self, estimate: LiveEstimate) -> None:
+        """Publish an estimate."""
+        if self._pose is not None and self._set_pose(estimate):
+            self._set_header(self._pose.header, estimate.stamp)
+            self._publish_pose(self._pose)
+        if self._state is not None:
+            there = [name for name in self._joints if name in estimate.axes]
+            self._state.name = there
+            self._state.position = [estimate.axes[name].position for name in there]
+            self._state.velocity = [estimate.axes[name].velocity for name in there]
+            self._set_header(self._state.header, estimate.stamp)
+            self._publish_joints(self._state)
+
+    def tick(self, health: Callable[[], Health]) -> None:
+        """Publish diagnostics once a second."""
+        now = time.monotonic()
+        if now - self._told >= _EVERY:
+            self._told = now
+            array = self._diagnostic.DiagnosticArray(status=list(self._statuses(health())))
+            self._set_header(array.header, self._source.clock())
+            self._publish_diagnostics(array)
+
+    def _set_header(self, header: Any, stamp: int) -> None:
+        """Set the stamp [ns], and the frame: that of the parameter, or of the commands."""
+        header.stamp.sec, header.stamp.nanosec = divmod(stamp, 10**9)
+        header.frame_id = self._source.node.get_parameter(FRAME_ID).value or self._source.frame
+
+    def _set_pose(self, estimate: LiveEstimate) -> bool:
+        """Set the pose and its covariance; whether the estimate has one."""
+        position = {name: axis.position for name, axis in estimate.axes.items()}
+        there = position if estimate.cartesian is None else estimate.cartesian
+        if not set(CARTESIAN) <= there.keys():
+            return False
+        pose = self._pose.pose.pose
+        pose.position.x, pose.position.y, pose.position.z = (there[axis] for axis in CARTESIAN)
+        rows = {name: np.array([value]) for name, value in position.items()}
+        sd = {name: np.array([axis.position_sd]) for name, axis in estimate.axes.items()}
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = covariance_in_log(self._live.placed, rows, sd)[0]
+        if estimate.orientation is not None:
+            turned = pose.orientation
+            turned.x, turned.y, turned.z, turned.w = estimate.orientation
+            covariance[3:, 3:] = turning_covariance(rows, sd)[0]
+        else:
+            covariance[3:, 3:] = _UNKNOWN * np.eye(3)
+        self._pose.pose.covariance = covariance.ravel()
+        return True
+
+    def _statuses(self, health: Health) -> list[Any]:
+        """The status of the estimates, and of each sensor."""
+        kind, estimate = self._diagnostic.DiagnosticStatus, self._live.estimate()
+        stale, doubtful = ", ".join(estimate.stale), ", ".join(estimate.doubtful)
+        fused = estimate.outcome is Outcome.FUSED
+        level = kind.WARN if doubtful or health.faults else kind.STALE if stale or not fused else kind.OK
+        words = [] if fused else [estimate.reason]
+        words += [f"doubtful: {doubtful}"] if doubtful else []
+        words += [f"stale: {stale}"] if stale else []
+        whole = self._status(
+            "estimates",
+            level,
+            "; ".join([*words, *health.faults]) or "as expected",
+            {
+                "stale": stale,
+                "doubtful": doubtful,
+                **{f"commands {word}": str(count) for word, count in health.commands.items() if count},
+                "segments": str(health.segments),
+            },
+        )
+        return [whole, *(self._of_sensor(name, one, health) for name, one in health.sensors.items())]
+
+    def _of_sensor(self, name: str, sensor: SensorHealth, health: Health) -> Any:
+        kind = self._diagnostic.DiagnosticStatus
+        faults = [fault for fault in health.faults if f"'{name}'" in fault]
+        level = kind.STALE if sensor.stale else kind.WARN if faults else kind.OK
+        silent = "no row yet" if sensor.silent is None else f"silent for {sensor.silent:.1f} s"
+        values = {
+            "rows": str(sensor.rows),
+            "rate [Hz]": f"{sensor.rate:.1f}",
+            "late [ms]": f"{sensor.lateness * MS:.1f}",
+            "dropouts": str(sensor.dropouts),
+            "NIS": "" if sensor.nis is None else f"{sensor.nis:.2f}",
+            **{word: str(count) for word, count in sensor.outcomes.items() if count or word == Outcome.REJECTED.word},
+        }
+        return self._status(name, level, "; ".join(faults) or (silent if sensor.stale else "fused"), values)
+
+    def _status(self, name: str, level: bytes, message: str, values: dict[str, str]) -> Any:
+        pairs = [self._diagnostic.KeyValue(key=key, value=value) for key, value in values.items()]
+        arm = self._live.config.arm.name
+        named = f"{self._source.node.get_name()}: {name}"
+        return self._diagnostic.DiagnosticStatus(
+            level=level, name=named, message=message, hardware_id=arm, values=pairs
+        )
+
+
+def load(module: str) -> Any:
+    """A module of ROS 2."""
     try:
         return import_module(module)
     except ImportError as error:

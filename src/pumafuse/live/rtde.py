@@ -8,7 +8,6 @@ a vector is ``target_q_0``.
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import struct
 import time
@@ -20,8 +19,9 @@ from ..errors import ConfigError
 from ..logs.columns import LOG_TIME
 from ..logs.manifest import Manifest
 from .address import Address
-from .messages import Reader
-from .network import EventClient, keep_alive
+from .messages import readers_of
+from .network import EventClient, Refused
+from .wire import Event
 
 _HEAD = struct.Struct(">HB")  # bytes of a package, and its type
 _VERSION, _OUTPUTS, _BEGIN, _DATA, _TEXT = b"VOSUM"  # types of packages
@@ -41,10 +41,6 @@ _TYPES = {  # of variables, in big endian
 _PATIENCE = 5.0  # s without a package, of a robot that sends one every few ms
 
 
-class _Refused(Exception):  # noqa: N818 - what a robot does, and never leaves this module
-    """The robot does not do what it was asked; the text says what."""
-
-
 class _Recipe(NamedTuple):
     """How a data package is read: its columns after the first byte, which is the ``number`` of the recipe."""
 
@@ -53,11 +49,7 @@ class _Recipe(NamedTuple):
     columns: list[str]
 
     def row(self, body: bytes) -> SimpleNamespace:
-        """The columns of a package.
-
-        Raises:
-            struct.error: It is too short.
-        """
+        """The columns of a package."""
         return SimpleNamespace(**dict(zip(self.columns, self.layout.unpack_from(body, 1), strict=True)))
 
 
@@ -65,67 +57,41 @@ class RtdeSource(EventClient):
     """Events of a robot."""
 
     def __init__(self, address: Address, listed: Manifest, rate: float, notify: Callable[[str], None]) -> None:
-        """Prepare; :meth:`start` connects.
-
-        Args:
-            address: Of the controller.
-            listed: What ``run.toml`` says.
-            rate: How often the robot is to send [Hz]: it knows up to 125, of the e-Series up to 500.
-            notify: Takes a sentence for the log.
-
-        Raises:
-            ConfigError: A column has no unit, or there are no stamps that a stream could have.
-        """
+        """Prepare; the robot is to send at a ``rate`` [Hz]: it knows up to 125, of the e-Series up to 500."""
         super().__init__(address, notify)
-        commanded, entries = (
-            dict[str, float](),
-            {**listed.sensors, "": listed.command},
-        )  # commands of an instant last
-        self._readers = [Reader(name, entry, commanded) for name, entry in entries.items()]
+        self._readers = readers_of(listed)
         asked = [column for reader in self._readers for column in reader.entry.fields if column != LOG_TIME]
         self._variables = dict.fromkeys(map(_variable, asked))
         self._rate = rate
         if not self._variables:
             raise ConfigError(f"{self._name}: run.toml names no column of the robot, as in target_q_0")
 
-    def _read(self, connection: socket.socket) -> bool:
-        some = False
-        with connection, contextlib.suppress(OSError):
-            keep_alive(connection)
-            connection.settimeout(_PATIENCE)
-            packages = _packages(connection)
-            try:
-                recipe = self._agree(connection, packages)
-                for kind, body in packages:
-                    received = time.time_ns()
-                    if kind == _DATA and body[:1] == bytes([recipe.number]):
-                        row = recipe.row(body)
-                        self._put([event for one in self._readers for event in one.events(row, received)])
-                        some = True
-            except (_Refused, ConfigError, struct.error) as error:
-                self._say("refused", str(error))
-        return some
+    def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
+        connection.settimeout(_PATIENCE)
+        packages = _packages(connection)
+        recipe = self._agree(connection, packages)
+        for kind, body in packages:
+            received = time.time_ns()
+            if kind == _DATA and body[:1] == bytes([recipe.number]):
+                row = recipe.row(body)
+                yield [event for one in self._readers for event in one.events(row, received)]
 
     def _agree(self, connection: socket.socket, packages: Iterator[tuple[int, bytes]]) -> _Recipe:
-        """Agree on the protocol and on what is sent, and let the robot begin.
-
-        Raises:
-            _Refused: It does not.
-        """
+        """Agree on the protocol and on what is sent, and let the robot begin."""
 
         def ask(kind: int, body: bytes) -> bytes:
             connection.sendall(_HEAD.pack(_HEAD.size + len(body), kind) + body)
             for answer, found in packages:
                 if answer == kind:
                     return found
-            raise _Refused("the robot has ended the connection instead of an answer")
+            raise Refused("the robot has ended the connection instead of an answer")
 
         if ask(_VERSION, struct.pack(">H", _PROTOCOL)) != b"\x01":
-            raise _Refused(f"the robot does not know version {_PROTOCOL} of RTDE (software 3.3 or newer does)")
+            raise Refused(f"the robot does not know version {_PROTOCOL} of RTDE (software 3.3 or newer does)")
         found = ask(_OUTPUTS, struct.pack(">d", self._rate) + ",".join(self._variables).encode())
         known = dict(zip(self._variables, found[1:].decode("ascii", "replace").split(","), strict=False))
         if unknown := [name for name in self._variables if known.get(name) not in _TYPES]:
-            raise _Refused(f"the robot has no variable {', '.join(unknown)}; names are those of record.py")
+            raise Refused(f"the robot has no variable {', '.join(unknown)}; names are those of record.py")
         sizes = {name: int(_TYPES[kind][:-1] or 1) for name, kind in known.items()}
         columns = [
             column
@@ -135,9 +101,9 @@ class RtdeSource(EventClient):
         recipe = _Recipe(found[0], struct.Struct(">" + "".join(_TYPES[kind] for kind in known.values())), columns)
         empty = SimpleNamespace(**dict.fromkeys(columns, 0.0))
         if lacking := [path for one in self._readers for path in one.lacks(empty)]:
-            raise _Refused(f"the robot has no column {', '.join(lacking)}; it has {', '.join(columns)}")
+            raise Refused(f"the robot has no column {', '.join(lacking)}; it has {', '.join(columns)}")
         if ask(_BEGIN, b"") != b"\x01":
-            raise _Refused(f"the robot does not begin to send {self._rate:g} times a second")
+            raise Refused(f"the robot does not begin to send {self._rate:g} times a second")
         return recipe
 
 

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from ctypes import Array, c_double
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -30,17 +30,11 @@ class Screened(NamedTuple):
 
 
 class Steps:
-    """The latest value of an axis and its steps.
-
-    Attributes:
-        value: The latest one; NaN before any.
-        pace: Its step, 0 for none.
-        usual: The step than which few are larger, of which the largest is three times as large; 0: not known yet.
-    """
+    """The latest value of an axis and its steps."""
 
     def __init__(self) -> None:
-        """No value yet."""
-        self.value, self.pace, self.usual = float("nan"), 0.0, 0.0
+        self.value, self.pace = math.nan, 0.0  # the latest one, and its step, 0 for none
+        self.usual = 0.0  # the step than which few are larger; 0: not known yet
         self._recent, self._new = deque[float](maxlen=_REMEMBERED), 0
 
     def add(self, value: float, consecutive: bool = True) -> None:
@@ -66,7 +60,6 @@ class _Repeated:
     """One axis of a sensor: its latest value, since when it has come, how often, where the axis was led meanwhile."""
 
     def __init__(self) -> None:
-        """No value yet."""
         self.value, self.stamp, self.since, self.count, self.leapt = math.nan, ALWAYS, ALWAYS, 0, False
         self.low, self.high = 0.0, 0.0
         self.waiting, self.believed = list[tuple[int, float, float]](), False
@@ -101,19 +94,15 @@ class _Repeated:
         return 1.0 - len(self._lengths) / (sum(self._lengths) + 1)
 
 
+Kept: TypeAlias = tuple[int, float, float]  # of a value: stamp [ns], value [m], and by what its noise is scaled
+
+
 class Judged(NamedTuple):
-    """What a measured value is.
+    """What a measured value is."""
 
-    Attributes:
-        held: Whether it is not used, at least not now.
-        sure: Whether it never will be.
-        released: Of those before it that were not used, and are news after all: stamp [ns], value [m], and by what its
-            noise is scaled.
-    """
-
-    held: bool
-    sure: bool
-    released: Sequence[tuple[int, float, float]] = ()
+    held: bool  # whether it is not used, at least not now
+    sure: bool  # whether it never will be
+    released: Sequence[Kept] = ()  # of those before it that were not used, and are news after all
 
 
 NEWS = Judged(False, False)
@@ -138,16 +127,7 @@ class HoldWatch:
     def judge(
         self, key: tuple[int, int], stamp: int, value: float, spreads: Array[c_double], commands: Commands, lag: int
     ) -> Judged:
-        """Judge a value; where they come out of order nothing is held.
-
-        Args:
-            key: Which sensor, and which axis.
-            stamp: Int ns.
-            value: [m].
-            spreads: By what the noise of each axis is scaled.
-            commands: As far as they have come.
-            lag: How late the axis may follow them [ns].
-        """
+        """Judge a value of a sensor and an axis, late by up to a lag [ns]; out of order nothing is held."""
         if (one := self._seen.get(key)) is None:
             one = self._seen[key] = _Repeated()
         axis, waited = key[1], one.waiting
@@ -180,11 +160,7 @@ class HoldWatch:
 
 
 class CommandScreen:
-    """Lets commands through but those that leap away, which wait: if the next ones are back they are stray.
-
-    Attributes:
-        until: Who waits is believed when something is stamped later [ns].
-    """
+    """Lets commands through but those that leap away, which wait: if the next ones are back they are stray."""
 
     def __init__(self, period: float) -> None:
         """Screen commands that come every ``period`` [s]."""
@@ -194,16 +170,11 @@ class CommandScreen:
 
     def restart(self) -> None:
         """Begin anew by another clock; usual steps stay."""
-        self._last, self.until = ALWAYS, NEVER
+        self._last, self.until = ALWAYS, NEVER  # who waits is believed when something is stamped later [ns]
         self._waiting: list[tuple[int, dict[str, Any]]] = []
 
     def take(self, stamp: int, values: Mapping[str, Any]) -> list[Screened]:
-        """Take a command; those that are decided by now, without what is stray, and that.
-
-        Args:
-            stamp: Int ns.
-            values: By axis.
-        """
+        """Take a command; those that are decided by now, without what is stray, and that."""
         consecutive, self._last = 0 < stamp - self._last <= self._apart, stamp
         told = list[Screened]()
         if self._waiting and consecutive:

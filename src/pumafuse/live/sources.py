@@ -26,11 +26,7 @@ _BATCH = 1000  # events that a replay hands over at once when it need not wait
 
 
 def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
-    """Lines of standard input as they come; an empty list after a tenth of a second without any.
-
-    Raises:
-        RunError: It cannot be read.
-    """
+    """Lines of standard input as they come; an empty list after a tenth of a second without any."""
     lines = Lines()
     while True:
         try:
@@ -51,9 +47,6 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
 
     A row arrives when its stamp says, one that steps back with the row before it; measurements come before commands
     of the same instant. What the run has in joints comes so: the configuration has its robot.
-
-    Raises:
-        RunError: The clocks of the run cannot be followed.
     """
     if run.clock != "stamps" and run.has_orientation:
         raise RunError(f"run '{run.name}': with orientations its clock = '{run.clock}' cannot be replayed; fuse it")

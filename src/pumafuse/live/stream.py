@@ -29,14 +29,7 @@ class Watcher(Protocol):
 
 
 class Stream:
-    """A live estimator between lines that come in and lines that go out.
-
-    Attributes:
-        live: The estimator.
-        lines: How many lines have come.
-        bad: How many of them were no event.
-        estimates: How many have gone out.
-    """
+    """A live estimator between lines that come in and lines that go out."""
 
     def __init__(
         self,
@@ -46,18 +39,7 @@ class Stream:
         rate: float | None = None,
         watchers: Sequence[Watcher] = (),
     ) -> None:
-        """Wait for lines.
-
-        Args:
-            live: The estimator.
-            write: Takes lines of estimates with their ends, some at a time.
-            notify: Takes a sentence for the log.
-            rate: Estimates on an even grid [Hz] from the first command on; one for each command for None.
-            watchers: Receive all events and estimates.
-
-        Raises:
-            ConfigError: The rate is not positive, or too high.
-        """
+        """Wait for lines."""
         if rate is not None and not 0.0 < rate <= _FASTEST:
             raise ConfigError(f"rate: at most {_FASTEST:g} estimates a second, not {rate:g}")
         self.live, self.lines, self.bad, self.estimates = live, 0, 0, 0

@@ -49,11 +49,7 @@ def row_noise(values: Mapping[str, Any]) -> float:
 
 
 def check_tool(config: FusionConfig, start: Mapping[str, float]) -> None:
-    """Refuse a configuration by which a stream cannot tell how the tool is turned.
-
-    Raises:
-        ConfigError: It has a marker and no reference orientation; or the start has an orientation.
-    """
+    """Refuse a configuration by which a stream cannot tell how the tool is turned."""
     turns = set(TURNING) <= set(config.arm.axes)
     if turns and config.tool is None:
         for name, sensor in config.sensors.items():
@@ -77,41 +73,27 @@ def tool_of(config: FusionConfig, log: RateLimitedLog) -> Tool | None:
 
 
 class Told(NamedTuple):
-    """What a measurement tells of the tool.
+    """What a measurement tells of the tool."""
 
-    Attributes:
-        values: By axis.
-        spread: By what the noise of some is scaled.
-        seen: What the sensor saw, along the base's axes [m], (3,), if the commands say where the tool point is from it.
-    """
-
-    values: dict[str, Any]
-    spread: dict[str, float]
-    seen: FloatArray | None
+    values: dict[str, Any]  # by axis
+    spread: dict[str, float]  # by what the noise of some is scaled
+    seen: FloatArray | None  # along the base's axes [m], (3,), if the commands say where the tool point is from it
 
 
 @dataclass(slots=True)
 class Row:
-    """A measurement of a sensor that tells no orientation.
+    """A measurement of a sensor that tells no orientation."""
 
-    Attributes:
-        stamp: Int ns.
-        seen: What the sensor saw, along the base's axes [m], (3,).
-        numbers: Values and spreads as they are in the window, (2 A,).
-        noise: By what that of the row is scaled.
-    """
-
-    stamp: int
-    seen: FloatArray
-    numbers: list[float]
-    noise: float
+    stamp: int  # int ns
+    seen: FloatArray  # what the sensor saw, along the base's axes [m], (3,)
+    numbers: list[float]  # values and spreads as they are in the window, (2 A,)
+    noise: float  # by what that of the row is scaled
 
 
 class Tool:
     """What events tell of a tool that turns, as axes; bit for bit as :mod:`pumafuse.fusion.placing` has it."""
 
     def __init__(self, config: FusionConfig, log: RateLimitedLog) -> None:
-        """Nothing known yet; ``log`` gets the sentences."""
         self._log, arm = log, config.arm
         turns = set(TURNING) <= set(arm.axes)
         self._reference = np.array(config.tool.reference) if turns and config.tool is not None else None
@@ -125,11 +107,7 @@ class Tool:
         self._behind = round((max(map(arm.delay_of, arm.axes)) + max((*self._latency.values(), 0)) / 1e9) * 1e9)
 
     def parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """An event's values: a commanded orientation as axes, a measured one as a quaternion, (1, 4).
-
-        Raises:
-            ValueError: It cannot be used; says why.
-        """
+        """An event's values: a commanded orientation as axes, a measured one as a quaternion, (1, 4)."""
         if self._reference is not None and (twice := next((axis for axis in TURNING if axis in values), None)):
             raise ValueError(f"'{twice}': with [tool] an orientation comes as a quaternion x, y, z, w")
         if ORIENTATION not in values:
@@ -143,11 +121,7 @@ class Tool:
         return found if self._reference is None else found | self._commanded(told, self._reference)
 
     def _commanded(self, told: FloatArray, reference: FloatArray) -> dict[str, float]:
-        """A commanded orientation (1, 4) as axes.
-
-        Raises:
-            ValueError: It is too far from the reference orientation.
-        """
+        """A commanded orientation (1, 4) as axes."""
         vector: list[float] = rotations.vectors(told, reference)[0].tolist()
         turn = math.hypot(*vector)
         far = f"the tool is told to turn by {math.degrees(turn):.0f}° from its reference orientation"
@@ -158,13 +132,7 @@ class Tool:
         return dict(zip(TURNING, vector, strict=True))
 
     def of_tool(self, sensor: str, stamp: int, values: Mapping[str, Any]) -> Told:
-        """What a sensor tells of the tool.
-
-        Args:
-            sensor: Its name.
-            stamp: Int ns.
-            values: Of :meth:`parsed`.
-        """
+        """What a sensor tells of the tool."""
         found, spread = dict(values), dict[str, FloatArray]()
         oriented: FloatArray | None = found.pop(ORIENTATION, None)
         placing, seen = self._placings.get(sensor), None
@@ -233,7 +201,6 @@ class CommandedTurn:
     """How the commands turn the tool, without noise: by all that have come, in whatever order."""
 
     def __init__(self, arm: ArmModel) -> None:
-        """No command yet."""
         self._axes: list[Record] = turning_axes(arm)
         self._delay = [round(arm.delay_of(axis) * 1e9) for axis in TURNING]
         self._given: list[int] = []
@@ -242,13 +209,7 @@ class CommandedTurn:
         self._start = [math.nan] * len(TURNING)
 
     def add(self, stamp: int, vector: list[float], oldest: int) -> int | None:
-        """Add a command, in the place of one of the same stamp; from when on it turns the tool otherwise, if it does.
-
-        Args:
-            stamp: Int ns.
-            vector: rx, ry and rz [rad].
-            oldest: Nobody will ask for what was before [ns].
-        """
+        """Add rx, ry, rz [rad] in the place of what had the same stamp; from when on that turns the tool otherwise."""
         place = bisect_left(self._given, stamp)
         again = place < len(self._given) and self._given[place] == stamp
         if again and self._vector[place] == vector:
@@ -264,7 +225,6 @@ class CommandedTurn:
         return stamp + min(self._delay) if place else ALWAYS
 
     def _after(self, place: int, axis: int) -> Record:
-        """What an axis does after a command."""
         motion = self._motion[place - 1][axis].copy() if place else at_rest()
         given, relative = self._commands(slice(place, place + 1), axis)
         follow(self._axes[axis], motion, given, relative, np.empty(0, np.int64))
@@ -299,11 +259,7 @@ class CommandedTurn:
 
 
 def unit(orientation: Any) -> FloatArray:
-    """A quaternion x, y, z, w of norm 1, (1, 4).
-
-    Raises:
-        ValueError: It is none.
-    """
+    """A quaternion x, y, z, w of norm 1, (1, 4)."""
     listed = isinstance(orientation, list | tuple) or (isinstance(orientation, np.ndarray) and orientation.ndim == 1)
     given = cast(Sequence[Any], orientation) if listed else ()
     parts = [number(one) for one in given] if len(given) == 4 else [math.nan] * 4

@@ -33,7 +33,6 @@ class Lines:
     """
 
     def __init__(self) -> None:
-        """Start at the beginning of a line."""
         self._torn, self._too_long = b"", False
 
     def cut(self, piece: bytes) -> list[bytes]:
@@ -64,15 +63,12 @@ class BadLine(Exception):  # noqa: N818 - it is what the line is called, and nev
 class Event(NamedTuple):
     """A command (no sensor) or a measurement.
 
-    Attributes:
-        t: Float seconds or int nanoseconds.
-        sensor: Its name, empty for a command.
-        values: By axis or joint [m or rad], an orientation as a quaternion x, y, z, w, and of a measurement perhaps by
-            what its noise is scaled; values under unknown names are passed on as they are.
+    Its values are by axis or joint [m or rad], an orientation as a quaternion x, y, z, w, and perhaps by what the noise
+    of a measurement is scaled; those under unknown names are passed on as they are.
     """
 
-    t: float | int
-    sensor: str
+    t: float | int  # float seconds or int nanoseconds
+    sensor: str  # its name, empty for a command
     values: Mapping[str, Any]
 
 
@@ -82,11 +78,7 @@ class LineDecoder:
     def __init__(
         self, kinds: Mapping[str, Kind], framed: bool, joints: Mapping[str, Kind] = MappingProxyType({})
     ) -> None:
-        """Prepare for axes and joints, of which each is a length or an angle, and for x, y, z where there is a frame.
-
-        Raises:
-            ConfigError: An axis or joint has the name of another part of a line.
-        """
+        """Prepare for axes and joints, and with a frame for x, y, z; none may be called as a part of a line."""
         every: dict[str, Kind] = {**dict.fromkeys(CARTESIAN if framed else (), "length"), **kinds, **joints}
         self._axes = tuple(dict.fromkeys((*kinds, *every)))
         self._scales = [SCREEN[every[axis]].scale for axis in self._axes]
@@ -114,11 +106,7 @@ class LineDecoder:
         self._decoder = msgspec.json.Decoder(msgspec.defstruct("Line", [*head, *fields], **options))
 
     def decode(self, line: bytes) -> Event:
-        """The event of a line.
-
-        Raises:
-            BadLine: It is none.
-        """
+        """The event of a line."""
         if len(line) > _LONGEST:
             raise BadLine("longer than 64 KiB")
         try:
@@ -168,13 +156,7 @@ class LineDecoder:
 
 
 def encode(estimate: LiveEstimate, kinds: Mapping[str, Kind], with_ns: bool) -> bytes:
-    """The line of an estimate: position, sd, velocity of each axis, x, y, z with a frame, q, stale and doubtful axes.
-
-    Args:
-        estimate: The estimate.
-        kinds: Whether each axis is a length or an angle.
-        with_ns: Give the time as ``t_ns``, too.
-    """
+    """The line of an estimate; with its time as ``t_ns``, too."""
     line: dict[str, Any] = {"t": estimate.time}
     if with_ns:
         line["t_ns"] = estimate.stamp
