@@ -7,7 +7,6 @@ with all factors at once, which an unbalanced design needs.
 
 from __future__ import annotations
 
-import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -18,6 +17,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray
 from ..model.arm import Validity
 from ..units import MM, SCREEN, Kind, of_kind
+from .estimate import weighted
 from .trials import Trial
 
 _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
@@ -159,10 +159,10 @@ def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Se
 
 def welch(groups: Sequence[FloatArray]) -> float | None:
     """P of the hypothesis that groups have one mean, whatever their variances; None where it cannot be tested."""
-    from statsmodels.stats.oneway import anova_oneway
+    from scipy.stats import f_oneway
 
     usable = [group for group in groups if len(group) > 1 and np.ptp(group) > 0.0]
-    return float(anova_oneway(usable, use_var="unequal").pvalue) if len(usable) > 1 else None
+    return float(f_oneway(*usable, equal_var=False).pvalue) if len(usable) > 1 else None
 
 
 def scatter(coefficient: str, trials: Sequence[Trial], values: FloatArray, sd: FloatArray) -> Scatter:
@@ -291,22 +291,17 @@ def _dependence(coefficient: str, values: FloatArray, factor: str, factors: Mapp
 
 def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
     """P of one factor in a model with all of them (main effects)."""
-    from statsmodels.regression.linear_model import OLS
-
-    rest = _design(len(values), [cells for name, cells in factors.items() if name != factor])
-    whole = np.column_stack((rest, _design(len(values), [factors[factor]])[:, 1:]))
-    with warnings.catch_warnings():  # of dependent columns: the rank shows confounded factors
-        warnings.simplefilter("ignore")
-        full, reduced = OLS(values, whole).fit(), OLS(values, rest).fit()
-    if full.df_resid < 1 or full.df_resid == reduced.df_resid or full.ssr <= 1e-24 * float(values @ values):
+    without = {name: cells for name, cells in factors.items() if name != factor}
+    full, reduced = (weighted(values, np.ones(len(values)), _design(values, one)) for one in (factors, without))
+    if full.freedom < 1 or full.freedom == reduced.freedom or full.squares <= 1e-24 * float(values @ values):
         return None
-    return float(full.compare_f_test(reduced)[1])
+    return full.p_against(reduced)
 
 
-def _design(rows: int, factors: Sequence[Sequence[str]]) -> FloatArray:
-    """A one, and for each factor a column for each level but its first, (rows, k)."""
-    columns = [np.ones(rows)]
-    for cells in factors:
+def _design(values: FloatArray, factors: Mapping[str, Sequence[str]]) -> FloatArray:
+    """A one, and for each factor a column for each level but its first, (n, k)."""
+    columns = [np.ones(len(values))]
+    for cells in factors.values():
         columns.extend(np.array(cells) == level for level in ordered(set(cells))[1:])
     return np.column_stack(columns).astype(np.float64)
 

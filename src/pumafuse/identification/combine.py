@@ -18,7 +18,7 @@ from ..model.plants import PLANTS, FirstOrder
 from ..units import MS, SCREEN, Kind
 from .anova import ordered, outlying, speed_levels
 from .batch import Order
-from .estimate import Estimate, common, mean, regression, robust
+from .estimate import Estimate, common, mean, regression, robust, weighted
 from .fit import StepFit, doubt, least_p, plant_of
 from .joint import JointFit, fit_together, inverse_square
 from .paper import minimise
@@ -343,8 +343,6 @@ def _choose(
 
 def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | None, str]:
     """K = a·speed + b with intervals, the p of its lack of fit, and what the line shows."""
-    from statsmodels.regression.linear_model import WLS
-
     speed, levels = np.array([one.speed_at(period) for one in found.trials]), speed_levels(found.trials, period, kind)
     distinct = ordered(set(levels))
     if len(distinct) == 1 or len(speed) < 4:
@@ -354,8 +352,8 @@ def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | 
         )
         return Gain(slope=0.0, intercept=level.value, intercept_ci95=level.ci95), None, f"slope 0: {why}"
     line = regression(found.gain, found.gain_sd, np.column_stack((np.ones(len(speed)), speed)))
-    (b_low, b_high), (a_low, a_high) = line.conf_int().tolist()
-    b, a = line.params.tolist()
+    (b_low, b_high), (a_low, a_high) = line.ci95.tolist()
+    b, a = line.values.tolist()
     gain = Gain(slope=a, intercept=b, slope_ci95=(a_low, a_high), intercept_ci95=(b_low, b_high))
     words = "the slope is not significant"
     if a_low > 0.0 or a_high < 0.0:
@@ -363,6 +361,6 @@ def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | 
     if not 2 < len(distinct) < len(speed):
         return gain, None, words
     at_levels = np.array(levels)[:, None] == np.array(distinct)
-    apart = WLS(found.gain, at_levels.astype(np.float64), weights=line.model.weights).fit()
-    lack = float(apart.compare_f_test(line)[1])  # p of the hypothesis that the means of all levels lie on the line
+    apart = weighted(found.gain, line.weights, at_levels.astype(np.float64))
+    lack = apart.p_against(line)  # of the hypothesis that the means of all levels lie on the line
     return gain, lack, words + ("; not along a straight line" if lack < 0.05 else "")
