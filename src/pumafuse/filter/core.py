@@ -57,17 +57,11 @@ class Output(IntEnum):
 
 
 class Model(NamedTuple):
-    """What the filter knows of A axes and S sensors: records of ``pf_axis``, ``pf_sensor`` and ``pf_view``.
+    """What the filter knows of A axes and S sensors: records of ``pf_axis``, ``pf_sensor`` and ``pf_view``."""
 
-    Attributes:
-        axis: (A,).
-        sensor: (S,).
-        view: What each sensor sees of each axis, (S, A).
-    """
-
-    axis: Record
-    sensor: Record
-    view: Record
+    axis: Record  # (A,)
+    sensor: Record  # (S,)
+    view: Record  # what each sensor sees of each axis, (S, A)
 
 
 def struct(counts: Sequence[str], arrays: Sequence[str]) -> type[ctypes.Structure]:

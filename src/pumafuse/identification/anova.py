@@ -40,23 +40,16 @@ class Dependence(msgspec.Struct, frozen=True, kw_only=True):
     """Whether one coefficient depends on one factor.
 
     Attributes:
-        coefficient: With its unit.
-        factor: What was varied.
-        levels: The coefficient at each level.
         i_ratio: F over the 95 % point of its distribution; above 1 is dependent. Null where it cannot be computed.
-        p: Of that F.
-        welch_p: Of Welch's test, which does not assume equal variances.
-        adjusted_p: Of the factor beside all the others; null where they are confounded.
-        verdict: In words.
     """
 
-    coefficient: str
-    factor: str
-    levels: list[Level]
+    coefficient: str  # with its unit
+    factor: str  # what was varied
+    levels: list[Level]  # the coefficient at each level
     i_ratio: float | None
-    p: float | None
-    welch_p: float | None
-    adjusted_p: float | None
+    p: float | None  # of that F
+    welch_p: float | None  # of Welch's test, which does not assume equal variances
+    adjusted_p: float | None  # of the factor beside all the others; null where they are confounded
     verdict: str
 
 
@@ -64,37 +57,24 @@ class Scatter(msgspec.Struct, frozen=True, kw_only=True):
     """Scatter of one coefficient on one axis, in its unit.
 
     Attributes:
-        coefficient: With its unit.
-        axis: Of the trials.
-        median: Over the trials.
         normal_p: Of a Shapiro-Wilk test; small: not normally distributed, so do not trust means and i-ratios alone.
-        outlying: Trials further from the median than eight robust standard deviations.
-        replicate_sd: Between trials of the same settings; null where none were repeated.
-        own_sd: By the noise within a trial (median over the trials).
     """
 
-    coefficient: str
-    axis: str
-    median: float
+    coefficient: str  # with its unit
+    axis: str  # of the trials
+    median: float  # over the trials
     normal_p: float | None
-    outlying: list[str]
-    replicate_sd: float | None
-    own_sd: float
+    outlying: list[str]  # trials further from the median than eight robust standard deviations
+    replicate_sd: float | None  # between trials of the same settings; null where none were repeated
+    own_sd: float  # by the noise within a trial (median over the trials)
 
 
 class Performance(msgspec.Struct, frozen=True, kw_only=True):
-    """Error of the combined model by one factor.
+    """Error of the combined model by one factor."""
 
-    Attributes:
-        factor: What was varied.
-        levels: RMS [mm or degrees] of the trials at each level.
-        limit: Where the mean RMS passes the tolerance, in the factor's unit; null where it does not.
-        verdict: In words.
-    """
-
-    factor: str
-    levels: list[Level]
-    limit: float | None
+    factor: str  # what was varied
+    levels: list[Level]  # RMS [mm or degrees] of the trials at each level
+    limit: float | None  # where the mean RMS passes the tolerance, in the factor's unit; null where it does not
     verdict: str
 
 

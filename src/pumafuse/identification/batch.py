@@ -43,38 +43,23 @@ class Point(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """Normal equations in q (and p) of each row with its delay eliminated.
+    """Normal equations in q (and p) of each row with its delay eliminated."""
 
-    Attributes:
-        shift: Gauss-Newton step of the delay when q and p stay [s], (R,).
-        coupling: −∂delay/∂(q, p), (R, k).
-        information: (R, k, k).
-        score: (R, k).
-        delay_sd: Of each delay under a given plant for unit noise, infinite where it has no effect, (R,).
-    """
-
-    shift: FloatArray
-    coupling: FloatArray
-    information: FloatArray
-    score: FloatArray
-    delay_sd: FloatArray
+    shift: FloatArray  # Gauss-Newton step of the delay when q and p stay [s], (R,)
+    coupling: FloatArray  # −∂delay/∂(q, p), (R, k)
+    information: FloatArray  # (R, k, k)
+    score: FloatArray  # (R, k)
+    delay_sd: FloatArray  # of each delay under a given plant for unit noise, infinite where it has no effect, (R,)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """R trials, padded to one length m.
+    """R trials, padded to one length m."""
 
-    Attributes:
-        time: [s] since the command, (R, m).
-        position: [m], (R, m).
-        weight: 0 where a trial has no sample, else the same for all its samples, (R, m).
-        count: Samples of each, (R,).
-    """
-
-    time: FloatArray
-    position: FloatArray
-    weight: FloatArray
-    count: FloatArray
+    time: FloatArray  # [s] since the command, (R, m)
+    position: FloatArray  # [m], (R, m)
+    weight: FloatArray  # 0 where a trial has no sample, else the same for all its samples, (R, m)
+    count: FloatArray  # samples of each, (R,)
 
     @staticmethod
     def of(trials: Sequence[Trial], weights: Sequence[float]) -> Batch:

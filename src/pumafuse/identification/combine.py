@@ -41,22 +41,16 @@ class OrderChoice(msgspec.Struct, frozen=True, kw_only=True):
     """First or second order.
 
     Attributes:
-        order: The choice.
         first_rms: Root mean square residual of first order over all trials [m or rad].
-        second_rms: Of second order [m or rad].
-        f: Of the F-test of the additional parameters of second order.
-        p: Of that F.
-        aicc_gain: By how much second order lowers AICc; negative: it raises it. Null: too few samples.
         inverse_square: 1/ω² [s²] with its interval by trials; 0 is first order.
-        why: In words.
     """
 
     order: Order
     first_rms: float = msgspec.field(name="first_rms_mm")
-    second_rms: float = msgspec.field(name="second_rms_mm")
-    f: float
-    p: float
-    aicc_gain: float | None
+    second_rms: float = msgspec.field(name="second_rms_mm")  # of second order [m or rad]
+    f: float  # of the F-test of the additional parameters of second order
+    p: float  # of that F
+    aicc_gain: float | None  # by how much second order lowers AICc; negative: it raises it. Null: too few samples.
     inverse_square: Estimate = msgspec.field(name="inverse_square_s2")
     why: str
 
@@ -65,13 +59,11 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
     """Three delays [s].
 
     Attributes:
-        lag: Behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω.
-        fitted: Td of the model.
         onset: When the arm is first seen to move: above 3 standard deviations and 2 % of the step; null: never.
     """
 
-    lag: Estimate = msgspec.field(name="lag_ms")
-    fitted: Estimate = msgspec.field(name="fitted_ms")
+    lag: Estimate = msgspec.field(name="lag_ms")  # behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω
+    fitted: Estimate = msgspec.field(name="fitted_ms")  # Td of the model
     onset: Estimate | None = msgspec.field(name="onset_ms")
 
 
@@ -107,27 +99,16 @@ class CombinedAxis(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Common:
-    """The common plant of an axis, and delay and gain of each trial under it; arrays (n,).
+    """The common plant of an axis, and delay and gain of each trial under it; arrays (n,)."""
 
-    Attributes:
-        trials: That it is made of.
-        choice: Of the order.
-        plant: Of that order.
-        lag: 2ζ/ω, or τ, plus each trial's influence on it [s].
-        delay: Td of each trial [s].
-        delay_sd: Its standard deviation by the noise [s].
-        gain: K of each trial.
-        gain_sd: Its standard deviation by the noise.
-    """
-
-    trials: Sequence[Trial]
+    trials: Sequence[Trial]  # that it is made of
     choice: OrderChoice
     plant: PLANTS
-    lag: FloatArray
-    delay: FloatArray
-    delay_sd: FloatArray
-    gain: FloatArray
-    gain_sd: FloatArray
+    lag: FloatArray  # 2ζ/ω, or τ, plus each trial's influence on it [s]
+    delay: FloatArray  # Td of each trial [s]
+    delay_sd: FloatArray  # its standard deviation by the noise [s]
+    gain: FloatArray  # K of each trial
+    gain_sd: FloatArray  # its standard deviation by the noise
 
 
 def combine(fitted: Sequence[Fitted], period: float, paper: bool, kind: Kind) -> tuple[CombinedAxis, Common] | str:

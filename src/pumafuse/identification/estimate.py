@@ -21,21 +21,13 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Line(NamedTuple):
-    """A weighted linear fit of n values by k parameters.
+    """A weighted linear fit of n values by k parameters."""
 
-    Attributes:
-        values: Of the parameters, (k,).
-        ci95: Their 95 % intervals, (k, 2).
-        weights: Of the fitted values, (n,).
-        squares: Weighted sum of squared residuals.
-        freedom: Of the residuals: n less the rank of the design.
-    """
-
-    values: FloatArray
-    ci95: FloatArray
-    weights: FloatArray
-    squares: float
-    freedom: int
+    values: FloatArray  # of the parameters, (k,)
+    ci95: FloatArray  # their 95 % intervals, (k, 2)
+    weights: FloatArray  # of the fitted values, (n,)
+    squares: float  # weighted sum of squared residuals
+    freedom: int  # of the residuals: n less the rank of the design
 
     def p_against(self, simpler: Line) -> float:
         """P of the hypothesis that a simpler design, nested in this one, explains as much: an F-test."""

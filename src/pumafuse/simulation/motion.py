@@ -36,15 +36,10 @@ _MOST_EVENTS = 20_000_000  # 2 GB of work
 
 @dataclass(frozen=True)
 class Motion:
-    """The true position of one axis.
+    """The true position of one axis."""
 
-    Attributes:
-        time: Int64 ns, ascending, (k,); it contains the grid.
-        position: [m] relative to the start level, (k,).
-    """
-
-    time: TimeArray
-    position: FloatArray
+    time: TimeArray  # int64 ns, ascending, (k,); it contains the grid
+    position: FloatArray  # [m] relative to the start level, (k,)
 
     def at(self, time: TimeArray) -> FloatArray:
         """Positions [m] at instants of the grid, (n,)."""

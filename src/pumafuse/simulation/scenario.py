@@ -45,11 +45,10 @@ class CommandLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     Attributes:
         stamp_jitter: Standard deviation of the logger's stamps around the true ticks [s].
-        clock: What ``run.toml`` says of the stamps.
     """
 
     stamp_jitter: NotNegative = msgspec.field(name="stamp_jitter_ms", default=0.0)
-    clock: Clock = "stamps"
+    clock: Clock = "stamps"  # what ``run.toml`` says of the stamps
 
 
 class ReferenceLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,11 +68,10 @@ class TrueStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     Attributes:
         offset_sd: Standard deviation of the offset there, drawn for each run and axis [m or rad].
-        level: By axis [m or rad]; 0 where absent.
     """
 
     offset_sd: PerAxis = msgspec.field(name="offset_sd_mm", default=0.0)
-    level: dict[str, float] = msgspec.field(default_factory=dict[str, float])
+    level: dict[str, float] = msgspec.field(default_factory=dict[str, float])  # by axis [m or rad]; 0 where absent
 
 
 class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
