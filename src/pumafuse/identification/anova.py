@@ -79,12 +79,8 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def factors_of(trials: Sequence[Trial], period: float, kind: Kind) -> dict[str, list[str]]:
-    """The level of each trial for every factor that varies and is no mere counter.
-
-    Args:
-        trials: All that are analysed together.
-        period: T [s], for a speed that is not recorded.
-        kind: What the axes are.
+    """The level of each trial for every factor that varies and is no mere counter; the period T [s] is for a speed
+    that is not recorded.
     """
     speeds = speed_levels(trials, period, kind)
     columns = {"axis": [trial.axis for trial in trials], of_kind("speed_m_s", kind): speeds}
@@ -127,12 +123,7 @@ def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
 
 
 def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:
-    """Analyse every coefficient against every factor.
-
-    Args:
-        coefficients: By name, each (trials,).
-        factors: By name, the level of each trial.
-    """
+    """Every coefficient, (trials,), against every factor, the level of each trial."""
     pairs = product(coefficients.items(), factors)
     return [_dependence(coefficient, values, factor, factors) for (coefficient, values), factor in pairs]
 
@@ -146,14 +137,7 @@ def welch(groups: Sequence[FloatArray]) -> float | None:
 
 
 def scatter(coefficient: str, trials: Sequence[Trial], values: FloatArray, sd: FloatArray) -> Scatter:
-    """Scatter of a coefficient among the trials of one axis.
-
-    Args:
-        coefficient: Its name.
-        trials: The trials.
-        values: The coefficient of each, (n,).
-        sd: Its standard deviation by the noise within the trial, (n,).
-    """
+    """Scatter of a coefficient, ``values`` (n,), among trials of one axis; ``sd`` is by the noise within each, (n,)."""
     from scipy.stats import shapiro
 
     normal = float(shapiro(values).pvalue) if len(values) >= 3 and np.ptp(values) > 0.0 else None
@@ -169,11 +153,9 @@ def scatter(coefficient: str, trials: Sequence[Trial], values: FloatArray, sd: F
 
 
 def outlying(values: FloatArray, sd: FloatArray) -> BoolArray:
-    """Which values are further than eight robust standard deviations (1.4826 MAD) from the median, (n,).
+    """Which values (n,) are further than eight robust standard deviations (1.4826 MAD) from the median, (n,).
 
-    Args:
-        values: One of each trial, (n,).
-        sd: Standard deviation of each by the noise within its trial, which widens the limit, (n,).
+    The ``sd`` of each by the noise within its trial, (n,), widens the limit.
     """
     from scipy.stats import median_abs_deviation
 
@@ -187,14 +169,7 @@ def outlying(values: FloatArray, sd: FloatArray) -> BoolArray:
 def performances(
     factors: Mapping[str, Sequence[str]], rms: FloatArray, tolerance: float, kind: Kind
 ) -> list[Performance]:
-    """Error of a model by each factor.
-
-    Args:
-        factors: By name, the level of each trial, (n,).
-        rms: Of the model's residuals in each trial [m or rad], (n,).
-        tolerance: RMS beyond which it is not called valid [m or rad].
-        kind: What the axes are.
-    """
+    """Error of a model by each factor: ``rms`` of each trial's residuals, (n,), and ``tolerance``, both [m or rad]."""
     screen, found = SCREEN[kind], list[Performance]()
     for factor, cells in factors.items():
         levels = levels_of(rms * screen.scale, cells)
@@ -216,10 +191,7 @@ def _levels(cells: Sequence[str]) -> list[str]:
 def validity(performance: Sequence[Performance], fastest: float, kind: Kind) -> Validity:
     """Limits that `fuse` can check: speed, and distance from the base where a factor is called radius_mm.
 
-    Args:
-        performance: By each factor.
-        fastest: Speed of the fastest trial [m/s or rad/s], the limit where no factor gives one.
-        kind: What the axes are.
+    The speed of the ``fastest`` trial [m/s or rad/s] is the limit where no factor gives one.
     """
     limits = {one.factor: one.limit for one in performance}
     radius, found = limits.get("radius_mm"), limits.get(of_kind("speed_m_s", kind))

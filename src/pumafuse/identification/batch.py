@@ -105,14 +105,9 @@ class Batch:
         return raw - share[:, :, None] * at.unit, -share
 
     def equations(self, at: Point, slopes: FloatArray, damping: FloatArray | float = 0.0) -> Equations:
-        """Normal equations of q and p with the delays eliminated.
+        """Normal equations of q and p with the delays eliminated, whose own steps are damped.
 
         A delay takes no part where it has no effect, or where its bound 0 is active.
-
-        Args:
-            at: Where.
-            slopes: There, from :meth:`slopes`.
-            damping: Of the delays' own steps.
         """
         own = np.einsum("ij,ij->i", slopes[0], slopes[0])
         gradient = np.einsum("ij,ij->i", slopes[0], at.residual)
@@ -128,15 +123,7 @@ class Batch:
         return Equations(gradient / own, coupling, information, score, delay_sd)
 
     def stepped(self, at: Point, order: Order, damping: FloatArray, low: FloatArray, high: FloatArray) -> Point:
-        """After a Gauss-Newton step of each group of rows, between ``low`` and ``high``, (3,).
-
-        Args:
-            at: Before it.
-            order: Of the plant.
-            damping: Of each group, (R / size,).
-            low: Least delay, q and p.
-            high: Most.
-        """
+        """After a step of each group of rows, whose ``damping`` is (R / size,), between ``low`` and ``high`` (3,)."""
         size = len(at.shape) // len(damping)
         slopes, _ = self.slopes(at, order)
         own = self.equations(at, slopes, np.repeat(damping, size))

@@ -77,11 +77,9 @@ def model_fit(measured: Measured, arm: Arm) -> ModelFit:
 
 
 def best_in_class(measured: Measured, own: Arm) -> BestInClass:
-    """The best gain, delay and plant of the model's order on this run.
+    """The best gain, delay and plant of the model's order on one recording by one source.
 
-    Args:
-        measured: The run: one recording, by one source.
-        own: The model. Its order and recovery stay; its numbers are one start of the search.
+    The order and recovery of the arm's ``own`` model stay; its numbers are one start of the search.
     """
     moving = speeds(measured)
     names = ["delay", "lag", *(["damping"] if own.damping else []), "gain"]

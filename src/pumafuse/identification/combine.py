@@ -112,16 +112,9 @@ class Common:
 
 
 def combine(fitted: Sequence[Fitted], period: float, paper: bool, kind: Kind) -> tuple[CombinedAxis, Common] | str:
-    """Combine the trials of one axis.
+    """The model of one axis from its trials, or why there is none; the period T is in s.
 
-    Args:
-        fitted: The trials with their fits.
-        period: T [s].
-        paper: Average as the paper does, with all outliers, and with delay and gain as read off.
-        kind: What the axis is.
-
-    Returns:
-        The model, or why there is none.
+    ``paper``: average as the paper does, with all outliers, and with delay and gain as read off.
     """
     usual = usual_gain(fitted)
     if usual == 0.0:
@@ -274,18 +267,11 @@ def _choose(
     inverse_square: Estimate,
     kind: Kind,
 ) -> OrderChoice:
-    """Choose the order by F-test, AICc and the interval of 1/ω².
+    """Choose the order by F-test, AICc and the interval of 1/ω² [s²].
 
     Second order is chosen if the F-test (5 %) and AICc prefer it and the interval of 1/ω² by trials lies above 0:
-    samples of one trial are not independent, trials are.
-
-    Args:
-        squares: Sum of squared residuals of first and second order, in units of noise or not.
-        parameters: How many each has.
-        samples: In all trials.
-        rms: Of the residuals of each [m or rad].
-        inverse_square: 1/ω² [s²].
-        kind: What the axis is.
+    samples of one trial are not independent, trials are. ``squares``, ``parameters`` and ``rms`` [m or rad] are those
+    of first and second order; ``samples`` are in all trials.
     """
     from scipy.stats import f as fisher
 

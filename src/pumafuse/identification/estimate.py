@@ -77,12 +77,7 @@ def robust(values: FloatArray) -> Estimate:
 
 
 def common(values: FloatArray, sd: FloatArray) -> Estimate:
-    """The common value of trials, by random-effects meta-analysis.
-
-    Args:
-        values: One of each trial, (n,).
-        sd: Standard deviation of each by the noise within its trial, (n,).
-    """
+    """The common value of trials, by random-effects meta-analysis; arguments as of :func:`regression`."""
     if len(values) < 2:
         return mean(values)
     found = regression(values, sd, np.ones((len(values), 1)))
@@ -91,15 +86,11 @@ def common(values: FloatArray, sd: FloatArray) -> Estimate:
 
 
 def regression(values: FloatArray, sd: FloatArray, design: FloatArray) -> Line:
-    """Random-effects regression with weights 1/(sd² + between²).
+    """Random-effects regression of values (n,) by a design (n, k) with weights 1/(sd² + between²).
 
-    The variance between trials is the one that makes the weighted squares equal to their degrees of freedom (Paule &
+    The ``sd`` of each value is by the noise within its trial, (n,); zeros give least squares with equal weights. The
+    variance between trials is the one that makes the weighted squares equal to their degrees of freedom (Paule &
     Mandel, J. Res. NBS 87, 1982). The intervals are Knapp and Hartung's (Statistics in Medicine 22, 2003).
-
-    Args:
-        values: (n,).
-        sd: As in :func:`common`; zeros give least squares with equal weights, (n,).
-        design: (n, k).
     """
     from scipy.optimize import brentq
 

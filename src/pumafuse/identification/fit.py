@@ -121,10 +121,9 @@ class StepFit:
 
 
 def fit_steps(trials: Sequence[Trial]) -> list[tuple[StepFit, StepFit]]:
-    """Fit each trial by itself with plants of both orders; delay, gain and zero are free.
+    """Each trial by itself with plants of first and second order; delay, gain and zero are free.
 
-    Returns:
-        First and second order of each trial. Second order never fits worse than first: that is its p = 0.
+    Second order never fits worse than first: that is its p = 0.
     """
     batch = Batch.of(trials, [1.0 / abs(trial.step) for trial in trials])
     starts = np.stack([_starts(trial) for trial in trials], axis=2)

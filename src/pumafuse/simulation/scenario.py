@@ -282,11 +282,7 @@ def _sensor(table: Any, arm: ArmModel, where: str, path: str) -> Any:
 
 
 def _kind_of(moving: Iterable[object], arm: ArmModel) -> units.Kind:
-    """The kind of the axes that a trajectory moves.
-
-    Raises:
-        ConfigError: They are of both.
-    """
+    """The kind of the axes that a trajectory moves: one."""
     kinds: list[units.Kind] = [arm.axes[axis].kind for axis in moving if isinstance(axis, str) and axis in arm.axes]
     if len(set(kinds)) > 1:
         raise ConfigError("trajectory: moves lengths and angles; its sizes would have two units")

@@ -184,11 +184,7 @@ TRAJECTORIES: TypeAlias = Raster | Steps | WhiteNoise | SineSweep | Hold | PathF
 
 
 def ticks(duration: float, period: float) -> IntArray:
-    """Numbers of the ticks from 0 to ``duration`` [s], the last at or after it.
-
-    Raises:
-        ConfigError: There are too many to simulate at a time.
-    """
+    """Numbers of the ticks from 0 to ``duration`` [s], the last at or after it; not too many to simulate at a time."""
     if not duration / period < _MOST_TICKS:
         raise ConfigError(f"trajectory: {duration / period + 1.0:.6g} commands; at most {_MOST_TICKS} in one run")
     return np.arange(int(np.ceil(duration / period - 1e-9)) + 1)
