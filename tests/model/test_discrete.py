@@ -109,7 +109,7 @@ DELAYS = st.one_of(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(plant=plants, period=periods, periods_late=DELAYS, seed=st.integers(0, 2**32 - 1))
 @example(plant=TANGENTIAL, period=0.028, periods_late=0.06045 / 0.028, seed=0)
 @example(plant=RADIAL, period=0.028, periods_late=0.0385 / 0.028, seed=0)
@@ -137,7 +137,7 @@ def test_as_many_past_inputs_as_are_needed(late: float, past: int) -> None:
     assert np.abs(np.sort_complex(model.poles)[:-2]).max(initial=0.0) <= 1e-12
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(omega=powers(-1.0, 5.0), damping=powers(-2.0, 3.0), interval=powers(-6.0, 5.0))
 @example(omega=0.1, damping=1.0, interval=DAY)
 @example(omega=1e5, damping=1 - 1e-9, interval=MICROSECOND)

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 import pumafuse as pf
+from draws import OneDraw
 from pumafuse.simulation import reverting
-from pumafuse.simulation.grid import grid
-from pumafuse.simulation.motion import Motion, simulate_axis
+from pumafuse.simulation.motion import Motion, grid, simulate_axis
 from pumafuse.simulation.sensing import measure
 from pumafuse.simulation.true_arm import TrueAxis
 from pumafuse.simulation.true_sensor import TrueSensor
@@ -32,20 +32,6 @@ def matern(apart: Floats, length: float) -> Floats:
 
 def ornstein_uhlenbeck(apart: Floats, length: float) -> Floats:
     return SD**2 * np.exp(-apart / length)
-
-
-class OneDraw:
-    """A generator whose numbers are all 0 but for one, which is 1."""
-
-    def __init__(self, chosen: int) -> None:
-        self.left = chosen
-
-    def standard_normal(self, size: Any) -> Floats:
-        drawn = np.zeros(size)
-        if 0 <= self.left < drawn.size:
-            drawn.flat[self.left] = 1.0
-        self.left -= drawn.size
-        return drawn
 
 
 @pytest.mark.parametrize("length", [0.002, 0.3, 1e4])

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pumafuse.logs.run import Source
-from pumafuse.simulation.grid import grid
+from pumafuse.simulation.motion import grid
 from pumafuse.simulation.sensing import measure, valid_times
 from pumafuse.simulation.true_sensor import Bursts, Outliers, TrueSensor
 

@@ -79,9 +79,7 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def factors_of(trials: Sequence[Trial], period: float, kind: Kind) -> dict[str, list[str]]:
-    """The level of each trial for every factor that varies and is no mere counter; the period T [s] is for a speed
-    that is not recorded.
-    """
+    """The level of each trial for every factor that varies and is no mere counter; T [s] for speeds not recorded."""
     speeds = speed_levels(trials, period, kind)
     columns = {"axis": [trial.axis for trial in trials], of_kind("speed_m_s", kind): speeds}
     for name in trials[0].factors:

@@ -24,14 +24,22 @@ from ..errors import ConfigError
 from ..fusion.config import Process
 from ..model.plants import FirstOrder
 from . import reverting
-from .grid import grid
 from .reverting import sum_of_decays
 from .true_arm import TrueAxis
 
+POINTS = 60  # of the grid in each period
 _APART = {2: 1e-5, 3: 1e-4}  # equal poles are set this far apart, relatively: it changes the response by its square
 _NODES = 3  # of the noise integral: exact to 1e-10 while |p|Δ ≤ _LONGEST_TURN
 _LONGEST_TURN = 0.1
 _MOST_EVENTS = 20_000_000  # 2 GB of work
+
+
+def grid(ticks: int, period: float) -> TimeArray:
+    """Instants of ``ticks`` periods of T [s] at which measurements and reference rows may be taken, int64 ns.
+
+    All random numbers are drawn on it, so that the motion does not depend on who measures it.
+    """
+    return np.rint(np.arange(ticks * POINTS + 1) * (period * 1e9 / POINTS)).astype(np.int64)
 
 
 @dataclass(frozen=True)

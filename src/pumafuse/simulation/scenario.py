@@ -31,7 +31,7 @@ from ..logs.run import Clock
 from ..model.arm import ArmModel
 from ..toml import NotNegative
 from ..units import of_kind
-from .grid import POINTS
+from .motion import POINTS
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
 from .true_arm import TrueArm, TrueAxis
 from .true_sensor import OF_OUTLIERS, PER_AXIS, Outliers, TrueSensor

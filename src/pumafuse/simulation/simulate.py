@@ -21,8 +21,7 @@ from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
 from ..units import MM, SCREEN
 from . import campaign, sensing
-from .grid import POINTS, grid
-from .motion import Motion, simulate_axis
+from .motion import POINTS, Motion, grid, simulate_axis
 from .scenario import Scenario
 from .trajectory import PathFromFile
 
