@@ -161,19 +161,6 @@ def test_many_intervals_at_once_are_each_its_own(plant: Plant) -> None:
         assert (part[0, 0] == expected).all()
 
 
-@pytest.mark.parametrize("drift", [None, 4e-4])
-@pytest.mark.parametrize("late", [0.0, 2.16])
-@pytest.mark.parametrize("plant", [TANGENTIAL, RADIAL], ids=["second-order", "first-order"])
-def test_noise_grows_as_the_integral_of_the_impulse_response(plant: Plant, late: float, drift: float | None) -> None:
-    """After n ticks the variance of p is q ∫ g² over n·T, not delayed, and drift²·n·T on top."""
-    model = discretize(plant, 0.028, late * 0.028, input_noise=3e-5, drift=drift)
-    P = np.zeros_like(model.F)
-    for n in range(1, 12):
-        P = model.F @ P @ model.F.T + model.Q
-        noise = 3e-5**2 * exact_transition(plant, n * 0.028)[2][0, 0] + (drift or 0.0) ** 2 * n * 0.028
-        assert (model.H @ P @ model.H.T).item() == pytest.approx(noise, rel=1e-11)
-
-
 def test_an_offset_stays_and_is_measured() -> None:
     """The offset adds to p for ever, moves nothing else, and no input moves it. Past inputs carry no noise."""
     inputs = np.random.default_rng(3).normal(size=20)
