@@ -198,17 +198,7 @@ def test_a_drift_of_20_ms_is_named(lag: ModuleType) -> None:
         assert any("drifts" in one for one in named), seed
 
 
-# ---- general filters, and where tables go ---------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("job", ["filter", "smooth", "likelihood"])
-def test_a_general_filter_gives_the_numbers_of_pumafuse(monkeypatch: pytest.MonkeyPatch, job: str) -> None:
-    """statsmodels, with matrices for each event of the shipped scan, to 1e-9 of a standard deviation."""
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    peers = importlib.import_module("peers")
-    scan = peers.Problem.of(0)
-    assert peers.error(peers.statsmodels(job)(scan)(), scan.answer(job)) < 1e-9
+# ---- where tables go ------------------------------------------------------------------------------------------------
 
 
 def test_tables_go_between_the_marks_of_who_makes_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

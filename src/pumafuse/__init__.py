@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         summarise,
     )
     from .identification.identify import CombinedAxis, Identification, TrialResult, identify
-    from .identification.plan import Design, Plan, PlannedTrial, plan
     from .identification.trials import StepTrials, Trial, TrialsError
     from .identification.verify import AxisVerification, BestInClass, ModelFit, Trace, verify
     from .live.estimator import EventLog, LiveEstimator
@@ -75,7 +74,6 @@ _NAMES = {
         "summarise",
     ],
     "identification.identify": ["CombinedAxis", "Identification", "TrialResult", "identify"],
-    "identification.plan": ["Design", "Plan", "PlannedTrial", "plan"],
     "identification.trials": ["StepTrials", "Trial", "TrialsError"],
     "identification.verify": ["AxisVerification", "BestInClass", "ModelFit", "Trace", "verify"],
     "live.estimator": ["EventLog", "LiveEstimator"],
@@ -106,17 +104,17 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
-    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
+    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "DiscreteModel", "Estimates", "EventLog",
     "Events", "FirstOrder", "Fitted", "FittedLag", "FoundCause", "FusionConfig", "Gain", "Health", "Identification",
     "Joint", "Joints", "Latency", "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit",
-    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plan", "PlannedTrial", "Plant", "Pose",
+    "OrientationScore", "Outcome", "PartLag", "Placed", "Placement", "Plant", "Pose",
     "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Registered", "RegisteredSensor",
     "RegistrationSummary", "Registrations", "Robot", "Rotated", "Run", "RunError", "Sag", "Scenario", "Score",
     "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary",
     "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Tool", "Trace", "Trial", "TrialResult",
     "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult",
     "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency",
-    "plan", "register", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
+    "register", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""`pumafuse identify`, `verify` and `plan` by the executable on joints: angles in degrees, also beside a length."""
+"""`pumafuse identify` and `verify` by the executable on joints: angles in degrees, also beside a length."""
 
 from __future__ import annotations
 
@@ -159,41 +159,9 @@ def test_fuse_takes_the_arm_with_both_kinds(folder: Path, run: Path, tmp_path: P
     assert axes["rail"]["sensors"]["encoder"]["innovation_rms_mm"] < 0.2
 
 
-def test_plan_for_joints_is_in_degrees(folder: Path, tmp_path: Path) -> None:
-    """Steps of speed times period, files by degrees; what identify reads, of the kind of the arm."""
-    plan = tmp_path / "plan"
-    done = pumafuse("plan", "-o", plan, "--arm", folder / "arm.toml", "--speeds", "15,45", "--noise", "0.5")
-    assert done.stderr == ""
-    joints = {f"white-noise-{axis}-0.5deg.csv" for axis in PLANTS}
-    assert names(plan) == {"trials.csv", "steps.csv", *joints}
-    lines = [line.replace('"', "").split(",") for line in (plan / "trials.csv").read_text().splitlines()]
-    assert lines[0] == ["trial", "axis", "step_deg", "speed_deg_s", "replicate"]
-    assert sorted(tuple(line[2:4]) for line in lines[1:]) == [("0.3", "15")] * 4 + [("0.9", "45")] * 4
-    steps = (plan / "steps.csv").read_text().splitlines()
-    assert steps[0].replace('"', "") == "trial,tick,time_s,shoulder_deg,wrist_deg"
-    assert {float(cell) for row in steps[1:] for cell in row.split(",")[3:]} == {0.0, 0.3, 0.9}
-    pumafuse("plan", "-o", tmp_path / "default", "--arm", folder / "arm.toml", "--axes", "wrist")
-    assert "white-noise-wrist-0.4deg.csv" in names(tmp_path / "default")
-
-
-@pytest.mark.long
-def test_plan_warns_in_degrees(folder: Path, tmp_path: Path) -> None:
-    """Of the arm's limit and of one that is given; of steps in a wrong unit, which no joint makes."""
-    plan = ("plan", "--arm", folder / "arm.toml", "--noise", "0.5", "-o")
-    beyond = pumafuse(*plan, tmp_path / "a", "--speeds", "50,110").stderr
-    assert beyond == "warning: commanded speeds reach 110 deg/s, the limit is 100 deg/s\n"
-    given = pumafuse(*plan, tmp_path / "b", "--speeds", "15,45", "--max-speed", 40).stderr
-    assert given == "warning: commanded speeds reach 45 deg/s, the limit is 40 deg/s\n"
-    wrong = pumafuse(*plan, tmp_path / "c", "--speeds", "50,5000").stderr
-    assert "steps are 100 deg at most, 5e+03 deg/s at T; is a unit wrong?" in wrong
-
-
 @pytest.mark.long
 def test_what_mixes_kinds_is_refused_in_a_line(folder: Path, run: Path, tmp_path: Path) -> None:
-    """Axes of both kinds in one plan, steps in degrees with positions in mm, a level of no axis; nothing is written."""
-    mixed = ("plan", "-o", tmp_path / "plan", "--arm", folder / "mixed.toml")
-    assert "is a length" in (line := refused(*mixed)) and line.endswith("plan a campaign for each, with --axes")
-    assert "speeds must make steps of 0.0001 deg to 360 deg" in refused(*mixed, "--axes", "wrist", "--speeds", "1e6")
+    """Steps in degrees with positions in mm, a level of no axis; nothing is written."""
     (tmp_path / "half").mkdir()
     (tmp_path / "half" / "trials.csv").write_bytes((folder / "steps" / "trials.csv").read_bytes())
     text = (folder / "steps" / "samples.csv").read_text().replace("position_deg", "position_mm")

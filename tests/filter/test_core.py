@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from pumafuse.arrays import FloatArray
 from pumafuse.errors import PumafuseError
@@ -86,122 +84,6 @@ def run(config: FusionConfig, events: Events) -> tuple[FloatArray, Results, Filt
 
 
 # ---- the textbook ---------------------------------------------------------------------------------------------------
-
-
-class Textbook:
-    """One axis: position, rate, the input u, the gain error e, the offset, what is disturbed, biases: known or not."""
-
-    def __init__(self, config: FusionConfig, axis: str) -> None:
-        self.config, self.axis, self.process = config, config.arm.axes[axis], config.process[axis]
-        plant, process, recovery = self.axis.plant, self.process, self.axis.gain_recovery
-        smooth = process.disturbance_kind == "matern"
-        disturbed = (2 if smooth else 1) if process.disturbance_sd else 0
-        size = 5 + disturbed + sum((one.bias_sd > 0) + (one.bias_drift_sd > 0) for one in config.sensors.values())
-        self.x, self.h, self.noise = np.zeros((3, size))
-        self.P, self.A = np.zeros((2, size, size))
-        self.step = self.maneuver = 0.0
-        if isinstance(plant, FirstOrder):
-            self.A[0, [0, 2, 3]] = np.array([-1.0, 1.0, 1.0]) / plant.time_constant
-        else:
-            w = plant.natural_frequency
-            self.A[0, 1], self.A[1, :4] = 1.0, [-w * w, -2.0 * plant.damping * w, w * w, w * w]
-        self.B = self.A[:, 2].copy()
-        self.A[3, 3] = -1.0 / recovery if recovery else 0.0
-        self.P[4, 4] = config.start.offset_sd**2
-        self.h[[0, 4]] = 1.0
-        moving = [0]  # what the speed is made of
-        if disturbed:
-            self.h[5], self.P[5, 5] = 1.0, process.disturbance_sd**2
-            rate = (np.sqrt(3.0) if smooth else 1.0) / process.disturbance_time
-            if smooth:
-                moving.append(5)
-                self.A[5, 6], self.A[6, 5:7] = 1.0, [-(rate**2), -2.0 * rate]
-                self.P[6, 6], self.noise[6] = rate**2 * self.P[5, 5], 4.0 * rate**3 * self.P[5, 5]
-            else:
-                self.A[5, 5], self.noise[5] = -rate, 2.0 * rate * self.P[5, 5]
-        self.speed = self.A[moving].sum(axis=0)
-        self.H, at = list[FloatArray](), 5 + disturbed
-        for sensor in config.sensors.values():
-            self.H.append(sensor.scale * self.h)
-            if sensor.bias_drift_sd:
-                self.H[-1][at], self.P[at, at], self.A[at, at] = 1.0, sensor.bias_drift_sd**2, -1.0 / sensor.bias_time
-                self.noise[at], at = 2.0 * self.P[at, at] / sensor.bias_time, at + 1
-            if sensor.bias_sd:
-                self.H[-1][at], self.P[at, at], at = 1.0, sensor.bias_sd**2, at + 1
-
-    def over(self, dt: float) -> tuple[FloatArray, FloatArray]:
-        """Φ and Q: Van Loan's exponential of a short part, doubled."""
-        noise, process, size = np.diag(self.noise), self.process, len(self.x)
-        noise += (process.input_noise**2 + (process.maneuver_noise * self.maneuver) ** 2) * np.outer(self.B, self.B)
-        noise[4, 4] += process.drift**2 + (process.maneuver_drift * self.maneuver) ** 2
-        doublings = max(math.ceil(math.log2(np.abs(self.A).max() * dt)), 0)
-        power = expm(np.block([[-self.A, noise], [np.zeros_like(noise), self.A.T]]) * dt / 2.0**doublings)
-        F = power[size:, size:].T
-        Q = F @ power[:size, size:]
-        for _ in range(doublings):
-            F, Q = F @ F, F @ Q @ F.T + Q
-        return F, Q
-
-    def predict(self, dt: float) -> None:
-        F, Q = self.over(dt)
-        self.x, self.P = F @ self.x, F @ self.P @ F.T + Q
-
-    def command(self, value: float) -> None:
-        step, gain = value - START - self.x[2], self.axis.gain
-        self.maneuver, self.step = abs(step - self.step) / T, step
-        self.x[2] += step
-        self.x[3] += (gain.slope * abs(step) / T + gain.intercept - 1.0) * step
-
-    def measure(self, number: int, value: float, spread: float) -> tuple[float, float]:
-        """ν and √S."""
-        sensor, H = list(self.config.sensors.values())[number], self.H[number]
-        R = (spread * sensor.sd) ** 2 + (sensor.scale * (self.speed @ self.x) * sensor.latency_sd) ** 2
-        nu, S = value - sensor.scale * START - H @ self.x, H @ self.P @ H + R
-        K = self.P @ H / S
-        left = np.eye(len(self.x)) - np.outer(K, H)
-        self.x, self.P = self.x + K * nu, left @ self.P @ left.T + R * np.outer(K, K)
-        return nu, np.sqrt(S)
-
-    def outputs(self) -> list[float]:
-        F, Q = self.over(T)
-        ahead = self.h @ (F - np.eye(len(F)))
-        disturbed = self.process.disturbance_sd > 0.0
-        return [
-            self.h @ self.x, np.sqrt(self.h @ self.P @ self.h),
-            ahead @ self.x / T, np.sqrt(ahead @ self.P @ ahead + self.h @ Q @ self.h) / T,
-            self.x[4], np.sqrt(self.P[4, 4]),
-            disturbed * self.x[5], disturbed * np.sqrt(self.P[5, 5]),
-        ]  # fmt: skip
-
-
-@every_axis
-def test_predictions_and_updates_are_the_textbook_s(axis: str) -> None:
-    """ν, √S, every output after every event, and the biases: means to 1e-9 of their sd, error bars to 1e-9.
-
-    So Φ and Q are those of the exponential, with an input that is held and a gain error that decays; a command adds
-    (K − 1)·step to it and sets the noise by |u_n − 2u_(n−1) + u_(n−2)| / T; R grows with spread and with the speed
-    times the latency's spread; and an update is the Joseph form's.
-    """
-    config = config_of([axis])
-    events = any_events(config)
-    outputs, results, core = run(config, events)
-    book, time = Textbook(config, axis), 0
-    for row, (then, source) in enumerate(zip(events.time.tolist(), events.source.tolist(), strict=True)):
-        book.predict((then - time) / 1e9)
-        value, time = float(events.value[row, 0]), then
-        if source == COMMAND:
-            book.command(value)
-        else:
-            nu, sd = book.measure(source, value, float(events.spread[row, 0]))
-            assert results.innovation[row, 0] == pytest.approx(nu, abs=1e-9 * sd)
-            assert results.innovation_sd[row, 0] == pytest.approx(sd, rel=1e-9)
-        wanted = np.array(book.outputs()).reshape(-1, 2)
-        np.testing.assert_allclose(outputs[1::2, 0, row], wanted[:, 1], rtol=1e-9, atol=1e-30)
-        assert (np.abs(outputs[::2, 0, row] - wanted[:, 0]) <= 1e-9 * wanted[:, 1] + 1e-15).all()
-    for sensor, place in (("biased", -3), ("drifting", -1)):
-        bias = core.bias(list(SENSORS).index(sensor), 0)
-        assert bias == pytest.approx((book.x[place], np.sqrt(book.P[place, place])), rel=1e-8, abs=1e-12)
-    assert core.bias(0, 0) is None
 
 
 # ---- to the bit -----------------------------------------------------------------------------------------------------

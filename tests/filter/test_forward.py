@@ -56,7 +56,7 @@ def segment_of(seed: int) -> Segment:
 GRID = 20 * MS * np.arange(160)
 LAST = GRID[-1:]
 NONE = GRID[:0]
-slips = settings(max_examples=20)
+slips = settings(max_examples=10)
 
 
 class Pass:

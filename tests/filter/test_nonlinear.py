@@ -81,12 +81,18 @@ def solved(axis: AxisModel, given: TimeArray, command: FloatArray, time: TimeArr
     return found
 
 
-@pytest.mark.parametrize("recovery", [None, 0.004, 0.1])
 @pytest.mark.parametrize("plant", KNOWN.values(), ids=KNOWN)
-def test_the_differential_equation_is_solved(plant: PLANTS, recovery: float | None) -> None:
-    """With a limit, with play, with both: to 1e-9, in motions that saturate, swing, turn and rest."""
+def test_the_differential_equation_is_solved(plant: PLANTS) -> None:
+    """Linear, with a limit, with play, with both: to 1e-9, in motions that saturate, swing, turn and rest."""
     rng = np.random.default_rng(3)
-    for seed, bends in enumerate([{"max_speed": 0.2}, {"play": 0.01}, {"max_speed": 0.5, "play": 0.05}]):
+    cases = [
+        (0.004, {"max_speed": 0.2}),
+        (0.1, {"play": 0.01}),
+        (None, {"max_speed": 0.5, "play": 0.05}),
+        (None, {}),
+        (0.0425, {}),
+    ]
+    for seed, (recovery, bends) in enumerate(cases):
         given, command = random_walk(seed, 8, 0.1)
         time = np.sort(rng.integers(0, int(given[-1]) + 500 * MS, 60))
         axis = AxisModel(plant=plant, gain=PAPER, gain_recovery=recovery, **bends)
@@ -95,10 +101,10 @@ def test_the_differential_equation_is_solved(plant: PLANTS, recovery: float | No
             moved(changed(axis, max_speed=None, play=None), given, command, time),
         )
         np.testing.assert_allclose(found, solved(axis, given, command, time), rtol=0.0, atol=1e-9)
-        assert np.abs(found - free).max() > 1e-3
+        assert (np.abs(found - free).max() > 1e-3) == bool(bends)
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(PLANT, RECOVERY, st.integers(0, 10**6))
 def test_what_is_never_reached_changes_no_bit(plant: PLANTS, recovery: float | None, seed: int) -> None:
     """No play, a speed that nothing asks for, and a load that weighs nothing: the linear response to the bit."""
@@ -109,7 +115,7 @@ def test_what_is_never_reached_changes_no_bit(plant: PLANTS, recovery: float | N
     np.testing.assert_array_equal(found, moved(linear, given, command, time))
 
 
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(PLANT, RECOVERY, SPEED, PLAY, st.integers(0, 10**6))
 def test_no_limit_is_exceeded(plant: PLANTS, recovery: float | None, fastest: float, play: float, seed: int) -> None:
     """From one instant to the next the drive goes as fast as it can at most, and the tool stays within the play."""
@@ -169,18 +175,19 @@ def test_a_load_holds_the_tool_off_by_where_it_is() -> None:
     assert (p < 0.45).any() and (p == middle).any() and (p > 0.47).any()
 
 
-@settings(max_examples=60)
-@given(PLANT, RECOVERY, SPEED, PLAY, st.integers(0, 10**6))
+@settings(max_examples=30)
+@given(PLANT, RECOVERY, st.none() | SPEED, st.none() | PLAY, st.sampled_from([None, CURVE]), st.integers(0, 10**6))
 def test_followed_in_pieces_it_is_the_same_to_the_bit(
-    plant: PLANTS, recovery: float | None, fastest: float, play: float, seed: int
+    plant: PLANTS, recovery: float | None, fastest: float | None, play: float | None, sag: Sag | None, seed: int
 ) -> None:
     """Each position alone, by commands that come in pieces, is that of all at once; to rounding it is the response."""
     rng, (given, command) = np.random.default_rng(seed), random_walk(seed)
     time = np.sort(rng.integers(0, int(given[-1]) + 500 * MS, 20))
-    axis = AxisModel(plant=plant, gain=PAPER, gain_recovery=recovery, max_speed=fastest, play=play, sag=CURVE)
+    axis = AxisModel(plant=plant, gain=PAPER, gain_recovery=recovery, max_speed=fastest, play=play, sag=sag)
     record, value, nothing = record_of(axis, PERIOD, DELAY, 0.0), command - START, np.empty(0)
     found = follow(record, at_rest(), given, value, time)
-    np.testing.assert_allclose(found, response(axis, PERIOD, DELAY, given, value, 0.0, time), rtol=0.0, atol=1e-12)
+    rounding = 1e-12 if fastest or play else 1e-14
+    np.testing.assert_allclose(found, response(axis, PERIOD, DELAY, given, value, 0.0, time), rtol=0.0, atol=rounding)
     for place, end in enumerate(np.searchsorted(given + round(DELAY * 1e9), time, side="right").tolist()):
         motion, cut = at_rest(), int(rng.integers(0, end + 1))
         for part in (slice(0, cut), slice(cut, end)):

@@ -97,23 +97,6 @@ def blurred(omega: float, zeta: float, t: float) -> float:
 # ---- the oracle -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("zeta", [0.3, 1.0 - 1e-9, 1.0, 1.0 + 1e-4, 4.0])
-@pytest.mark.parametrize("turn", [1e-3, 0.7, 5.0])
-def test_the_oracle_is_the_matrix_exponential_and_its_integral(zeta: float, turn: float) -> None:
-    """Φ and Q stand in the exponential of [−A, B Bᵀ; 0, Aᵀ] t (Van Loan), summed as a power series, to 30 digits."""
-    omega = 20.0
-    got = wanted(omega, zeta, turn / omega)
-    with mpmath.workdps(60):
-        w, t = mpf(omega), mpf(turn / omega)
-        A = w * mpmath.matrix([[0, 1], [-1, -2 * mpf(zeta)]])
-        block = mpmath.zeros(4)
-        block[:2, :2], block[2:, 2:], block[1, 3] = -A, A.T, w**2
-        power = mpmath.expm(block * t)
-        Phi = power[2:, 2:].T
-        assert mpmath.norm(got.Phi - Phi) < mpf("1e-30")
-        assert mpmath.norm(got.Q - Phi * power[:2, 2:]) < mpf("1e-30") * mpmath.norm(got.Q)
-
-
 # ---- second order ---------------------------------------------------------------------------------------------------
 
 CRITICAL = [1.0, 1.0 + 2**-52, 1.0 - 2**-53, 1.0 + 1e-12, 1.0 - 1e-12, 1.0 + 1e-9, 1.0 - 1e-9, 1.0 + 1e-4, 1.0 - 1e-4]
@@ -160,13 +143,13 @@ def test_any_transition_is_that_of_the_plant(made: tuple[float, float, float]) -
 @pytest.mark.parametrize("omega", [1e-3, 53.9])
 def test_a_transition_over_any_interval(omega: float, zeta: float) -> None:
     """From 1 ns to 1e5 s, densely where the plant answers: the same digits everywhere."""
-    for t in {*(10.0 ** np.arange(-9.0, 6.0)), *(10.0 ** np.arange(-2.0, 2.01, 0.1) / fastest(omega, zeta))}:
+    for t in {*(10.0 ** np.arange(-9.0, 6.0)), *(10.0 ** np.arange(-2.0, 2.01, 0.25) / fastest(omega, zeta))}:
         if 1e-9 <= t <= 1e5:
             made = omega, zeta, float(t)
             check(found(*made), wanted(*made), 2e-15 * blurred(*made), 1e-13)
 
 
-@settings(max_examples=1000)
+@settings(max_examples=200)
 @given(transitions())
 def test_process_noise_is_a_covariance(made: tuple[float, float, float]) -> None:
     """Q11 and Q22 are never negative, and no correlation is beyond 1 by more than an ulp or two."""
@@ -198,7 +181,7 @@ def test_nothing_happens_in_no_time() -> None:
 # ---- first order ----------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=1000)
+@settings(max_examples=200)
 @given(powers(-6.0, 3.0), powers(-9.0, 5.0))
 def test_any_lag_is_that_of_the_plant(tau: float, t: float) -> None:
     """Φ = e^(−t/τ) to an ulp of 1, Q = (1 − e^(−2t/τ)) / 2τ to 2e-15 of itself."""
@@ -234,19 +217,6 @@ def check_decaying(plant: PLANTS, decay: float, t: float, tolerance: float = 1e-
         assert abs(mpf(got) - right) <= tolerance * blur
 
 
-def test_the_oracle_of_a_decaying_input_is_its_integral() -> None:
-    """∫ g(s) ω² e^(−b (t − s)) ds by quadrature, g the impulse response; and its derivative."""
-    plant, b, t = SecondOrder(natural_frequency=50.0, damping=0.7), 20.0, 0.05
-    with mpmath.workdps(40):
-        w, z, b, t = mpf(50), mpf("0.7"), mpf(b), mpf(t)
-        turning = w * mpmath.sqrt(1 - z**2)
-        position = mpmath.quad(
-            lambda s: w**2 * mpmath.exp(-z * w * s) * mpmath.sin(turning * s) / turning * mpmath.exp(-b * (t - s)),
-            [0, t],
-        )
-        assert abs(wanted_decaying(plant, 20.0, 0.05)[0] - position) < mpf("1e-15")  # 0.7 and 0.05 are doubles there
-
-
 @st.composite
 def decaying(draw: st.DrawFn) -> tuple[PLANTS, float, float]:
     """A plant, a decay anywhere or on, or a hair beside, one of the plant's poles, and an interval."""
@@ -262,21 +232,11 @@ def decaying(draw: st.DrawFn) -> tuple[PLANTS, float, float]:
     return plant, decay, min(max(t, 1e-9), 1e3)
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(decaying())
 def test_any_response_to_a_decaying_input(made: tuple[PLANTS, float, float]) -> None:
     """Position and rate over ω to 1e-13, wherever the input's pole lies and however long the interval is."""
     check_decaying(*made)
-
-
-@pytest.mark.parametrize("zeta", [None, 0.3, 1.0 - 1e-9, 1.0, 1.0 + 1e-7, 2.0])
-def test_a_recovery_on_or_beside_a_pole(zeta: float | None) -> None:
-    """From on a pole of the plant, over where the series end, to far from it: no digit is lost anywhere."""
-    plant = FirstOrder(time_constant=0.02) if zeta is None else SecondOrder(natural_frequency=50.0, damping=zeta)
-    poles = {50.0} if zeta is None else {50.0, fastest(50.0, zeta), 2500.0 / fastest(50.0, zeta)}
-    apart = [0.0, *(sign * by for by in (1e-15, 1e-12, 1e-8, 1e-5, 1e-3, 0.03, 0.1, 0.2, 0.5) for sign in (-1.0, 1.0))]
-    for pole, by, turn in product(poles, apart, (1e-6, 1e-2, 0.5, 1.3, 8.0, 200.0)):
-        check_decaying(plant, pole * (1.0 + by), turn / 50.0, 2e-14)
 
 
 @pytest.mark.parametrize("plant", [FirstOrder(time_constant=0.04), SecondOrder(natural_frequency=53.9, damping=0.8)])
@@ -293,7 +253,7 @@ def test_an_input_that_stays_is_a_step_and_one_that_is_gone_at_once_is_nothing(p
 # ---- a smooth disturbance -------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=500)
+@settings(max_examples=150)
 @given(powers(-4.0, 5.0), powers(-9.0, 5.0))
 @example(0.5, 1.0 - 1e-15)  # where a series ends
 @example(0.5, 1.0 + 1e-15)

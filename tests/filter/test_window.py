@@ -33,7 +33,7 @@ def empty(delays: tuple[float, ...]) -> Window:
     return Window(filter_model(config, tuple(axes), tuple(SENSORS), None, [["vision", "ahead"]] * len(axes)))
 
 
-@settings(max_examples=150)
+@settings(max_examples=40)
 @given(
     st.integers(0, 2**32),
     st.lists(st.sampled_from([0.0, 0.06, 0.5]), min_size=1, max_size=3),

@@ -75,54 +75,9 @@ def numbers(tree: Any, path: str = "") -> Iterator[tuple[str, float]]:
         yield path, float(tree)
 
 
-def test_kinds_and_units_of_a_campaign(trials: dict[str, StepTrials]) -> None:
-    """Lengths in m, angles in rad, whichever of their units a file has; the factor is no speed and no step."""
-    assert {unit: of.kind for unit, of in trials.items()} == {"_mm": "length", "_deg": "angle", "_rad": "angle"}
-    for unit, size in (("_mm", 1e-3), ("_deg", PER_DEGREE), ("_rad", PER_DEGREE)):
-        last = trials[unit].trials[-1]
-        assert (last.step, last.speed) == pytest.approx((-19.0 * size, 19.0 / PERIOD * size), rel=1e-12)
-        assert set(last.factors) == {"radius_mm"}
-        assert trials[unit].axes == ("shoulder", "elbow")
-        assert trials[unit].period() == pytest.approx(0.028, rel=1e-12)
-
-
-def test_one_mm_and_one_degree_are_one_arm(found: dict[str, pf.Identification]) -> None:
-    """Plant, delay, gain and every interval to 1e-9; only the slope of the gain has a unit of the axis."""
-    assert found["_deg"].kind == "angle"
-    for axis, length in found["_mm"].axes.items():
-        angle = found["_deg"].axes[axis]
-        assert (length.model.kind, angle.model.kind) == ("length", "angle")
-        assert type(length.model.plant) is type(angle.model.plant) is [pf.FirstOrder, pf.SecondOrder][axis == "elbow"]
-        for one, other in (
-            (length.model.plant, angle.model.plant),
-            (length.delays, angle.delays),
-            (length.model.delay_ci95, angle.model.delay_ci95),
-            ([length.model.delay, length.delay_spread], [angle.model.delay, angle.delay_spread]),
-        ):
-            pairs = zip(flat(one), flat(other), strict=True)
-            assert all(a == pytest.approx(b, rel=1e-9, abs=1e-12) for a, b in pairs)
-        gains = [length.model.gain, angle.model.gain]
-        assert gains[0].intercept == pytest.approx(gains[1].intercept, rel=1e-9)
-        assert gains[0].intercept_ci95 == pytest.approx(gains[1].intercept_ci95, rel=1e-9)
-        per_unit = [gains[0].slope * 1e-3, gains[1].slope * PER_DEGREE]
-        assert per_unit[0] == pytest.approx(per_unit[1], rel=1e-9)
-        assert per_unit[1] == pytest.approx(SLOPE, rel=0.2)
-        low, high = gains[1].slope_ci95 or (0.0, 0.0)
-        assert low * PER_DEGREE < SLOPE < high * PER_DEGREE
-
-
 def _near(key: str) -> dict[str, float]:
     """Of a single trial ω and ζ make up for each other: where its search ends differs in the last digits."""
     return {"rel": 1e-7 if key == "axes" else 1e-4, "abs": 1e-9}
-
-
-def flat(value: Any) -> list[float]:
-    """The numbers of a struct, a tuple or a list."""
-    if isinstance(value, int | float):
-        return [float(value)]
-    if hasattr(value, "__struct_fields__"):
-        value = [getattr(value, name) for name in value.__struct_fields__]
-    return [number for item in value or [] for number in flat(item)]
 
 
 def test_json_has_the_same_numbers_under_the_names_of_its_kind(found: dict[str, pf.Identification]) -> None:
@@ -202,13 +157,6 @@ def test_a_limit_is_in_the_unit_of_its_factor() -> None:
     assert limits.max_speed is None
     assert (limits.max_angular_speed, limits.max_radius) == pytest.approx((60.0 * PER_DEGREE, 0.8), rel=1e-9)
     assert validity(found[1:], 7.0, "angle").max_angular_speed == 7.0
-
-
-@pytest.mark.long
-def test_the_default_tolerance_is_a_millimetre_or_a_tenth_of_a_degree(trials: dict[str, StepTrials]) -> None:
-    """As JSON shows it."""
-    shown = {unit: json.loads(pf.identify(trials[unit]).to_json()) for unit in ("_mm", "_deg")}
-    assert (shown["_mm"]["tolerance_mm"], shown["_deg"]["tolerance_deg"]) == (1.0, 0.1)
 
 
 def test_tables_show_the_numbers_of_the_json(found: dict[str, pf.Identification]) -> None:

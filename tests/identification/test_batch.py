@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from pumafuse.identification.batch import Batch
@@ -61,24 +59,6 @@ def unpacked(trials: list[Trial], plant: tuple[float, float], delays: np.ndarray
 
 
 # ---- one shape ------------------------------------------------------------------------------------------------------
-
-
-@settings(max_examples=40)
-@given(st.floats(0.005, 0.15), st.floats(0.0, 2.0), st.floats(0.0, 0.1), st.integers(0, 50))
-def test_a_point_is_plain_regression_in_each_row(q: float, ratio: float, delay: float, seed: int) -> None:
-    """Height and residuals as `lstsq` has them from the response and a one, weighted; the padding stays 0."""
-    trials, plant = campaign(SWINGING, 0.05, seed), (q, ratio * q * q)
-    delays = delay * np.array([1.0, 0.5, 0.2, 0.9])
-    found = Batch.of(trials, WEIGHTS).point(shapes(plant, delays))
-    for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
-        height, zero = linear(trial, delays[row], plant)
-        c = unit_response(trial.time - delays[row], *plant)
-        left, n = weight * (trial.position - zero - height * c), len(c)
-        assert found.amplitude[row] == pytest.approx(height, rel=1e-9)
-        np.testing.assert_allclose(found.residual[row, :n], left, rtol=0.0, atol=1e-10)
-        np.testing.assert_allclose(found.unit[row, :n], weight * (c - c.mean()), rtol=0.0, atol=1e-10)
-        assert not found.residual[row, n:].any() and not found.unit[row, n:].any()
-        assert found.cost[row] == pytest.approx(left @ left, rel=1e-9)
 
 
 def test_a_response_that_comes_after_the_last_sample_has_no_height() -> None:
@@ -146,6 +126,3 @@ def test_fit_shared_finds_the_minimum_of_the_dense_problem(
         )
         worst = max(worst, found.cost.sum() / (2.0 * best.cost) - 1.0)
     assert worst < KINKS
-
-
-# ---- stacking -------------------------------------------------------------------------------------------------------

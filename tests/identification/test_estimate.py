@@ -37,10 +37,12 @@ def test_a_mean_has_the_textbooks_interval(values: np.ndarray) -> None:
 def test_a_robust_mean_solves_hubers_equation() -> None:
     """The clipped residuals, in units of 1.4826 times their median size, sum to 0; 1.345 is where they are clipped."""
     values = np.append(np.random.default_rng(3).standard_normal(15), [9.0, 14.0])
-    left = values - robust(values).value
+    found = robust(values)
+    left = values - found.value
     scale = np.median(np.abs(left)) / stats.norm.ppf(0.75)
     assert abs(np.clip(left / scale, -1.345, 1.345).sum()) < 1e-5
     assert (np.abs(left / scale) > 1.345).sum() >= 2
+    assert found.ci95 == pytest.approx((-0.81658327, 0.49914297), rel=1e-7)  # of statsmodels 0.15, by its H1
 
 
 # ---- random effects -------------------------------------------------------------------------------------------------
@@ -52,8 +54,8 @@ def test_equal_sds_give_ordinary_least_squares(sd: float) -> None:
     values = 1.0 + 0.05 * SPEEDS + scattered(4, 20, 0.01, np.full(20, 0.005))
     found = regression(values, np.full(20, sd), LINE)
     line, t = stats.linregress(SPEEDS, values), stats.t.ppf(0.975, 18)
-    np.testing.assert_allclose(found.params, [line.intercept, line.slope], rtol=1e-9)
-    halves = 0.5 * np.diff(found.conf_int())[:, 0]
+    np.testing.assert_allclose(found.values, [line.intercept, line.slope], rtol=1e-9)
+    halves = 0.5 * np.diff(found.ci95)[:, 0]
     np.testing.assert_allclose(halves, [t * line.intercept_stderr, t * line.stderr], rtol=1e-9)
 
 
@@ -62,12 +64,13 @@ def test_equal_sds_give_ordinary_least_squares(sd: float) -> None:
 def test_the_variance_between_trials_is_paule_and_mandels(design: np.ndarray, between: float) -> None:
     """Weighted squares equal their degrees of freedom, weights are 1/(sd² + between²) with one `between`."""
     sd = np.geomspace(0.01, 0.2, 20)
-    found = regression(scattered(5, 20, between, sd), sd, design)
-    weight = found.model.weights
+    values = scattered(5, 20, between, sd)
+    found = regression(values, sd, design)
+    weight = found.weights
     variance = 1.0 / weight - sd**2
     np.testing.assert_allclose(variance, variance[0], rtol=1e-6)
     assert variance[0] > 0.0
-    left = found.model.endog - design @ found.params
+    left = values - design @ found.values
     assert weight @ left**2 == pytest.approx(20 - design.shape[1], rel=1e-6)
     assert np.abs(design.T @ (weight * left)).max() < 1e-8 * np.abs(design.T @ (weight * np.abs(left))).max()
     assert 0.4 * between < np.sqrt(variance[0]) < 2.0 * between
@@ -93,6 +96,3 @@ def test_degenerate_values_are_taken_without_a_warning(values: list[float], sd: 
             np.testing.assert_allclose([one.value, *one.ci95], values[0], rtol=1e-9, atol=1e-12)
         else:
             assert 1.0 <= one.value < 2.0 and np.isfinite(one.ci95).all()
-
-
-# ---- coverage -------------------------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ def test_second_order_becomes_first_order() -> None:
 # ---- fits -----------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(st.floats(0.01, 0.08), st.floats(0.0, 0.15))
 def test_first_order_without_noise_is_found_exactly(tau: float, delay: float) -> None:
     """Time constant, delay, gain and zero to 1e-5."""
@@ -53,7 +53,7 @@ def test_first_order_without_noise_is_found_exactly(tau: float, delay: float) ->
     assert fit.rms < 1e-8
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(st.floats(25.0, 150.0), st.floats(0.4, 1.6), st.floats(0.0, 0.12))
 def test_second_order_without_noise_is_found_exactly(omega: float, damping: float, delay: float) -> None:
     """ω and ζ to 1e-3, the curve to 1e-7 m."""

@@ -6,7 +6,6 @@ the true one, found from the run alone.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,11 +17,9 @@ import pytest
 from scipy.signal import lfilter
 
 import pumafuse as pf
-from pumafuse import toml
 from pumafuse.arrays import FloatArray
 from pumafuse.filter.response import response
-from pumafuse.identification.best_in_class import ModelFit
-from pumafuse.identification.verify import Trace
+from pumafuse.identification.verify import ModelFit, Trace
 from pumafuse.logs.frames import Rotated
 from pumafuse.model.plants import PLANTS
 from refusals import one_line
@@ -159,32 +156,6 @@ def test_the_best_of_arms_whose_gain_recovers_is_one_of_them() -> None:
     left = measured - moved(arm(best.plant, pf.Gain(intercept=best.gain), best.delay, 0.1))
     assert best.fit.rms == pytest.approx(np.std(left), rel=1e-6)
     assert best.fit.rms > 1.5 * NOISE
-
-
-def test_one_mm_and_one_degree_are_verified_alike() -> None:
-    """Every number of a run relabelled from mm to degrees, in the units of its keys; lags and gains are the same."""
-    to_angle, encoded = np.deg2rad(1.0) / 1e-3, msgspec.json.Encoder(decimal_format="number").encode
-    length, plant, gain = (
-        run_of(moved(arm(SECOND)) + noise()),
-        pf.SecondOrder(natural_frequency=48.0, damping=1.0),
-        GAIN,
-    )
-    turned = pf.Gain(slope=gain.slope / to_angle, intercept=gain.intercept)
-    joint = pf.AxisModel(kind="angle", plant=plant, gain=turned)
-    scaled = run_of((moved(arm(SECOND)) + noise()) * to_angle, BINARY * to_angle)
-    one = only(length, arm(plant))
-    other = only(scaled, pf.ArmModel(name="joint", update_period=PERIOD, delay=DELAY, axes={"tip": joint}))
-    assert (one.kind, other.kind) == ("length", "angle")
-    ours, theirs = (json.loads(encoded(toml.reported(each, each.kind))) for each in (other, one))
-    assert ours["model"]["rms_deg"] == pytest.approx(theirs["model"]["rms_mm"], rel=1e-9)
-    assert [ours["amplitude_deg"], ours["start_deg"]] == pytest.approx([8.0, 556.0], rel=1e-9)
-    assert ours["lag_ms"] == pytest.approx(theirs["lag_ms"], rel=1e-9)
-    best = [each["best_in_class"] for each in (ours, theirs)]
-    for key in ("lag_ms", "lag_ms_ci95", "delay_ms", "gain"):
-        assert best[0][key] == pytest.approx(best[1][key], rel=1e-5), key
-    assert best[0]["fit"]["rms_deg"] == pytest.approx(best[1]["fit"]["rms_mm"], rel=1e-7)
-    assert best[0]["plant"]["plant"] == "second-order"
-    assert one.verdict == other.verdict.replace(" deg are left", " mm are left")
 
 
 # ---- the best in class ----------------------------------------------------------------------------------------------

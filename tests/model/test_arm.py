@@ -109,7 +109,7 @@ def load(tmp_path: Path):
     return from_text
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(arm=arms)
 def test_arm_toml_loses_nothing(tmp_path_factory: pytest.TempPathFactory, arm: ArmModel) -> None:
     """Any arm, with any optional key and any finite numbers, comes back from its file to the last bit."""
@@ -120,7 +120,7 @@ def test_arm_toml_loses_nothing(tmp_path_factory: pytest.TempPathFactory, arm: A
     assert again.to_toml() == path.read_text(encoding="utf-8")
 
 
-@settings(max_examples=200)
+@settings(max_examples=60)
 @given(value=st.floats(1e-6, 1e6))
 def test_numbers_are_converted_without_rounding_twice(tmp_path_factory: pytest.TempPathFactory, value: float) -> None:
     """What stands in a file in ms is the float nearest to its thousandth in seconds."""

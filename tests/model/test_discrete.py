@@ -109,7 +109,7 @@ DELAYS = st.one_of(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(plant=plants, period=periods, periods_late=DELAYS, seed=st.integers(0, 2**32 - 1))
 @example(plant=TANGENTIAL, period=0.028, periods_late=0.06045 / 0.028, seed=0)
 @example(plant=RADIAL, period=0.028, periods_late=0.0385 / 0.028, seed=0)
@@ -137,7 +137,7 @@ def test_as_many_past_inputs_as_are_needed(late: float, past: int) -> None:
     assert np.abs(np.sort_complex(model.poles)[:-2]).max(initial=0.0) <= 1e-12
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(omega=powers(-1.0, 5.0), damping=powers(-2.0, 3.0), interval=powers(-6.0, 5.0))
 @example(omega=0.1, damping=1.0, interval=DAY)
 @example(omega=1e5, damping=1 - 1e-9, interval=MICROSECOND)
@@ -159,19 +159,6 @@ def test_many_intervals_at_once_are_each_its_own(plant: Plant) -> None:
             np.testing.assert_allclose(all_at_once[index], alone, rtol=1e-13, atol=0.0)
     for part, expected in zip(together, (np.eye(n), np.zeros((n, 1)), np.zeros((n, n))), strict=True):
         assert (part[0, 0] == expected).all()
-
-
-@pytest.mark.parametrize("drift", [None, 4e-4])
-@pytest.mark.parametrize("late", [0.0, 2.16])
-@pytest.mark.parametrize("plant", [TANGENTIAL, RADIAL], ids=["second-order", "first-order"])
-def test_noise_grows_as_the_integral_of_the_impulse_response(plant: Plant, late: float, drift: float | None) -> None:
-    """After n ticks the variance of p is q ∫ g² over n·T, not delayed, and drift²·n·T on top."""
-    model = discretize(plant, 0.028, late * 0.028, input_noise=3e-5, drift=drift)
-    P = np.zeros_like(model.F)
-    for n in range(1, 12):
-        P = model.F @ P @ model.F.T + model.Q
-        noise = 3e-5**2 * exact_transition(plant, n * 0.028)[2][0, 0] + (drift or 0.0) ** 2 * n * 0.028
-        assert (model.H @ P @ model.H.T).item() == pytest.approx(noise, rel=1e-11)
 
 
 def test_an_offset_stays_and_is_measured() -> None:

@@ -95,19 +95,6 @@ def test_a_scenario_of_both_kinds_is_what_it_says(tmp_path: Path) -> None:
     assert run.kinds["yaw"] == "angle"
 
 
-def test_error_bars_of_a_simulated_angle_hold(tmp_path: Path) -> None:
-    """95 % of the errors lie within the error bars, over five runs of 12 s: 90 to 98 %."""
-    text = SCENARIO.replace("[true_arm.yaw]\nbacklash_deg = 0.05\n", "").replace("bias_deg = { yaw = 1.0 }\n", "")
-    scenario = load(tmp_path, text)
-    inside: list[float] = []
-    for seed in range(5):
-        made = pf.simulate(scenario, seed)
-        score = pf.summarise(pf.fuse(made.run, made.config)).axes["yaw"].score
-        assert score is not None and score.rmse_deg < 0.7
-        inside.append(score.coverage)
-    assert 0.90 < np.mean(inside) < 0.98
-
-
 WRONG = {
     "amplitude of a length": (
         ("amplitude_deg", "amplitude_mm"),

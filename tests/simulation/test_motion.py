@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from draws import OneDraw
 from pumafuse.filter.response import response
 from pumafuse.fusion.config import Process
 from pumafuse.model.arm import AxisModel, Gain, Sag
 from pumafuse.model.plants import FirstOrder, SecondOrder
-from pumafuse.simulation.grid import POINTS, grid
-from pumafuse.simulation.motion import Motion, simulate_axis
+from pumafuse.simulation.motion import POINTS, Motion, grid, simulate_axis
 from pumafuse.simulation.true_arm import GainCurve, TrueArm, TrueAxis
 
 Floats = NDArray[np.float64]
@@ -277,23 +277,6 @@ def covariance(axis: TrueAxis, q: Sequence[float], changes: Sequence[float], wan
         g = np.array([[C @ expm(A * (t - s)) @ B if t >= end else 0.0 for s in at] for t in wanted])
         found += density * 0.5 * (end - start) * (g * weight) @ g.T
     return found
-
-
-class OneDraw:
-    """A generator, and all that spawn from it, whose every number is 0 but for one, which is 1."""
-
-    def __init__(self, chosen: int) -> None:
-        self.left = chosen
-
-    def spawn(self, count: int) -> list[OneDraw]:
-        return [self] * count
-
-    def standard_normal(self, size: Any = None) -> Any:
-        drawn = np.zeros(1 if size is None else size)
-        if 0 <= self.left < drawn.size:
-            drawn.flat[self.left] = 1.0
-        self.left -= drawn.size
-        return drawn if size is not None else float(drawn[0])
 
 
 def drawn_covariance(

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 import pumafuse as pf
+from draws import OneDraw
 from pumafuse.simulation import reverting
-from pumafuse.simulation.grid import grid
 from pumafuse.simulation.motion import Motion, simulate_axis
 from pumafuse.simulation.sensing import measure
 from pumafuse.simulation.true_arm import TrueAxis
@@ -32,20 +32,6 @@ def matern(apart: Floats, length: float) -> Floats:
 
 def ornstein_uhlenbeck(apart: Floats, length: float) -> Floats:
     return SD**2 * np.exp(-apart / length)
-
-
-class OneDraw:
-    """A generator whose numbers are all 0 but for one, which is 1."""
-
-    def __init__(self, chosen: int) -> None:
-        self.left = chosen
-
-    def standard_normal(self, size: Any) -> Floats:
-        drawn = np.zeros(size)
-        if 0 <= self.left < drawn.size:
-            drawn.flat[self.left] = 1.0
-        self.left -= drawn.size
-        return drawn
 
 
 @pytest.mark.parametrize("length", [0.002, 0.3, 1e4])
@@ -86,17 +72,6 @@ def test_a_disturbance_is_the_process_of_its_sd_and_time(kind: str, process: Any
     own = np.random.default_rng(7).spawn(5)[4]
     expected = process(disturbed.time, SD, 0.2, own)
     assert disturbed.position - moved(7).position == pytest.approx(expected, abs=1e-14)
-
-
-def test_an_axis_is_disturbed_from_its_start_on_and_nothing_else_changes() -> None:
-    """Motion with a disturbance = motion without + the process; variance and covariance over 400 seeds within 4 se."""
-    instants = grid(5, 0.028)
-    for kind, expected in (("matern", matern), ("ou", ornstein_uhlenbeck)):
-        d = np.array([moved(seed, kind, SD).at(instants) - moved(seed).at(instants) for seed in range(400)]) / SD
-        for place in (0, 150, 300):
-            assert np.mean(d[:, place] ** 2) == pytest.approx(1.0, abs=4.0 * (2.0 / 400) ** 0.5)
-        late = float(instants[150] / 1e9)
-        assert np.mean(d[:, 0] * d[:, 150]) == pytest.approx(expected(late, 0.2) / SD**2, abs=4.0 * (2.0 / 400) ** 0.5)
 
 
 def test_a_sensor_drifts_on_each_axis_by_itself() -> None:

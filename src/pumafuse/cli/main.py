@@ -196,48 +196,6 @@ def simulate(
 
 
 @app.command()
-def plan(
-    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the sequences go.")],
-    axes: Annotated[str | None, Option(metavar="A,B", help="Default: the arm's, or the paper's three.")] = None,
-    speeds: Annotated[
-        str | None,
-        Option(
-            metavar="M_S,...",
-            help="Speeds of the steps, each the step over the period; default: 0.071,0.14,0.28,0.68. Of an --arm whose"
-            " axes are angles in degrees/s; default: 7.1,14,28,68.",
-        ),
-    ] = None,
-    positions: Annotated[Path | None, Option(metavar="TABLE", help="Where to step, a position a row.")] = None,
-    replicates: Annotated[int, Option(metavar="N", min=1, help="How often each combination is tried.")] = 2,
-    period: Annotated[float | None, Option(metavar="MS", help="Update period; default: the arm's, or 28.")] = None,
-    hold: Annotated[float, Option(metavar="S", help="How long a step is held.")] = 0.5,
-    rest: Annotated[float, Option(metavar="S", help="How long the arm rests before and after it.")] = 0.5,
-    noise: Annotated[
-        str | None,
-        Option(
-            metavar="MM,...",
-            help="Amplitudes of the white noise; empty: none; default: 4,8,14, of angles 0.4,0.8,1.4 degrees.",
-        ),
-    ] = None,
-    noise_duration: Annotated[float, Option(metavar="S", help="Of each white-noise sequence.")] = 4.2,
-    arm: Annotated[str | None, Option(metavar="ARM", help="Check the plan for this arm: arm.toml or preset.")] = None,
-    max_speed: Annotated[
-        float | None, Option(metavar="M_S", help="Limit, of angles in degrees/s; default: the arm's validity.")
-    ] = None,
-    seed: Annotated[int, Option(metavar="N", min=0, help="Of the order and of the noise.")] = 1,
-    force: Force = False,
-) -> None:
-    """Lay out a step campaign and white noise to send to an arm, tick by tick."""
-    from . import plan as command
-
-    _check_positive(period=period, hold=hold, rest=rest, noise_duration=noise_duration, max_speed=max_speed)
-    named, period_s = _names(axes, "--axes"), period and _seconds(period)
-    sizes = _numbers(speeds, "--speeds"), _numbers(noise, "--noise")
-    steps = {"replicates": replicates, "hold": hold, "rest": rest, "noise_duration": noise_duration, "seed": seed}
-    command.run(output, named, period_s, positions, arm, max_speed, *sizes, force, **steps)
-
-
-@app.command()
 def identify(
     source: Annotated[
         list[Path],
@@ -497,16 +455,6 @@ def _names(listed: str | None, option: str = "--sensors") -> list[str] | None:
     if names == []:
         raise BadParameter("names nothing", param_hint=option)
     return names
-
-
-def _numbers(listed: str | None, option: str) -> tuple[float, ...] | None:
-    """Numbers with commas between; None if the option is not given."""
-    if listed is None:
-        return None
-    try:
-        return tuple(float(number) for number in listed.split(",") if number.strip())
-    except ValueError:
-        raise BadParameter(f"expected numbers with commas between, not '{listed}'", param_hint=option) from None
 
 
 def _level(text: str) -> tuple[str, float]:

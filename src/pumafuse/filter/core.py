@@ -57,17 +57,11 @@ class Output(IntEnum):
 
 
 class Model(NamedTuple):
-    """What the filter knows of A axes and S sensors: records of ``pf_axis``, ``pf_sensor`` and ``pf_view``.
+    """What the filter knows of A axes and S sensors: records of ``pf_axis``, ``pf_sensor`` and ``pf_view``."""
 
-    Attributes:
-        axis: (A,).
-        sensor: (S,).
-        view: What each sensor sees of each axis, (S, A).
-    """
-
-    axis: Record
-    sensor: Record
-    view: Record
+    axis: Record  # (A,)
+    sensor: Record  # (S,)
+    view: Record  # what each sensor sees of each axis, (S, A)
 
 
 def struct(counts: Sequence[str], arrays: Sequence[str]) -> type[ctypes.Structure]:
@@ -107,11 +101,7 @@ _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double
 
 
 def _loaded() -> ctypes.CDLL:
-    """The library.
-
-    Raises:
-        PumafuseError: It is not there, does not load, or is of another version.
-    """
+    """The library, of this version."""
     again = "install pumafuse again (in a checkout: make .venv/.ready)"
     try:
         library, held = ctypes.CDLL(str(LIBRARY)), ctypes.PyDLL(str(LIBRARY))
@@ -137,11 +127,7 @@ def at(array: np.ndarray) -> int:
 
 
 def checked(result: Any) -> Any:
-    """What a call returned.
-
-    Raises:
-        PumafuseError: The call failed.
-    """
+    """What a call returned; an error if it failed."""
     if result is None or result < 0:
         raise PumafuseError(f"the filter stops: {library.pf_error().decode()}")
     return result
@@ -189,11 +175,7 @@ class Filter(Handle):
     _free = library.pf_filter_free
 
     def __init__(self, model: Model, origin: int) -> None:
-        """At rest at the instant ``origin`` [ns].
-
-        Raises:
-            PumafuseError: An axis has more states than the core is made for.
-        """
+        """At rest at the instant ``origin`` [ns]."""
         super().__init__(library.pf_filter_new(ctypes.byref(struct_of(model)), origin))
         self._axes = len(model.axis)
 
@@ -205,15 +187,11 @@ class Filter(Handle):
         mode: Literal["filtered", "repeated", "as-live", "smoothed"] = "filtered",
         span: tuple[int, int] | None = None,
     ) -> FloatArray:
-        """Events in their order, and an estimate at each of ``times``.
+        """Events in their order, and an estimate at each of ``times``, int64 ns, ascending, (n,).
 
-        Args:
-            events: All of them.
-            results: Gets what became of each measurement; has the outcomes that are to be ``repeated``.
-            times: Of the estimates, int64 ns, ascending, (n,).
-            mode: What an estimate knows: the events until then (``repeated``: whatever a gate would say), those that
-                had arrived by then, or all of them.
-            span: The first event that is run, and the one after the last; an estimate knows commands behind it, too.
+        An estimate knows the events until then (``repeated``: by the outcomes in ``results``, whatever a gate would
+        say), those that had arrived by then, or all of them. Of a ``span`` from the first event to behind the last it
+        knows commands behind it, too. ``results`` gets what became of each measurement.
 
         Returns:
             Outputs by :class:`Output`, axis and time, (8, A, n).
@@ -234,12 +212,8 @@ def linearise(
 ) -> tuple[FloatArray, FloatArray]:
     """Innovations while the outcomes in ``results`` are repeated, and how they change with k parameters.
 
-    Args:
-        model: Axes and sensors.
-        tangents: The derivatives of all its numbers by each parameter.
-        origin: The first command, int ns.
-        events: In their order.
-        results: Has the outcomes, gets innovations and their sd.
+    ``tangents`` are the derivatives of all numbers of the model by each parameter; ``origin`` is the first command's
+    stamp [ns].
 
     Returns:
         Derivatives of ν and of S, (k, n, A) each.
@@ -254,11 +228,7 @@ def linearise(
 def classify(model: Model, events: Events, origin: int, too_late: BoolArray) -> CodeArray:
     """What each value of a table is before the filter sees it, (n, A).
 
-    Args:
-        model: Axes and sensors.
-        events: In their order.
-        origin: The first command, int ns.
-        too_late: Rows far behind earlier ones, (n,).
+    ``origin`` is the first command's stamp [ns]; rows that are ``too_late``, (n,), come far behind earlier ones.
     """
     known = np.empty_like(events.known)
     structs = ctypes.byref(struct_of(model)), ctypes.byref(_events_of(events))

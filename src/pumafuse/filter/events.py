@@ -66,19 +66,12 @@ class Events(NamedTuple):
 
 
 class Results(NamedTuple):
-    """What became of n events on A axes.
+    """What became of n events on A axes."""
 
-    Attributes:
-        innovation: ν [m], (n, A).
-        innovation_sd: √S [m], (n, A).
-        outcome: Codes of Outcome, (n, A).
-        contradicts: The sensor that a rejected row contradicts time after time, −1 for none, (n,).
-    """
-
-    innovation: FloatArray
-    innovation_sd: FloatArray
-    outcome: CodeArray
-    contradicts: IndexArray
+    innovation: FloatArray  # ν [m], (n, A)
+    innovation_sd: FloatArray  # √S [m], (n, A)
+    outcome: CodeArray  # codes of Outcome, (n, A)
+    contradicts: IndexArray  # the sensor that a rejected row contradicts time after time, −1 for none, (n,)
 
     @staticmethod
     def room(events: int, axes: int) -> Results:

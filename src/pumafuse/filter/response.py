@@ -11,14 +11,7 @@ from .core import AXIS, MOTION, Record, at, library
 
 
 def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Record:
-    """An axis without noise as the core takes it, (1,).
-
-    Args:
-        axis: Plant, gain, fastest speed, play and sag.
-        period: The update period T [s].
-        delay: Td [s].
-        start: The level u₀ [m] at which it rests; NaN where that is not known.
-    """
+    """An axis without noise as the core takes it, (1,): T, Td in s, the level of its rest [m], NaN if not known."""
     found, plant, gain = np.zeros(1, AXIS), axis.plant, axis.gain
     found["period"], found["delay"], found["start"] = period, delay, start
     if isinstance(plant, FirstOrder):
@@ -38,19 +31,10 @@ def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Rec
 def response(
     axis: AxisModel, period: float, delay: float, given: TimeArray, command: FloatArray, start: float, time: TimeArray
 ) -> FloatArray:
-    """The position of an axis that rests until its first command.
+    """The position [m] relative to ``start`` of an axis that rests there until its first command, (n,).
 
-    Args:
-        axis: Plant, gain, fastest speed, play and sag.
-        period: The update period T [s].
-        delay: Td [s].
-        given: When each command is given, int64 ns, ascending, (k,).
-        command: u [m], (k,).
-        start: The level u₀ [m] at which the axis rests.
-        time: Asked for, int64 ns, ascending, (n,).
-
-    Returns:
-        The position [m] relative to ``start``, (n,).
+    Period T and delay Td are in s; a command u [m] is ``given`` at int64 ns, ascending, (k,); the position is asked for
+    at each ``time``, int64 ns, ascending, (n,).
     """
     position = np.empty(len(time))
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
@@ -67,19 +51,11 @@ def at_rest() -> Record:
 
 
 def follow(axis: Record, motion: Record, given: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
-    """The position of an axis from what it does after a command on.
+    """The position [m] of an axis from what it does after a command on, (n,).
 
-    No bit of it depends on what else is asked for, or on the pieces in which commands come.
-
-    Args:
-        axis: Of :func:`record_of`, with a start level of 0, (1,).
-        motion: What it does, (1,); becomes that after the last command.
-        given: When each further command is given, int64 ns, ascending, (k,).
-        command: u [m] relative to the level at which the axis rested, (k,).
-        time: Asked for, int64 ns, ascending, (n,).
-
-    Returns:
-        The position [m], relative likewise, (n,).
+    No bit of it depends on what else is asked for, or on the pieces in which commands come. The axis, (1,), is of
+    :func:`record_of`, with a start level of 0; its ``motion``, (1,), becomes that after the last command. A command u
+    [m] relative to the level of its rest is ``given`` at int64 ns, ascending, (k,); ``time`` likewise, (n,).
     """
     position = np.empty(len(time))
     library.pf_follow(at(axis), at(motion), len(given), at(given), at(command), len(time), at(time), at(position))

@@ -70,13 +70,7 @@ class Window(Handle):
         return None if origin == NEVER else origin
 
     def add(self, stamp: int, source: int, given: int, oldest: int) -> bool:
-        """Take in an event.
-
-        Args:
-            stamp: Int ns.
-            source: ``COMMAND``, or which sensor.
-            given: The axes that it gives, as bits.
-            oldest: No event stamped before will ever come [ns].
+        """Take in an event whose axes are ``given`` as bits; no event stamped before ``oldest`` will ever come [ns].
 
         Returns:
             False if to make room the window had to let go of its time.
@@ -87,13 +81,9 @@ class Window(Handle):
     def estimate(self, time: int, after: int = NEVER) -> list[tuple[list[float], int] | None]:
         """Every axis at an instant [ns] by all measurements valid until then; nothing changes.
 
-        Args:
-            time: The instant.
-            after: What is stamped later [ns] is as if it had not come.
-
-        Returns:
-            For each axis what :class:`.core.Output` has, in the stream's own coordinates and SI, and when the last
-            measurement was valid that it knows of [ns]; None as long as the axis has no start level.
+        What is stamped ``after`` [ns] is as if it had not come. For each axis what :class:`.core.Output` has, in the
+        stream's own coordinates and SI, and when the last measurement was valid that it knows of [ns]; None as long as
+        the axis has no start level.
         """
         library.pf_live_estimate(self._core, time, after, *self._found)
         rows = zip(self._outputs.T.tolist(), self._fused.tolist(), strict=True)
@@ -111,12 +101,8 @@ class Window(Handle):
         library.pf_live_forget(self._core, after)
 
     def amend(self, sensor: int, stamp: TimeArray, before: FloatArray, now: FloatArray) -> None:
-        """Change measurements that are known better now.
+        """Change measurements of a sensor, stamped int64 ns, (n,), that are known better now.
 
-        Args:
-            sensor: Which one.
-            stamp: Of its rows, int64 ns, (n,).
-            before: Their values and spreads as they were put in, (n, 2 A); what has other values stays as it is.
-            now: As they are now, (n, 2 A).
+        Their values and spreads as put in and as they are ``now`` are (n, 2 A); what had others stays as it is.
         """
         library.pf_live_amend(self._core, sensor, len(stamp), at(stamp), at(before), at(now))

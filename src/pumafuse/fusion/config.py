@@ -19,8 +19,7 @@ from .. import toml
 from ..errors import ConfigError, UnknownNameError, shortened, suggestion
 from ..logs.frames import CARTESIAN, Frame
 from ..logs.manifest import Robot, chain_of
-from ..model.arm import ArmModel, arm_of
-from ..model.presets import PRESETS
+from ..model.arm import PRESETS, ArmModel, arm_of
 from ..space import rotations
 from ..space.rotations import TURNING
 from ..toml import NotNegative, Positive, Time

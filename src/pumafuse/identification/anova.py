@@ -7,7 +7,6 @@ with all factors at once, which an unbalanced design needs.
 
 from __future__ import annotations
 
-import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -18,6 +17,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray
 from ..model.arm import Validity
 from ..units import MM, SCREEN, Kind, of_kind
+from .estimate import weighted
 from .trials import Trial
 
 _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
@@ -40,23 +40,16 @@ class Dependence(msgspec.Struct, frozen=True, kw_only=True):
     """Whether one coefficient depends on one factor.
 
     Attributes:
-        coefficient: With its unit.
-        factor: What was varied.
-        levels: The coefficient at each level.
         i_ratio: F over the 95 % point of its distribution; above 1 is dependent. Null where it cannot be computed.
-        p: Of that F.
-        welch_p: Of Welch's test, which does not assume equal variances.
-        adjusted_p: Of the factor beside all the others; null where they are confounded.
-        verdict: In words.
     """
 
-    coefficient: str
-    factor: str
-    levels: list[Level]
+    coefficient: str  # with its unit
+    factor: str  # what was varied
+    levels: list[Level]  # the coefficient at each level
     i_ratio: float | None
-    p: float | None
-    welch_p: float | None
-    adjusted_p: float | None
+    p: float | None  # of that F
+    welch_p: float | None  # of Welch's test, which does not assume equal variances
+    adjusted_p: float | None  # of the factor beside all the others; null where they are confounded
     verdict: str
 
 
@@ -64,48 +57,29 @@ class Scatter(msgspec.Struct, frozen=True, kw_only=True):
     """Scatter of one coefficient on one axis, in its unit.
 
     Attributes:
-        coefficient: With its unit.
-        axis: Of the trials.
-        median: Over the trials.
         normal_p: Of a Shapiro-Wilk test; small: not normally distributed, so do not trust means and i-ratios alone.
-        outlying: Trials further from the median than eight robust standard deviations.
-        replicate_sd: Between trials of the same settings; null where none were repeated.
-        own_sd: By the noise within a trial (median over the trials).
     """
 
-    coefficient: str
-    axis: str
-    median: float
+    coefficient: str  # with its unit
+    axis: str  # of the trials
+    median: float  # over the trials
     normal_p: float | None
-    outlying: list[str]
-    replicate_sd: float | None
-    own_sd: float
+    outlying: list[str]  # trials further from the median than eight robust standard deviations
+    replicate_sd: float | None  # between trials of the same settings; null where none were repeated
+    own_sd: float  # by the noise within a trial (median over the trials)
 
 
 class Performance(msgspec.Struct, frozen=True, kw_only=True):
-    """Error of the combined model by one factor.
+    """Error of the combined model by one factor."""
 
-    Attributes:
-        factor: What was varied.
-        levels: RMS [mm or degrees] of the trials at each level.
-        limit: Where the mean RMS passes the tolerance, in the factor's unit; null where it does not.
-        verdict: In words.
-    """
-
-    factor: str
-    levels: list[Level]
-    limit: float | None
+    factor: str  # what was varied
+    levels: list[Level]  # RMS [mm or degrees] of the trials at each level
+    limit: float | None  # where the mean RMS passes the tolerance, in the factor's unit; null where it does not
     verdict: str
 
 
 def factors_of(trials: Sequence[Trial], period: float, kind: Kind) -> dict[str, list[str]]:
-    """The level of each trial for every factor that varies and is no mere counter.
-
-    Args:
-        trials: All that are analysed together.
-        period: T [s], for a speed that is not recorded.
-        kind: What the axes are.
-    """
+    """The level of each trial for every factor that varies and is no mere counter; T [s] for speeds not recorded."""
     speeds = speed_levels(trials, period, kind)
     columns = {"axis": [trial.axis for trial in trials], of_kind("speed_m_s", kind): speeds}
     for name in trials[0].factors:
@@ -147,33 +121,21 @@ def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
 
 
 def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:
-    """Analyse every coefficient against every factor.
-
-    Args:
-        coefficients: By name, each (trials,).
-        factors: By name, the level of each trial.
-    """
+    """Every coefficient, (trials,), against every factor, the level of each trial."""
     pairs = product(coefficients.items(), factors)
     return [_dependence(coefficient, values, factor, factors) for (coefficient, values), factor in pairs]
 
 
 def welch(groups: Sequence[FloatArray]) -> float | None:
     """P of the hypothesis that groups have one mean, whatever their variances; None where it cannot be tested."""
-    from statsmodels.stats.oneway import anova_oneway
+    from scipy.stats import f_oneway
 
     usable = [group for group in groups if len(group) > 1 and np.ptp(group) > 0.0]
-    return float(anova_oneway(usable, use_var="unequal").pvalue) if len(usable) > 1 else None
+    return float(f_oneway(*usable, equal_var=False).pvalue) if len(usable) > 1 else None
 
 
 def scatter(coefficient: str, trials: Sequence[Trial], values: FloatArray, sd: FloatArray) -> Scatter:
-    """Scatter of a coefficient among the trials of one axis.
-
-    Args:
-        coefficient: Its name.
-        trials: The trials.
-        values: The coefficient of each, (n,).
-        sd: Its standard deviation by the noise within the trial, (n,).
-    """
+    """Scatter of a coefficient, ``values`` (n,), among trials of one axis; ``sd`` is by the noise within each, (n,)."""
     from scipy.stats import shapiro
 
     normal = float(shapiro(values).pvalue) if len(values) >= 3 and np.ptp(values) > 0.0 else None
@@ -189,11 +151,9 @@ def scatter(coefficient: str, trials: Sequence[Trial], values: FloatArray, sd: F
 
 
 def outlying(values: FloatArray, sd: FloatArray) -> BoolArray:
-    """Which values are further than eight robust standard deviations (1.4826 MAD) from the median, (n,).
+    """Which values (n,) are further than eight robust standard deviations (1.4826 MAD) from the median, (n,).
 
-    Args:
-        values: One of each trial, (n,).
-        sd: Standard deviation of each by the noise within its trial, which widens the limit, (n,).
+    The ``sd`` of each by the noise within its trial, (n,), widens the limit.
     """
     from scipy.stats import median_abs_deviation
 
@@ -207,14 +167,7 @@ def outlying(values: FloatArray, sd: FloatArray) -> BoolArray:
 def performances(
     factors: Mapping[str, Sequence[str]], rms: FloatArray, tolerance: float, kind: Kind
 ) -> list[Performance]:
-    """Error of a model by each factor.
-
-    Args:
-        factors: By name, the level of each trial, (n,).
-        rms: Of the model's residuals in each trial [m or rad], (n,).
-        tolerance: RMS beyond which it is not called valid [m or rad].
-        kind: What the axes are.
-    """
+    """Error of a model by each factor: ``rms`` of each trial's residuals, (n,), and ``tolerance``, both [m or rad]."""
     screen, found = SCREEN[kind], list[Performance]()
     for factor, cells in factors.items():
         levels = levels_of(rms * screen.scale, cells)
@@ -236,10 +189,7 @@ def _levels(cells: Sequence[str]) -> list[str]:
 def validity(performance: Sequence[Performance], fastest: float, kind: Kind) -> Validity:
     """Limits that `fuse` can check: speed, and distance from the base where a factor is called radius_mm.
 
-    Args:
-        performance: By each factor.
-        fastest: Speed of the fastest trial [m/s or rad/s], the limit where no factor gives one.
-        kind: What the axes are.
+    The speed of the ``fastest`` trial [m/s or rad/s] is the limit where no factor gives one.
     """
     limits = {one.factor: one.limit for one in performance}
     radius, found = limits.get("radius_mm"), limits.get(of_kind("speed_m_s", kind))
@@ -291,22 +241,17 @@ def _dependence(coefficient: str, values: FloatArray, factor: str, factors: Mapp
 
 def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
     """P of one factor in a model with all of them (main effects)."""
-    from statsmodels.regression.linear_model import OLS
-
-    rest = _design(len(values), [cells for name, cells in factors.items() if name != factor])
-    whole = np.column_stack((rest, _design(len(values), [factors[factor]])[:, 1:]))
-    with warnings.catch_warnings():  # of dependent columns: the rank shows confounded factors
-        warnings.simplefilter("ignore")
-        full, reduced = OLS(values, whole).fit(), OLS(values, rest).fit()
-    if full.df_resid < 1 or full.df_resid == reduced.df_resid or full.ssr <= 1e-24 * float(values @ values):
+    without = {name: cells for name, cells in factors.items() if name != factor}
+    full, reduced = (weighted(values, np.ones(len(values)), _design(values, one)) for one in (factors, without))
+    if full.freedom < 1 or full.freedom == reduced.freedom or full.squares <= 1e-24 * float(values @ values):
         return None
-    return float(full.compare_f_test(reduced)[1])
+    return full.p_against(reduced)
 
 
-def _design(rows: int, factors: Sequence[Sequence[str]]) -> FloatArray:
-    """A one, and for each factor a column for each level but its first, (rows, k)."""
-    columns = [np.ones(rows)]
-    for cells in factors:
+def _design(values: FloatArray, factors: Mapping[str, Sequence[str]]) -> FloatArray:
+    """A one, and for each factor a column for each level but its first, (n, k)."""
+    columns = [np.ones(len(values))]
+    for cells in factors.values():
         columns.extend(np.array(cells) == level for level in ordered(set(cells))[1:])
     return np.column_stack(columns).astype(np.float64)
 

@@ -43,38 +43,23 @@ class Point(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """Normal equations in q (and p) of each row with its delay eliminated.
+    """Normal equations in q (and p) of each row with its delay eliminated."""
 
-    Attributes:
-        shift: Gauss-Newton step of the delay when q and p stay [s], (R,).
-        coupling: −∂delay/∂(q, p), (R, k).
-        information: (R, k, k).
-        score: (R, k).
-        delay_sd: Of each delay under a given plant for unit noise, infinite where it has no effect, (R,).
-    """
-
-    shift: FloatArray
-    coupling: FloatArray
-    information: FloatArray
-    score: FloatArray
-    delay_sd: FloatArray
+    shift: FloatArray  # Gauss-Newton step of the delay when q and p stay [s], (R,)
+    coupling: FloatArray  # −∂delay/∂(q, p), (R, k)
+    information: FloatArray  # (R, k, k)
+    score: FloatArray  # (R, k)
+    delay_sd: FloatArray  # of each delay under a given plant for unit noise, infinite where it has no effect, (R,)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """R trials, padded to one length m.
+    """R trials, padded to one length m."""
 
-    Attributes:
-        time: [s] since the command, (R, m).
-        position: [m], (R, m).
-        weight: 0 where a trial has no sample, else the same for all its samples, (R, m).
-        count: Samples of each, (R,).
-    """
-
-    time: FloatArray
-    position: FloatArray
-    weight: FloatArray
-    count: FloatArray
+    time: FloatArray  # [s] since the command, (R, m)
+    position: FloatArray  # [m], (R, m)
+    weight: FloatArray  # 0 where a trial has no sample, else the same for all its samples, (R, m)
+    count: FloatArray  # samples of each, (R,)
 
     @staticmethod
     def of(trials: Sequence[Trial], weights: Sequence[float]) -> Batch:
@@ -120,14 +105,9 @@ class Batch:
         return raw - share[:, :, None] * at.unit, -share
 
     def equations(self, at: Point, slopes: FloatArray, damping: FloatArray | float = 0.0) -> Equations:
-        """Normal equations of q and p with the delays eliminated.
+        """Normal equations of q and p with the delays eliminated, whose own steps are damped.
 
         A delay takes no part where it has no effect, or where its bound 0 is active.
-
-        Args:
-            at: Where.
-            slopes: There, from :meth:`slopes`.
-            damping: Of the delays' own steps.
         """
         own = np.einsum("ij,ij->i", slopes[0], slopes[0])
         gradient = np.einsum("ij,ij->i", slopes[0], at.residual)
@@ -143,15 +123,7 @@ class Batch:
         return Equations(gradient / own, coupling, information, score, delay_sd)
 
     def stepped(self, at: Point, order: Order, damping: FloatArray, low: FloatArray, high: FloatArray) -> Point:
-        """After a Gauss-Newton step of each group of rows, between ``low`` and ``high``, (3,).
-
-        Args:
-            at: Before it.
-            order: Of the plant.
-            damping: Of each group, (R / size,).
-            low: Least delay, q and p.
-            high: Most.
-        """
+        """After a step of each group of rows, whose ``damping`` is (R / size,), between ``low`` and ``high`` (3,)."""
         size = len(at.shape) // len(damping)
         slopes, _ = self.slopes(at, order)
         own = self.equations(at, slopes, np.repeat(damping, size))

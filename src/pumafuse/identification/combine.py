@@ -18,7 +18,7 @@ from ..model.plants import PLANTS, FirstOrder
 from ..units import MS, SCREEN, Kind
 from .anova import ordered, outlying, speed_levels
 from .batch import Order
-from .estimate import Estimate, common, mean, regression, robust
+from .estimate import Estimate, common, mean, regression, robust, weighted
 from .fit import StepFit, doubt, least_p, plant_of
 from .joint import JointFit, fit_together, inverse_square
 from .paper import minimise
@@ -41,22 +41,16 @@ class OrderChoice(msgspec.Struct, frozen=True, kw_only=True):
     """First or second order.
 
     Attributes:
-        order: The choice.
         first_rms: Root mean square residual of first order over all trials [m or rad].
-        second_rms: Of second order [m or rad].
-        f: Of the F-test of the additional parameters of second order.
-        p: Of that F.
-        aicc_gain: By how much second order lowers AICc; negative: it raises it. Null: too few samples.
         inverse_square: 1/ω² [s²] with its interval by trials; 0 is first order.
-        why: In words.
     """
 
     order: Order
     first_rms: float = msgspec.field(name="first_rms_mm")
-    second_rms: float = msgspec.field(name="second_rms_mm")
-    f: float
-    p: float
-    aicc_gain: float | None
+    second_rms: float = msgspec.field(name="second_rms_mm")  # of second order [m or rad]
+    f: float  # of the F-test of the additional parameters of second order
+    p: float  # of that F
+    aicc_gain: float | None  # by how much second order lowers AICc; negative: it raises it. Null: too few samples.
     inverse_square: Estimate = msgspec.field(name="inverse_square_s2")
     why: str
 
@@ -65,13 +59,11 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
     """Three delays [s].
 
     Attributes:
-        lag: Behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω.
-        fitted: Td of the model.
         onset: When the arm is first seen to move: above 3 standard deviations and 2 % of the step; null: never.
     """
 
-    lag: Estimate = msgspec.field(name="lag_ms")
-    fitted: Estimate = msgspec.field(name="fitted_ms")
+    lag: Estimate = msgspec.field(name="lag_ms")  # behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω
+    fitted: Estimate = msgspec.field(name="fitted_ms")  # Td of the model
     onset: Estimate | None = msgspec.field(name="onset_ms")
 
 
@@ -107,40 +99,22 @@ class CombinedAxis(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Common:
-    """The common plant of an axis, and delay and gain of each trial under it; arrays (n,).
+    """The common plant of an axis, and delay and gain of each trial under it; arrays (n,)."""
 
-    Attributes:
-        trials: That it is made of.
-        choice: Of the order.
-        plant: Of that order.
-        lag: 2ζ/ω, or τ, plus each trial's influence on it [s].
-        delay: Td of each trial [s].
-        delay_sd: Its standard deviation by the noise [s].
-        gain: K of each trial.
-        gain_sd: Its standard deviation by the noise.
-    """
-
-    trials: Sequence[Trial]
+    trials: Sequence[Trial]  # that it is made of
     choice: OrderChoice
     plant: PLANTS
-    lag: FloatArray
-    delay: FloatArray
-    delay_sd: FloatArray
-    gain: FloatArray
-    gain_sd: FloatArray
+    lag: FloatArray  # 2ζ/ω, or τ, plus each trial's influence on it [s]
+    delay: FloatArray  # Td of each trial [s]
+    delay_sd: FloatArray  # its standard deviation by the noise [s]
+    gain: FloatArray  # K of each trial
+    gain_sd: FloatArray  # its standard deviation by the noise
 
 
 def combine(fitted: Sequence[Fitted], period: float, paper: bool, kind: Kind) -> tuple[CombinedAxis, Common] | str:
-    """Combine the trials of one axis.
+    """The model of one axis from its trials, or why there is none; the period T is in s.
 
-    Args:
-        fitted: The trials with their fits.
-        period: T [s].
-        paper: Average as the paper does, with all outliers, and with delay and gain as read off.
-        kind: What the axis is.
-
-    Returns:
-        The model, or why there is none.
+    ``paper``: average as the paper does, with all outliers, and with delay and gain as read off.
     """
     usual = usual_gain(fitted)
     if usual == 0.0:
@@ -293,18 +267,11 @@ def _choose(
     inverse_square: Estimate,
     kind: Kind,
 ) -> OrderChoice:
-    """Choose the order by F-test, AICc and the interval of 1/ω².
+    """Choose the order by F-test, AICc and the interval of 1/ω² [s²].
 
     Second order is chosen if the F-test (5 %) and AICc prefer it and the interval of 1/ω² by trials lies above 0:
-    samples of one trial are not independent, trials are.
-
-    Args:
-        squares: Sum of squared residuals of first and second order, in units of noise or not.
-        parameters: How many each has.
-        samples: In all trials.
-        rms: Of the residuals of each [m or rad].
-        inverse_square: 1/ω² [s²].
-        kind: What the axis is.
+    samples of one trial are not independent, trials are. ``squares``, ``parameters`` and ``rms`` [m or rad] are those
+    of first and second order; ``samples`` are in all trials.
     """
     from scipy.stats import f as fisher
 
@@ -343,8 +310,6 @@ def _choose(
 
 def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | None, str]:
     """K = a·speed + b with intervals, the p of its lack of fit, and what the line shows."""
-    from statsmodels.regression.linear_model import WLS
-
     speed, levels = np.array([one.speed_at(period) for one in found.trials]), speed_levels(found.trials, period, kind)
     distinct = ordered(set(levels))
     if len(distinct) == 1 or len(speed) < 4:
@@ -354,8 +319,8 @@ def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | 
         )
         return Gain(slope=0.0, intercept=level.value, intercept_ci95=level.ci95), None, f"slope 0: {why}"
     line = regression(found.gain, found.gain_sd, np.column_stack((np.ones(len(speed)), speed)))
-    (b_low, b_high), (a_low, a_high) = line.conf_int().tolist()
-    b, a = line.params.tolist()
+    (b_low, b_high), (a_low, a_high) = line.ci95.tolist()
+    b, a = line.values.tolist()
     gain = Gain(slope=a, intercept=b, slope_ci95=(a_low, a_high), intercept_ci95=(b_low, b_high))
     words = "the slope is not significant"
     if a_low > 0.0 or a_high < 0.0:
@@ -363,6 +328,6 @@ def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | 
     if not 2 < len(distinct) < len(speed):
         return gain, None, words
     at_levels = np.array(levels)[:, None] == np.array(distinct)
-    apart = WLS(found.gain, at_levels.astype(np.float64), weights=line.model.weights).fit()
-    lack = float(apart.compare_f_test(line)[1])  # p of the hypothesis that the means of all levels lie on the line
+    apart = weighted(found.gain, line.weights, at_levels.astype(np.float64))
+    lack = apart.p_against(line)  # of the hypothesis that the means of all levels lie on the line
     return gain, lack, words + ("; not along a straight line" if lack < 0.05 else "")

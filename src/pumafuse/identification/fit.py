@@ -36,17 +36,11 @@ _MOVES = 0.5  # share of the usual gain below which an arm has hardly moved
 
 
 class Shape(NamedTuple):
-    """The nonlinear parameters of a response.
+    """The nonlinear parameters of a response."""
 
-    Attributes:
-        delay: Td [s].
-        q: 2ζ/ω, or τ [s].
-        p: 1/ω², 0 of a first-order plant [s²].
-    """
-
-    delay: float
-    q: float
-    p: float
+    delay: float  # Td [s]
+    q: float  # 2ζ/ω, or τ [s]
+    p: float  # 1/ω², 0 of a first-order plant [s²]
 
 
 class Intervals(NamedTuple):
@@ -63,26 +57,18 @@ class StepFit:
     """The best response of one order.
 
     Attributes:
-        order: 1 or 2.
-        shape: Delay, q and p.
-        gain: K.
-        zero: z₀ [m].
-        rms: Of the residuals [m], eq. 10.
-        samples: How many were fitted.
         covariance: Of delay, q, p, K and z₀, (5, 5); 0 for what was not fitted, infinite where it is not identifiable.
-        reached: Share of its final value that the response has reached with the last sample.
-        parameters: How many were fitted.
     """
 
-    order: Order
-    shape: Shape
+    order: Order  # 1 or 2
+    shape: Shape  # delay, q and p
     gain: float
-    zero: float
-    rms: float
-    samples: int
+    zero: float  # z₀ [m]
+    rms: float  # of the residuals [m], eq. 10
+    samples: int  # how many were fitted
     covariance: FloatArray
-    reached: float
-    parameters: int
+    reached: float  # share of its final value that the response has reached with the last sample
+    parameters: int  # how many were fitted
 
     @property
     def squares(self) -> float:
@@ -135,10 +121,9 @@ class StepFit:
 
 
 def fit_steps(trials: Sequence[Trial]) -> list[tuple[StepFit, StepFit]]:
-    """Fit each trial by itself with plants of both orders; delay, gain and zero are free.
+    """Each trial by itself with plants of first and second order; delay, gain and zero are free.
 
-    Returns:
-        First and second order of each trial. Second order never fits worse than first: that is its p = 0.
+    Second order never fits worse than first: that is its p = 0.
     """
     batch = Batch.of(trials, [1.0 / abs(trial.step) for trial in trials])
     starts = np.stack([_starts(trial) for trial in trials], axis=2)

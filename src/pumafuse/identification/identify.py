@@ -34,40 +34,25 @@ class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
     """One trial's fit of one order; plant parameters of the other order are null, as are infinite ends of intervals.
 
     Attributes:
-        lag: Td + τ, or Td + 2ζ/ω [s]: behind the held command at constant velocity.
-        lag_ci95: Its 95 % interval [s].
-        gain: K.
-        gain_ci95: Its interval.
-        delay: Td [s].
-        delay_ci95: Its interval.
-        time_constant: τ [s].
-        time_constant_ci95: Its interval.
-        natural_frequency: ω [rad/s].
         natural_frequency_ci95: Its interval.
-        damping: ζ.
-        damping_ci95: Its interval.
-        rms: Of the residuals, eq. 10 [m or rad].
-        rms_percent: Of the step.
-        fit_percent: 100 (1 − ‖residuals‖ / ‖position without its mean‖).
-        flags: What to know before trusting it.
     """
 
-    lag: float = msgspec.field(name="lag_ms")
+    lag: float = msgspec.field(name="lag_ms")  # Td + τ, or Td + 2ζ/ω [s]: behind the held command at constant velocity
     lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
     gain: float
     gain_ci95: Interval
-    delay: float = msgspec.field(name="delay_ms")
+    delay: float = msgspec.field(name="delay_ms")  # Td [s]
     delay_ci95: Interval = msgspec.field(name="delay_ms_ci95")
-    time_constant: float | None = msgspec.field(name="time_constant_ms", default=None)
+    time_constant: float | None = msgspec.field(name="time_constant_ms", default=None)  # τ [s]
     time_constant_ci95: Interval | None = msgspec.field(name="time_constant_ms_ci95", default=None)
-    natural_frequency: float | None = msgspec.field(name="natural_frequency_rad_s", default=None)
+    natural_frequency: float | None = msgspec.field(name="natural_frequency_rad_s", default=None)  # ω [rad/s]
     natural_frequency_ci95: Interval | None = msgspec.field(name="natural_frequency_rad_s_ci95", default=None)
-    damping: float | None = None
+    damping: float | None = None  # ζ
     damping_ci95: Interval | None = None
-    rms: float = msgspec.field(name="rms_mm")
-    rms_percent: float
-    fit_percent: float
-    flags: list[str]
+    rms: float = msgspec.field(name="rms_mm")  # of the residuals, eq. 10 [m or rad].
+    rms_percent: float  # of the step
+    fit_percent: float  # 100 (1 − ‖residuals‖ / ‖position without its mean‖)
+    flags: list[str]  # what to know before trusting it
 
 
 class TrialResult(msgspec.Struct, frozen=True, kw_only=True):

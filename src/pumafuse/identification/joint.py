@@ -26,36 +26,23 @@ class JointFit:
     """The plant that fits all trials best. Arrays are in the order of the trials, (n,), or (n, 2) for q and p.
 
     Attributes:
-        q: 2ζ/ω, or τ [s].
-        p: 1/ω² [s²]; 0 of first order.
-        delay: Td of each trial under this plant [s].
-        gain: K likewise.
-        rms: Of the residuals of each trial [m].
-        count: Samples of each.
-        cost: Sum of squared residuals, each trial's over its own noise.
-        residual: Of each trial, over its noise, (n, m).
         influence: Of each trial on q and p (0 of first order), times n: their mean is the error. HC2-corrected.
-        expected: Covariance of each influence by the noise within the trial, (n, 2, 2).
-        delay_sd: Of each Td by the trial's noise [s], infinite where it is not identifiable.
-        delay_slope: ∂Td/∂(q, p).
-        gain_slope: ∂K/∂(q, p).
-        gain_sd: Of each K by the trial's noise.
     """
 
-    q: float
-    p: float
-    delay: FloatArray
-    gain: FloatArray
-    rms: FloatArray
-    count: FloatArray
-    cost: float
-    residual: FloatArray
+    q: float  # 2ζ/ω, or τ [s]
+    p: float  # 1/ω² [s²]; 0 of first order
+    delay: FloatArray  # Td of each trial under this plant [s]
+    gain: FloatArray  # K likewise
+    rms: FloatArray  # of the residuals of each trial [m]
+    count: FloatArray  # samples of each
+    cost: float  # sum of squared residuals, each trial's over its own noise
+    residual: FloatArray  # of each trial, over its noise, (n, m)
     influence: FloatArray
-    expected: FloatArray
-    delay_sd: FloatArray
-    delay_slope: FloatArray
-    gain_slope: FloatArray
-    gain_sd: FloatArray
+    expected: FloatArray  # covariance of each influence by the noise within the trial, (n, 2, 2)
+    delay_sd: FloatArray  # of each Td by the trial's noise [s], infinite where it is not identifiable
+    delay_slope: FloatArray  # ∂Td/∂(q, p)
+    gain_slope: FloatArray  # ∂K/∂(q, p)
+    gain_sd: FloatArray  # of each K by the trial's noise
 
     def half_width(self, slope: Sequence[float]) -> float:
         """Half the 95 % interval of a quantity whose gradient by (q, p) is ``slope`` (2,).

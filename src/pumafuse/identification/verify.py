@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import msgspec
 import numpy as np
@@ -22,10 +23,13 @@ from ..fusion.segments import build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run
-from ..model.arm import ArmModel
-from ..tuning.arms import Arm, Measured, Recording
+from ..model.arm import ArmModel, commanded_speed
+from ..model.plants import PLANTS
+from ..toml import Interval
+from ..tuning.arms import Arm, Coordinates, Limits, Measured, Recording, Rest, covariance
+from ..tuning.plain import COMMANDS, LAGS, ROWS, delays
 from ..units import Kind
-from .best_in_class import BestInClass, ModelFit, best_in_class, model_fit, speeds
+from .estimate import t_quantile
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
@@ -36,6 +40,49 @@ _FARTHEST, _SLOWEST = 1e6, 1e4  # m or rad, from the start level; s
 _SPIKE = 8.0  # robust standard deviations
 _HOLDS = 50.0  # % fit
 _BETTER = 0.8  # share of the error below which a recovery is recommended
+
+_DAMPED = 1.0  # ζ of the grid, of second order
+_STARTS = 3  # cells of it to search from
+_BLOCKS = 10  # of a run, whose errors count as independent of each other
+_STEP = 1e-5  # of a coordinate, by which the lag is varied
+_REAL = -np.inf, np.inf
+_ANY = Limits(  # s, s, 1, 1, s/m or s/rad: as far as arms may be given, and beyond what is seen of them
+    {"delay": (0.0, 1e4), "lag": (1e-6, 1e4), "damping": (1e-3, 1e3), "gain": _REAL, "slope": _REAL}, {}
+)
+
+
+class ModelFit(msgspec.Struct, frozen=True, kw_only=True):
+    """Error of a simulated position against the measured one.
+
+    Attributes:
+        rms: Of the difference, without its mean [m or rad].
+        percent: Of the amplitude of the commands.
+        fit: 100 (1 − ‖difference‖ / ‖measured‖), both without their means.
+    """
+
+    rms: float = msgspec.field(name="rms_mm")
+    percent: float = msgspec.field(name="percent_of_signal")
+    fit: float = msgspec.field(name="fit_percent")
+
+
+class BestInClass(msgspec.Struct, frozen=True, kw_only=True):
+    """The best linear model of the order, refitted on the run.
+
+    Attributes:
+        fit: Its error.
+        lag: Behind the held command at constant velocity, at the commands' mean speed [s].
+        lag_ci95: Its 95 % interval [s].
+        delay: Td [s].
+        gain: K, at the commands' mean speed.
+        plant: Of unit gain.
+    """
+
+    fit: ModelFit
+    lag: float = msgspec.field(name="lag_ms")
+    lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
+    delay: float = msgspec.field(name="delay_ms")
+    gain: float
+    plant: PLANTS
 
 
 class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
@@ -272,3 +319,68 @@ def _recovers(model: ModelFit, recovering: ModelFit, recovery: float, kind: Kind
         return ""
     left = f"{recovering.rms * units.SCREEN[kind].scale:.3g} {units.SCREEN[kind].unit}"
     return f"; with gain_recovery_ms = {recovery * units.MS:g} {left} are left"
+
+
+def speeds(measured: Measured) -> FloatArray:
+    """Of the commands of a run that move [m/s or rad/s]."""
+    steps = np.diff(measured.recordings[0].command)
+    return commanded_speed(steps[steps != 0.0], measured.period)
+
+
+def model_fit(measured: Measured, arm: Arm) -> ModelFit:
+    """How well an arm fits a run."""
+    (one,) = measured.recordings
+    rms, signal = float(np.std(measured.left(arm))), float(np.std(one.value))
+    return ModelFit(
+        rms=rms,
+        percent=100.0 * rms / float(np.ptp(one.command)),
+        fit=100.0 * (1.0 - rms / signal) if signal > 0.0 else -np.inf,
+    )
+
+
+def best_in_class(measured: Measured, own: Arm) -> BestInClass:
+    """The best gain, delay and plant of the model's order on one recording by one source.
+
+    The order and recovery of the arm's ``own`` model stay; its numbers are one start of the search.
+    """
+    moving = speeds(measured)
+    names = ["delay", "lag", *(["damping"] if own.damping else []), "gain"]
+    if np.ptp(moving) > 1e-6 * moving.max():
+        names.append("slope")
+    starts = _on_grid(measured, own)
+    rest = measured.white(starts[0])
+    fits = [measured.fitted(arm, names, rest, _ANY) for arm in (own, *starts)]
+    near = max(fits, key=lambda one: one.log_posterior).arm
+    rest = measured.white(near)  # beside the noise of a poor start the last steps seemed to gain nothing
+    best, speed = measured.fitted(near, names, rest, _ANY).arm, float(moving.mean())
+    lag, half = best.model.lag(best.delay, speed), _half_width(measured, best, names, rest, speed)
+    return BestInClass(
+        fit=model_fit(measured, best),
+        lag=lag,
+        lag_ci95=(lag - half, lag + half),
+        delay=best.delay,
+        gain=best.slope * speed + best.gain,
+        plant=best.model.plant,
+    )
+
+
+def _on_grid(measured: Measured, own: Arm) -> list[Arm]:
+    """The best of a grid over dead times and plants, each with its best gain that is the same at every speed."""
+    part, alike = measured.excerpt(COMMANDS, ROWS), own._replace(damping=_DAMPED if own.damping else 0.0, slope=0.0)
+    arms = [alike._replace(delay=delay, lag=lag) for delay, lag in product(delays(part).tolist(), LAGS.tolist())]
+    log, gain = part.weighed(arms, part.white(own), _ANY)
+    return [arms[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:_STARTS].tolist()]
+
+
+def _half_width(measured: Measured, arm: Arm, names: Coordinates, rest: Rest, speed: float) -> float:
+    """Half the 95 % interval of the lag at a ``speed`` [m/s or rad/s].
+
+    What a model leaves over of a run is correlated, and each measurement alone would count far too much: a block of the
+    run counts as one observation (Bester, Conley & Hansen, J. Econometrics 165, 2011).
+    """
+    free = [name for name, inside in zip(names, _ANY.inside(arm, names), strict=True) if inside]
+    here, varied = arm.model, [arm.moved([name], [arm.coordinate(name) + _STEP]) for name in free]
+    slope = np.array([one.model.lag(one.delay, speed) - here.lag(arm.delay, speed) for one in varied]) / _STEP
+    information, scatter = measured.scattered(arm, free, rest, _ANY, _BLOCKS)
+    weight = covariance(information) @ slope
+    return t_quantile(_BLOCKS - 1) * float(weight @ scatter @ weight * _BLOCKS / (_BLOCKS - 1)) ** 0.5

@@ -17,8 +17,9 @@ from ..errors import ConfigError, UnknownNameError, suggestion
 from ..toml import Interval, NotNegative, Positive, Time
 from ..units import AN, KINDS, MM, MS, SCREEN, Kind, Screen, of_kind, refuse_name
 from .plants import PLANTS, Delay
-from .presets import PRESETS
 
+# arms by name: files beside this one; the PUMA 560 is the paper's Table II, "The Combined Model"
+PRESETS = {name: Path(__file__).with_name(f"{name}.toml") for name in ("puma560-internal", "puma560-external")}
 CANONICAL_AXES = ("tangential", "radial", "vertical")
 Slope = Annotated[float, msgspec.Meta(gt=-1, le=1e3)]  # at -1 or less a tool would go backwards, at 1000 run away
 _EXCEEDED = 1.005  # share of a limit from which two decimals show that it is exceeded

@@ -23,17 +23,11 @@ if TYPE_CHECKING:
 
 
 class Transition(NamedTuple):
-    """A plant's transition over an interval h with constant input; leading axes are those of the intervals.
+    """A plant's transition over an interval h with constant input; leading axes are those of the intervals."""
 
-    Attributes:
-        Phi: e^(Ah), (..., n, n).
-        Gamma: ∫₀ʰ e^(As) ds B, (..., n, 1).
-        Q: ∫₀ʰ e^(As) B Bᵀ e^(Aᵀs) ds, (..., n, n): covariance from input noise of density 1 m/√Hz.
-    """
-
-    Phi: FloatArray
-    Gamma: FloatArray
-    Q: FloatArray
+    Phi: FloatArray  # e^(Ah), (..., n, n)
+    Gamma: FloatArray  # ∫₀ʰ e^(As) ds B, (..., n, 1)
+    Q: FloatArray  # ∫₀ʰ e^(As) B Bᵀ e^(Aᵀs) ds, (..., n, n): covariance from input noise of density 1 m/√Hz
 
 
 def transition(plant: Plant, interval: npt.ArrayLike) -> Transition:

@@ -22,11 +22,7 @@ def cut_trials(
 ) -> dict[str, pa.Table]:
     """The tables ``trials.csv`` and ``samples.csv`` of a step campaign, as `identify` reads them; else none.
 
-    Args:
-        scenario: What was simulated.
-        tick: When each command was given, int64 ns, (n,).
-        commands: The commands by axis [m or rad], (n,).
-        sensors: The measurements of the run, among them the scope's.
+    Commands [m or rad] were given at each ``tick``, int64 ns, (n,); the scope is among the sensors.
     """
     campaign = scenario.trajectory
     if not isinstance(campaign, Steps):

@@ -24,27 +24,30 @@ from ..errors import ConfigError
 from ..fusion.config import Process
 from ..model.plants import FirstOrder
 from . import reverting
-from .grid import grid
 from .reverting import sum_of_decays
 from .true_arm import TrueAxis
 
+POINTS = 60  # of the grid in each period
 _APART = {2: 1e-5, 3: 1e-4}  # equal poles are set this far apart, relatively: it changes the response by its square
 _NODES = 3  # of the noise integral: exact to 1e-10 while |p|Δ ≤ _LONGEST_TURN
 _LONGEST_TURN = 0.1
 _MOST_EVENTS = 20_000_000  # 2 GB of work
 
 
+def grid(ticks: int, period: float) -> TimeArray:
+    """Instants of ``ticks`` periods of T [s] at which measurements and reference rows may be taken, int64 ns.
+
+    All random numbers are drawn on it, so that the motion does not depend on who measures it.
+    """
+    return np.rint(np.arange(ticks * POINTS + 1) * (period * 1e9 / POINTS)).astype(np.int64)
+
+
 @dataclass(frozen=True)
 class Motion:
-    """The true position of one axis.
+    """The true position of one axis."""
 
-    Attributes:
-        time: Int64 ns, ascending, (k,); it contains the grid.
-        position: [m] relative to the start level, (k,).
-    """
-
-    time: TimeArray
-    position: FloatArray
+    time: TimeArray  # int64 ns, ascending, (k,); it contains the grid
+    position: FloatArray  # [m] relative to the start level, (k,)
 
     def at(self, time: TimeArray) -> FloatArray:
         """Positions [m] at instants of the grid, (n,)."""
@@ -61,20 +64,10 @@ def simulate_axis(
     rng: np.random.Generator,
     start: float = 0.0,
 ) -> Motion:
-    """Simulate the motion of one axis through its commands.
+    """The motion of one axis through its commands, exact on the grid, until one period T [s] after the last.
 
-    Args:
-        axis: The true axis.
-        process: Its process noise, and its disturbance, which is stationary from the start.
-        offset_sd: Standard deviation of its offset at the start [m].
-        issued: When each command is given, on the ticks of T, int64 ns, (n,).
-        command: Relative to the start level [m], (n,).
-        period: T [s].
-        rng: Draws everything random of this axis.
-        start: The start level [m], for its sag.
-
-    Returns:
-        The motion, exact on the grid, until one period after the last command.
+    A ``command`` [m] relative to the ``start`` level, which the sag needs, is given at each ``issued`` tick of T, int64
+    ns, (n,). The process's disturbance is stationary from the start; ``rng`` draws everything random of this axis.
 
     Raises:
         ConfigError: A time constant is too short for so long a run.
@@ -203,21 +196,11 @@ def _events(acting: TimeArray, instants: TimeArray, fastest: float) -> TimeArray
 def _limited(
     axis: TrueAxis, max_speed: float, time: TimeArray, level: FloatArray, error: FloatArray, decay_rate: float
 ) -> FloatArray:
-    """Where a drive with a fastest speed is, from what its input is from each instant to the next [m].
+    """Where a drive with a fastest speed is at all instants but the first [m], (k,).
 
     It is asked for the speed that takes back the gap within the plant's lag, but for no more than the fastest. A plant
-    of second order follows that with the time constant 1/(2ζω).
-
-    Args:
-        axis: The true axis.
-        max_speed: The fastest [m/s].
-        time: Int64 ns, (k + 1,).
-        level: What is constant of the input from each instant on, (k,).
-        error: What decays, as it is at that instant, (k,).
-        decay_rate: How fast [1/s].
-
-    Returns:
-        The position at all instants but the first [m], (k,).
+    of second order follows that with the time constant 1/(2ζω). From each instant, int64 ns, (k + 1,), to the next its
+    input is a constant ``level`` and an ``error`` that decays, (k,).
     """
     from scipy.integrate import odeint
 

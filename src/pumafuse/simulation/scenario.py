@@ -31,7 +31,7 @@ from ..logs.run import Clock
 from ..model.arm import ArmModel
 from ..toml import NotNegative
 from ..units import of_kind
-from .grid import POINTS
+from .motion import POINTS
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
 from .true_arm import TrueArm, TrueAxis
 from .true_sensor import OF_OUTLIERS, PER_AXIS, Outliers, TrueSensor
@@ -45,11 +45,10 @@ class CommandLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     Attributes:
         stamp_jitter: Standard deviation of the logger's stamps around the true ticks [s].
-        clock: What ``run.toml`` says of the stamps.
     """
 
     stamp_jitter: NotNegative = msgspec.field(name="stamp_jitter_ms", default=0.0)
-    clock: Clock = "stamps"
+    clock: Clock = "stamps"  # what ``run.toml`` says of the stamps
 
 
 class ReferenceLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,11 +68,10 @@ class TrueStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     Attributes:
         offset_sd: Standard deviation of the offset there, drawn for each run and axis [m or rad].
-        level: By axis [m or rad]; 0 where absent.
     """
 
     offset_sd: PerAxis = msgspec.field(name="offset_sd_mm", default=0.0)
-    level: dict[str, float] = msgspec.field(default_factory=dict[str, float])
+    level: dict[str, float] = msgspec.field(default_factory=dict[str, float])  # by axis [m or rad]; 0 where absent
 
 
 class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -284,11 +282,7 @@ def _sensor(table: Any, arm: ArmModel, where: str, path: str) -> Any:
 
 
 def _kind_of(moving: Iterable[object], arm: ArmModel) -> units.Kind:
-    """The kind of the axes that a trajectory moves.
-
-    Raises:
-        ConfigError: They are of both.
-    """
+    """The kind of the axes that a trajectory moves: one."""
     kinds: list[units.Kind] = [arm.axes[axis].kind for axis in moving if isinstance(axis, str) and axis in arm.axes]
     if len(set(kinds)) > 1:
         raise ConfigError("trajectory: moves lengths and angles; its sizes would have two units")

@@ -26,12 +26,7 @@ def measure(
 ) -> Source:
     """The sensor's log, in the order of its stamps.
 
-    Args:
-        sensor: How it measures.
-        name: Its name.
-        valid: When it measures, int64 ns, (rows,).
-        position: True positions then, in the coordinates in which the sensor is logged [m or rad], (rows,) each.
-        rng: Draws everything random of this sensor.
+    It measures at ``valid`` instants, int64 ns, (rows,), true positions [m or rad] in the coordinates of its log.
     """
     noises = rng.spawn(7)  # so that one kind of fault changes no other
     count, seconds = len(valid), valid / 1e9

@@ -21,8 +21,7 @@ from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
 from ..units import MM, SCREEN
 from . import campaign, sensing
-from .grid import POINTS, grid
-from .motion import Motion, simulate_axis
+from .motion import POINTS, Motion, grid, simulate_axis
 from .scenario import Scenario
 from .trajectory import PathFromFile
 
@@ -115,11 +114,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
 
 
 def check_writable(folder: Path, force: bool) -> None:
-    """Refuse early what :func:`write` would refuse late.
-
-    Raises:
-        FolderError: The folder exists and is not to be replaced, or holds something else than a simulated run.
-    """
+    """Refuse early what :func:`write` would refuse late."""
     folders.check_writable(folder, force, _ALWAYS_WRITTEN, lambda name: name in _files_of(folder))
 
 
@@ -127,9 +122,6 @@ def write(simulated: Simulated, folder: Path, force: bool) -> None:
     """Write a simulated run as a recorded run, with ``fusion.toml`` and ``arm.toml`` for a filter, and its step trials.
 
     ``scenario.toml`` in the folder makes the same run again; a path from a file is copied beside it.
-
-    Raises:
-        FolderError: See :func:`check_writable`, or the disk refuses.
     """
     check_writable(folder, force)
     scenario = simulated.scenario

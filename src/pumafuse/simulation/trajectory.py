@@ -30,13 +30,9 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", fo
 
 
 class OnAxes(Trajectory, frozen=True, kw_only=True):
-    """Base of the trajectories that name their axes in a list.
+    """Base of the trajectories that name their axes in a list."""
 
-    Attributes:
-        axes: The axes that move.
-    """
-
-    axes: Names
+    axes: Names  # the axes that move
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -45,33 +41,20 @@ class OnAxes(Trajectory, frozen=True, kw_only=True):
 
 
 class Timed(OnAxes, frozen=True, kw_only=True):
-    """Base of the trajectories that say how long they last.
+    """Base of the trajectories that say how long they last."""
 
-    Attributes:
-        duration: [s].
-    """
-
-    duration: Positive = msgspec.field(name="duration_s")
+    duration: Positive = msgspec.field(name="duration_s")  # [s]
 
 
 class Raster(Trajectory, frozen=True, kw_only=True, tag="raster"):
-    """Lines to and fro over a panel at constant speed, each one pitch beyond the last.
+    """Lines to and fro over a panel at constant speed, each one pitch beyond the last."""
 
-    Attributes:
-        along: The axis of the lines.
-        across: The axis of the pitch.
-        width: Length of a line [m].
-        height: What the lines cover [m].
-        pitch: Between lines [m].
-        speed: Of the command [m/s].
-    """
-
-    along: str = "tangential"
-    across: str = "vertical"
-    width: Positive = msgspec.field(name="width_mm")
-    height: NotNegative = msgspec.field(name="height_mm")
-    pitch: Positive = msgspec.field(name="pitch_mm")
-    speed: Positive = msgspec.field(name="speed_m_s")
+    along: str = "tangential"  # the axis of the lines
+    across: str = "vertical"  # the axis of the pitch
+    width: Positive = msgspec.field(name="width_mm")  # length of a line [m]
+    height: NotNegative = msgspec.field(name="height_mm")  # what the lines cover [m]
+    pitch: Positive = msgspec.field(name="pitch_mm")  # between lines [m]
+    speed: Positive = msgspec.field(name="speed_m_s")  # of the command [m/s]
 
     def __post_init__(self) -> None:
         if self.along == self.across:
@@ -99,22 +82,14 @@ class Steps(OnAxes, frozen=True, kw_only=True, tag="steps"):
 
     Every size on every axis in both directions, ``replicates`` times, in random order, the first ``trials`` of them.
     ``trials.csv`` and ``samples.csv`` are cut from the one run that goes through all of them.
-
-    Attributes:
-        sizes: Of the steps [m].
-        replicates: Of each combination.
-        trials: How many to keep, as of a campaign that was cut short; None: all.
-        rest: Between steps [s].
-        window: How long a trial is sampled [s].
-        scope: The sensor that samples it.
     """
 
-    sizes: Annotated[list[Positive], msgspec.Meta(min_length=1)] = msgspec.field(name="sizes_mm")
-    replicates: Count = 1
-    trials: Count | None = None
-    rest: Positive = msgspec.field(name="rest_s", default=1.0)
-    window: Positive = msgspec.field(name="window_s", default=0.33)
-    scope: str
+    sizes: Annotated[list[Positive], msgspec.Meta(min_length=1)] = msgspec.field(name="sizes_mm")  # of the steps [m]
+    replicates: Count = 1  # of each combination
+    trials: Count | None = None  # how many to keep, as of a campaign that was cut short; None: all
+    rest: Positive = msgspec.field(name="rest_s", default=1.0)  # between steps [s]
+    window: Positive = msgspec.field(name="window_s", default=0.33)  # how long a trial is sampled [s]
+    scope: str  # the sensor that samples it
 
     def __post_init__(self) -> None:
         if self.window > self.rest:
@@ -142,13 +117,9 @@ class Steps(OnAxes, frozen=True, kw_only=True, tag="steps"):
 
 
 class WhiteNoise(Timed, frozen=True, kw_only=True, tag="white-noise"):
-    """The paper's binary white noise on each axis: between two levels, changing with probability 0.5 each period.
+    """The paper's binary white noise on each axis: between two levels, changing with probability 0.5 each period."""
 
-    Attributes:
-        amplitude: From one level to the other [m].
-    """
-
-    amplitude: Positive = msgspec.field(name="amplitude_mm")
+    amplitude: Positive = msgspec.field(name="amplitude_mm")  # from one level to the other [m]
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """0 or the amplitude; the first command is the start level."""
@@ -162,17 +133,11 @@ class WhiteNoise(Timed, frozen=True, kw_only=True, tag="white-noise"):
 
 
 class SineSweep(Timed, frozen=True, kw_only=True, tag="sine-sweep"):
-    """A sine whose frequency grows by the same factor each second.
+    """A sine whose frequency grows by the same factor each second."""
 
-    Attributes:
-        amplitude: Of the sine [m].
-        start_frequency: [Hz].
-        end_frequency: [Hz].
-    """
-
-    amplitude: Positive = msgspec.field(name="amplitude_mm")
-    start_frequency: Positive = msgspec.field(name="from_hz")
-    end_frequency: Positive = msgspec.field(name="to_hz")
+    amplitude: Positive = msgspec.field(name="amplitude_mm")  # of the sine [m]
+    start_frequency: Positive = msgspec.field(name="from_hz")  # [Hz]
+    end_frequency: Positive = msgspec.field(name="to_hz")  # [Hz]
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """A sin φ with φ = 2π ∫ f dt and f = f₀ (f₁/f₀)^(t/duration)."""
@@ -192,13 +157,9 @@ class Hold(Timed, frozen=True, kw_only=True, tag="hold"):
 
 
 class PathFromFile(OnAxes, frozen=True, kw_only=True, tag="path"):
-    """A path from a table, linear between its rows, relative to its first row.
+    """A path from a table, linear between its rows, relative to its first row."""
 
-    Attributes:
-        file: A CSV or Parquet table beside the scenario with ``time_s`` and ``<axis>_mm`` (or any unit).
-    """
-
-    file: str
+    file: str  # a CSV or Parquet table beside the scenario with ``time_s`` and ``<axis>_mm`` (or any unit)
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """The path on the ticks."""
@@ -223,11 +184,7 @@ TRAJECTORIES: TypeAlias = Raster | Steps | WhiteNoise | SineSweep | Hold | PathF
 
 
 def ticks(duration: float, period: float) -> IntArray:
-    """Numbers of the ticks from 0 to ``duration`` [s], the last at or after it.
-
-    Raises:
-        ConfigError: There are too many to simulate at a time.
-    """
+    """Numbers of the ticks from 0 to ``duration`` [s], the last at or after it; not too many to simulate at a time."""
     if not duration / period < _MOST_TICKS:
         raise ConfigError(f"trajectory: {duration / period + 1.0:.6g} commands; at most {_MOST_TICKS} in one run")
     return np.arange(int(np.ceil(duration / period - 1e-9)) + 1)

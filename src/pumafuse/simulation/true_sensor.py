@@ -16,74 +16,55 @@ OF_OUTLIERS = ("from_mm", "to_mm")  # likewise
 
 
 class Bursts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Spells in which all rows are lost.
+    """Spells in which all rows are lost."""
 
-    Attributes:
-        per_minute: How many, at random instants.
-        length: How long each lasts [s].
-    """
-
-    per_minute: Annotated[float, msgspec.Meta(gt=0, le=6000)]
-    length: Positive = msgspec.field(name="length_s")
+    per_minute: Annotated[float, msgspec.Meta(gt=0, le=6000)]  # how many, at random instants
+    length: Positive = msgspec.field(name="length_s")  # how long each lasts [s]
 
 
 _GATE = 5.0  # of a sensor that has outliers
 
 
 class Outliers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Measurements with a large error.
+    """Measurements with a large error."""
 
-    Attributes:
-        share: Share of the rows.
-        smallest: Smallest error [m or rad], for all axes or for each.
-        largest: Largest error [m or rad]; either sign.
-    """
-
-    share: Share
-    smallest: PerAxis = msgspec.field(name="from_mm")
-    largest: PerAxis = msgspec.field(name="to_mm")
+    share: Share  # share of the rows
+    smallest: PerAxis = msgspec.field(name="from_mm")  # smallest error [m or rad], for all axes or for each
+    largest: PerAxis = msgspec.field(name="to_mm")  # largest error [m or rad]; either sign
 
 
 class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How a sensor measures: z = scale · p(stamp − latency) + bias + noise.
 
     Attributes:
-        rate: Rows a second [Hz].
         rate_jitter: Standard deviation of each row's instant around an even grid [s].
         axes: What it measures. Absent: everything, in x, y, z if the scenario has a frame; a sensor that names its
             axes is logged in them.
         sd: Standard deviation of the noise [m or rad], one number or one for each axis; likewise all in that unit.
-        latency: From the valid time to the stamp [s].
         latency_sd: Standard deviation of each row's own latency [s].
-        scale: Factor on the position.
-        bias: Constant [m or rad].
         bias_sd: Standard deviation of one more bias, drawn for each run and axis [m or rad].
         bias_drift_sd: Standard deviation of one more bias, which drifts and reverts to 0 [m or rad]; 0: none.
-        bias_time: How long such a drift lasts [s].
         quantisation: Step between two values [m or rad]; 0: none.
-        dropouts: Share of rows lost, one by one.
-        bursts: Rows lost together.
-        outliers: Rows with a large error.
         outages: From and to, since the first command [s].
         clock_offset: Of the sensor's clock against the commands' [s].
         clock_drift: Of the sensor's clock against the commands' [parts per million].
     """
 
-    rate: Positive = msgspec.field(name="rate_hz")
+    rate: Positive = msgspec.field(name="rate_hz")  # rows a second [Hz]
     rate_jitter: NotNegative = msgspec.field(name="rate_jitter_ms", default=0.0)
     axes: Annotated[list[str], msgspec.Meta(min_length=1)] | None = None
     sd: Positive | dict[str, Positive] = msgspec.field(name="sd_mm")
-    latency: float = msgspec.field(name="latency_ms", default=0.0)
+    latency: float = msgspec.field(name="latency_ms", default=0.0)  # from the valid time to the stamp [s]
     latency_sd: NotNegative = msgspec.field(name="latency_sd_ms", default=0.0)
-    scale: float = 1.0
-    bias: float | dict[str, float] = msgspec.field(name="bias_mm", default=0.0)
+    scale: float = 1.0  # factor on the position
+    bias: float | dict[str, float] = msgspec.field(name="bias_mm", default=0.0)  # constant [m or rad]
     bias_sd: PerAxis = msgspec.field(name="bias_sd_mm", default=0.0)
     bias_drift_sd: PerAxis = msgspec.field(name="bias_drift_sd_mm", default=0.0)
-    bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)
+    bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)  # how long such a drift lasts [s]
     quantisation: PerAxis = msgspec.field(name="quantisation_mm", default=0.0)
-    dropouts: Share = 0.0
-    bursts: Bursts | None = None
-    outliers: Outliers | None = None
+    dropouts: Share = 0.0  # share of rows lost, one by one
+    bursts: Bursts | None = None  # rows lost together
+    outliers: Outliers | None = None  # rows with a large error
     outages: list[tuple[float, float]] = msgspec.field(name="outages_s", default=[])
     clock_offset: float = msgspec.field(name="clock_offset_ms", default=0.0)
     clock_drift: float = msgspec.field(name="clock_drift_ppm", default=0.0)
