@@ -44,11 +44,12 @@ def recorded(name: str, seconds: float = 1e9) -> tuple[pf.Run, pf.FusionConfig]:
     return replace(run, command=command, sensors=dict(zip(run.sensors, sensors, strict=True)), reference=None), config
 
 
-@pytest.mark.parametrize("longest", [pytest.param(0.0, marks=pytest.mark.long), 1.2])
+@pytest.mark.parametrize("longest", [0.0, 1.2])
+@pytest.mark.parametrize("seconds", [10.0, pytest.param(1e9, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", ["scan1", *RUNS])
-def test_in_any_order(name: str, longest: float) -> None:
+def test_in_any_order(name: str, seconds: float, longest: float) -> None:
     """Each event up to 1.2 s late, a tenth of them twice: the offline estimates once measurements are in."""
-    run, config = recorded(name, 10.0 if longest else 1e9)
+    run, config = recorded(name, seconds)
     fused_in_any_order(run, pf.fuse(run, config), pf.LiveEstimator(config, start=run.start), longest)
 
 
