@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,6 +19,7 @@ import pumafuse as pf
 from fusion_oracle import AxisOracle, nanoseconds
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.engine import Filtered, filter_segment
+from pumafuse.fusion.estimates import Mode
 from pumafuse.fusion.segments import build, output_times
 from pumafuse.logs.run import Run
 from pumafuse.model.plants import Plant
@@ -45,18 +44,24 @@ def agree(got: Filtered, wanted: Filtered, tolerance: float = 1e-9) -> None:
     np.testing.assert_array_equal(got.results.contradicts, wanted.results.contradicts)
     pairs = [(part.results.innovation, part.results.innovation_sd) for part in (got, wanted)]
     _close("innovation", *pairs[0], *pairs[1], tolerance)
-    assert tuple(got.axes) == tuple(wanted.axes)
-    for axis in wanted.axes:
-        for field in FIELDS:
-            mine, theirs = ((getattr(e.axes[axis], field), getattr(e.axes[axis], f"{field}_sd")) for e in (got, wanted))
-            assert not np.isnan(theirs).any()
-            _close(f"{axis} {field}", *mine, *theirs, tolerance)
+    agree_on_axes(got.axes, wanted.axes, tolerance)
     assert got.biases.keys() == wanted.biases.keys()
     for name, of in wanted.biases.items():
         assert got.biases[name].keys() == of.keys()
         for axis, bias in of.items():
             mine = got.biases[name][axis]
             _close(f"bias of {name} on {axis}", *map(np.array, (mine.value, mine.sd, bias.value, bias.sd)), tolerance)
+
+
+def agree_on_axes(
+    got: Mapping[str, pf.AxisEstimate], wanted: Mapping[str, pf.AxisEstimate], tolerance: float = 1e-9
+) -> None:
+    assert tuple(got) == tuple(wanted)
+    for axis in wanted:
+        for field in FIELDS:
+            mine, theirs = ((getattr(of[axis], field), getattr(of[axis], f"{field}_sd")) for of in (got, wanted))
+            assert not np.isnan(theirs).any()
+            _close(f"{axis} {field}", *mine, *theirs, tolerance)
 
 
 def _close(
@@ -251,30 +256,24 @@ def test_a_smooth_disturbance_is_forgotten_in_any_pause(lasts: float, pause: flo
 
 
 @pytest.mark.long
-def test_fuse_by_filterpy_says_the_same() -> None:
-    """Measurements, notes and estimates of `fuse` by either engine; progress goes up; other modes are refused."""
-    scan, config = Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    until = scan.command.stamp[0] + 3_000_000_000
-    run = replace(
-        scan,
-        command=scan.command.rows(scan.command.stamp < until),
-        sensors={name: source.rows(source.stamp < until) for name, source in scan.sensors.items()},
-    )
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+def test_fuse_by_filterpy_says_the_same_of_the_scan() -> None:
+    """Measurements, notes and estimates of `fuse` by either engine, of 10 s with all its sensors; progress goes up."""
+    run, config = Run.read(DATA / "scan1").between(until=10.0), pf.FusionConfig.load(DATA / "fusion.toml")
     done: list[float] = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        got = pf.fuse(run, config)
-        wanted = pf.fuse(run, config, engine="filterpy", progress=done.append)
+    got, wanted = pf.fuse(run, config), pf.fuse(run, config, engine="filterpy", progress=done.append)
     assert (got.engine, wanted.engine) == ("compiled", "filterpy")
     assert got.notes == wanted.notes
     for name in ("time", "stamp", "sensor", "axis", "value", "outcome"):
         np.testing.assert_array_equal(getattr(got.measurements, name), getattr(wanted.measurements, name))
-    for axis in wanted.axes:
-        np.testing.assert_allclose(got[axis].position, wanted[axis].position, rtol=0.0, atol=1e-11)
+    agree_on_axes(got.axes, wanted.axes)
     assert done == sorted(done)
-    for mode in ({"mode": "smoothed"}, {"mode": "as-live"}):
-        with pytest.raises(ValueError, match="filterpy"):
-            pf.fuse(run, config, engine="filterpy", **mode)
+
+
+@pytest.mark.parametrize("mode", ["smoothed", "as-live"])
+def test_filterpy_only_filters(mode: Mode) -> None:
+    with pytest.raises(ValueError, match=f"mode '{mode}' needs the compiled one"):
+        pf.fuse(*wide("offset", 1e3), engine="filterpy", mode=mode)
 
 
 # ---- wide priors ----------------------------------------------------------------------------------------------------
@@ -329,15 +328,3 @@ def test_estimates_are_right_while_priors_are_wide(kind: str, ratio: float, tole
             getattr(e, name) for e in (estimates["radial"], belief) for name in (field, f"{field}_sd")
         )
         _close(field, mean, sd, right, right_sd, tolerance)
-
-
-# ---- the shipped scan -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("sensors", [["tracker", "vision"], ["vision"], ["range", "vision"]], ids="+".join)
-def test_both_engines_make_the_same_of_the_scan(sensors: list[str]) -> None:
-    """30 s of the shipped scan as configured: a camera's outliers, a tracker, a panel 1 m of bias away."""
-    run, config = Run.read(DATA / "scan1").between(until=30.0), pf.FusionConfig.load(DATA / "fusion.toml")
-    config = msgspec.structs.replace(config, sensors={name: config.sensors[name] for name in sensors})
-    agree(*both(replace(run, sensors={name: run.sensors[name] for name in sensors}), config))

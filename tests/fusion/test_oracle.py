@@ -20,6 +20,7 @@ from pumafuse.filter.events import Events, Results
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.engine import model_of
+from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.segments import build
 from pumafuse.logs.run import Run
@@ -133,6 +134,17 @@ def check(case: Case, mode: str = "filtered", engine: str = "compiled") -> None:
         oracle = AxisOracle(run, config, axis)
         check_innovations(fused.where(fused.axis == number), oracle)
         check_estimates(estimates[axis], getattr(oracle, mode)(times))
+        if mode != "as_live":
+            check_biases(estimates, axis, oracle)
+
+
+def check_biases(estimates: Estimates, axis: str, oracle: AxisOracle) -> None:
+    """Means given all measurements to 1e-9 sd + 1e-12 m, variances to 1e-9."""
+    found, wanted = {name: of[axis] for name, of in estimates.biases.items() if axis in of}, oracle.biases()
+    assert found.keys() == wanted.keys()
+    for name, (mean, sd) in wanted.items():
+        assert abs(found[name].value - mean) < 1e-9 * sd + 1e-12
+        assert found[name].sd ** 2 == pytest.approx(sd**2, rel=1e-9)
 
 
 NEARLY = SecondOrder(natural_frequency=45.0, damping=1.0 + 1e-9)
@@ -151,6 +163,7 @@ GRID = np.arange(16) * T
 IRREGULAR = np.cumsum([0, 28, 31, 20, 28, 3, 28, 400, 28, 28, 5, 28, 90, 28]) * MS
 TRACKER = Seen(sensor(latency=0.008), every(90, 36))
 VISION = Seen(sensor(0.4e-3, latency=0.090), every(25, 10, 7 * MS))
+LATE = replace(TRACKER, valid=every(90, 20, 240 * MS))
 SLOW = Seen(sensor(0.2e-3, latency=0.240), every(12.5, 5, 3 * MS))
 PANEL = Seen(sensor(0.3e-3, latency=0.004, scale=-1.0, bias_sd=1.0), every(40, 16, 2 * MS))
 AHEAD = Seen(sensor(0.3e-3, latency=-0.050), every(15, 6, 61 * MS))  # stamped before it is true
@@ -211,6 +224,22 @@ CASES = {
     ),
     "rates and latencies": Case(one(UNDER), seen={"vision": VISION, "slow": SLOW, "ahead": AHEAD, "tracker": TRACKER}),
     "panel": Case(one(UNDER), seen={"panel": PANEL, "tracker": Seen(sensor(latency=0.05), every(20, 8, 150 * MS))}),
+    "a bias of every scale": Case(
+        seen={
+            str(scale): Seen(sensor(0.3e-3, scale=scale, bias_sd=bias_sd), every(30, 9, 40 * MS))
+            for scale, bias_sd in ((1.0, 0.0), (-1.0, 0.5), (2.5, 1e-3), (-0.2, 0.02))
+        },
+        start={"radial": 0.51},
+    ),
+    "a late first measurement": Case(one(UNDER), seen={"tracker": LATE}, rate=110.0),
+    "a gap in the measurements": Case(
+        one(UNDER), seen={"tracker": replace(LATE, valid=np.r_[every(90, 15), LATE.valid])}
+    ),
+    "a latency that wanders": Case(
+        delay=0.02,
+        seen={"wandering": Seen(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), GRID), "vision": VISION},
+    ),
+    "a panel before the tracker": Case(one(UNDER), seen={"panel": PANEL, "tracker": LATE}, rate=60.0),
     "sparse grid": Case(rate=7.0, seen={"tracker": TRACKER, "vision": VISION}),
     "nanosecond stamps": Case(origin=1_700_000_000_123_456_789, rate=100.0),
     "absolute seconds": Case(one(UNDER), origin=1.7e9),
@@ -232,10 +261,17 @@ CASES = {
 
 @pytest.mark.filterwarnings("ignore:.*sensors.ahead.latency_ms:pumafuse.PumafuseWarning")
 @pytest.mark.filterwarnings("ignore:.*(where the commands lead|whose commands rest):pumafuse.PumafuseWarning")
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+@pytest.mark.parametrize(
+    ("case", "mode"),
+    [
+        pytest.param(case, mode, id=f"{name}-{mode}")
+        for name, case in CASES.items()
+        for mode in MODES
+        if mode != "as_live" or not any(seen.sensor.latency_sd for seen in case.seen.values())
+    ],
+)
 def test_estimates_are_conditional_means(case: Case, mode: str) -> None:
-    """Every estimate, error bar and innovation is that of the joint Gaussian given the measurements it may know."""
+    """Estimates, error bars, biases and innovations are those of the joint Gaussian given what they may know."""
     check(case, mode)
 
 
@@ -363,11 +399,25 @@ def cases(draw: st.DrawFn) -> Case:
     )  # fmt: skip
 
 
-@settings(max_examples=80)
-@given(cases(), st.sampled_from(["filtered", "as_live"]))
+def tame(case: Case) -> Case:
+    """Priors and drifts of at most some 30 times a measurement's noise; beyond, rounding can pass 1e-12 m.
+
+    And no disturbance: at the very start of a run it costs the smoother up to 1e-7 of a standard deviation.
+    """
+    seen = {
+        name: replace(each, sensor=replace_(
+            each.sensor, sd=max(each.sensor.sd, 0.3e-3), bias_sd=min(each.sensor.bias_sd, 9e-3)))
+        for name, each in case.seen.items()
+    }  # fmt: skip
+    process = replace_(case.process, maneuver_drift=min(case.process.maneuver_drift, 5e-3), disturbance_sd=0.0)
+    return replace(case, seen=seen, process=process, offset_sd=min(case.offset_sd, 5e-3))
+
+
+@settings(max_examples=100)
+@given(cases(), st.sampled_from(list(MODES)))
 def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
-    """Random plants, delays, gains, noise and sensors: nothing deviates from the joint Gaussian."""
-    check(case, mode)
+    """Random plants, delays, gains, gaps, noise and sensors: nothing deviates from the joint Gaussian."""
+    check(tame(case) if mode == "smoothed" else case, mode)
 
 
 # ---- long runs ------------------------------------------------------------------------------------------------------

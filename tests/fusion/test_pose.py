@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
 import turning
-from executable import pumafuse
+from executable import printed
 from pumafuse.errors import RunError
 from pumafuse.fusion import results
 from pumafuse.fusion.config import Tool
@@ -24,7 +24,7 @@ TURNING = ("rx", "ry", "rz")
 QUATERNION = ("qx", "qy", "qz", "qw")
 SAMPLES = 200_000
 
-pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.errors.PumafuseWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +35,14 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> pf.FusionConfig:
 @pytest.fixture(scope="module")
 def est(config: pf.FusionConfig) -> pf.Estimates:
     return pf.fuse(turning.recorded(), config)
+
+
+@pytest.fixture(scope="module")
+def saved(est: pf.Estimates, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Their result folder."""
+    folder = tmp_path_factory.mktemp("results") / "fused"
+    est.save(folder)
+    return folder
 
 
 def turned(est: pf.Estimates) -> Rotation:
@@ -110,10 +118,9 @@ def test_with_a_frame_positions_and_their_covariance_are_in_the_log(frame: Frame
     assert np.abs(found - wanted).max() < 0.02 * wanted.max()
 
 
-def test_files_have_the_quaternion_of_the_axes_beside_them(est: pf.Estimates, tmp_path: Path) -> None:
+def test_files_have_the_quaternion_of_the_axes_beside_them(est: pf.Estimates, saved: Path) -> None:
     """`estimates.parquet`, `to_arrow`, and the reference, whose truth comes back; without a sign that changes."""
-    est.save(tmp_path / "fused")
-    tables = [pq.read_table(tmp_path / "fused" / f"{name}.parquet") for name in ("estimates", "reference")]
+    tables = [pq.read_table(saved / f"{name}.parquet") for name in ("estimates", "reference")]
     for table in (tables[0], est.to_arrow()):
         found = np.column_stack([table[name].to_numpy() for name in QUATERNION])
         assert apart(Rotation.from_quat(found), turned(est)).max() < 1e-12
@@ -122,11 +129,10 @@ def test_files_have_the_quaternion_of_the_axes_beside_them(est: pf.Estimates, tm
     assert apart(reference, turning.sources()["truth"][2]).max() < 1e-12
 
 
-def test_a_trajectory_has_the_orientation(est: pf.Estimates, tmp_path: Path) -> None:
+def test_a_trajectory_has_the_orientation(est: pf.Estimates, saved: Path, tmp_path: Path) -> None:
     """In the TUM format, from Python and from a result folder, which has the reference, too."""
     est.to_tum(tmp_path / "fused.tum")
-    est.save(tmp_path / "fused")
-    pumafuse("compare", tmp_path / "fused", "--tum", tmp_path / "out")
+    printed("compare", saved, "--tum", tmp_path / "out")
     for path in (tmp_path / "fused.tum", tmp_path / "out" / "fused.tum"):
         rows = np.loadtxt(path)
         assert apart(Rotation.from_quat(rows[:, 4:]), turned(est)).max() < 1e-12
@@ -135,15 +141,14 @@ def test_a_trajectory_has_the_orientation(est: pf.Estimates, tmp_path: Path) -> 
     assert apart(Rotation.from_quat(reference[:, 4:]), turning.sources()["truth"][2]).max() < 1e-12
 
 
-def test_the_angle_of_the_score_is_that_of_the_orientations(est: pf.Estimates, tmp_path: Path) -> None:
+def test_the_angle_of_the_score_is_that_of_the_orientations(est: pf.Estimates, saved: Path) -> None:
     """RMS of scipy's magnitude at the instants at which the truth is known, and as large as expected."""
     assert est.reference is not None
     truth = turning.sources()["truth"]
     shared = np.isin(np.rint(est.time * 1e3), np.rint((truth[0] - turning.START) * 1e3))
     known = np.isin(np.rint((truth[0] - turning.START) * 1e3), np.rint(est.time * 1e3))
     wanted = np.sqrt(np.mean(apart(turned(est)[shared], truth[2][known]) ** 2))
-    est.save(tmp_path / "fused")
-    read = results.read(tmp_path / "fused")
+    read = results.read(saved)
     for found in (pf.summarise(est).orientation, read.summary.orientation, read.orientation_score(est.reference)):
         assert found is not None
         assert found.rows == known.sum()
@@ -154,17 +159,15 @@ def test_the_angle_of_the_score_is_that_of_the_orientations(est: pf.Estimates, t
 
 
 def test_results_about_other_reference_orientations_are_compared_as_one(
-    config: pf.FusionConfig, est: pf.Estimates, tmp_path: Path
+    config: pf.FusionConfig, est: pf.Estimates, saved: Path, tmp_path: Path
 ) -> None:
     """With R₀ turned by 5° the same tool is the same to a hundredth of a degree, and so is its score."""
-    est.save(tmp_path / "first")
     assert est.config.tool is not None
     other = Rotation.from_rotvec([5.0, 0.0, 0.0], degrees=True) * Rotation.from_rotvec(est.config.tool.reference)
     tool = Tool(reference=tuple(other.as_rotvec().tolist()))
     pf.fuse(turning.recorded(), msgspec.structs.replace(config, tool=tool)).save(tmp_path / "second")
-    reference = ("--reference", tmp_path / "first" / "reference.parquet", "--json")
-    done = pumafuse("compare", tmp_path / "first", tmp_path / "second", *reference)
-    first, second = msgspec.json.decode(done.stdout)
+    reference = ("--reference", saved / "reference.parquet", "--json")
+    first, second = msgspec.json.decode(printed("compare", saved, tmp_path / "second", *reference))
     assert all(second["difference"][axis]["rms_deg"] < 0.02 for axis in TURNING)
     assert second["orientation"]["rms_deg"] == pytest.approx(first["orientation"]["rms_deg"], abs=0.01)
     assert all(second["axes"][axis]["rmse_deg"] < 0.5 for axis in TURNING)
@@ -172,17 +175,12 @@ def test_results_about_other_reference_orientations_are_compared_as_one(
 
 def test_the_command_says_the_angle(tmp_path: Path) -> None:
     """`fuse` and `compare` print it beside what is expected, and `summary.json` has it."""
-    said = pumafuse("fuse", turning.written(tmp_path), "-c", turning.configured(tmp_path), "-o", tmp_path / "fused")
-    again = pumafuse("compare", tmp_path / "fused")
+    said = printed("fuse", turning.written(tmp_path), "-c", turning.configured(tmp_path), "-o", tmp_path / "fused")
     found = msgspec.json.decode((tmp_path / "fused" / "summary.json").read_bytes())["orientation"]
     assert found.keys() == {"rms_deg", "expected_deg", "rows", "left_out"}
-    for printed in (said.stdout, again.stdout):
-        (row,) = [
-            line.split()[1:]
-            for line in printed.splitlines()
-            if line.split()[1:3] == [f"{found['rms_deg']:.3f}", f"{found['expected_deg']:.3f}"]
-        ]
-        assert row[2:] == [str(found["rows"]), str(found["left_out"])]
+    wanted = [f"{found['rms_deg']:.3f}", f"{found['expected_deg']:.3f}", str(found["rows"]), str(found["left_out"])]
+    for text in (said, printed("compare", tmp_path / "fused")):
+        assert wanted in [line.split()[1:] for line in text.splitlines()]
 
 
 def test_what_has_no_pose_says_so(est: pf.Estimates) -> None:
