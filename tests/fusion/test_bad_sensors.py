@@ -38,14 +38,12 @@ def camera_alone(scan: pf.Run, config: pf.FusionConfig) -> pf.Estimates:
     return pf.fuse(scan, config, sensors=["vision"])
 
 
-def fused(
-    scan: pf.Run, config: pf.FusionConfig, spoil: Callable[[Source], Source], rate: float | None = None
-) -> tuple[pf.Estimates, Summary]:
+def fused(scan: pf.Run, config: pf.FusionConfig, spoil: Callable[[Source], Source]) -> tuple[pf.Estimates, Summary]:
     """Camera and spoilt tracker; every note of the summary must have been a warning too."""
     run = replace(scan, sensors={**scan.sensors, "tracker": spoil(scan.sensors["tracker"])})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        est = pf.fuse(run, config, sensors=["tracker", "vision"], rate=rate)
+        est = pf.fuse(run, config, sensors=["tracker", "vision"])
     summary = summarise(est)
     assert [str(warning.message) for warning in caught] == [f"run 'scan1': {note}" for note in summary.notes]
     assert all(np.isfinite(est[axis].position).all() for axis in est.axes)
@@ -69,13 +67,6 @@ def rmse(est: pf.Estimates, axis: str, after: float = 0.0) -> float:
         est.time[late], est.segment[late], est[axis].position[late], est[axis].position_sd[late], est.reference, axis
     )
     return score.rmse
-
-
-def check_same(est: pf.Estimates, wanted: pf.Estimates) -> None:
-    """A sensor that says nothing of the run changes nothing: the same estimates to rounding, and no surer."""
-    for axis in AXES:
-        np.testing.assert_allclose(est[axis].position, wanted[axis].position, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(est[axis].position_sd, wanted[axis].position_sd, rtol=1e-9)
 
 
 def test_a_constant_error_is_found_where_a_bias_is_expected(
@@ -127,42 +118,37 @@ def test_what_one_axis_does_is_said_of_that_axis(scan: pf.Run, config: pf.Fusion
     assert note.startswith(("tracker: 16%", "tracker: 17%"))
 
 
-def test_a_sensor_of_nothing_but_nan_is_left_out(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
+def nothing(source: Source) -> Source:
+    """Of which no value is a number."""
+    return changed(source, lambda value: np.full_like(value, np.nan))
+
+
+def of_the_epoch(source: Source) -> Source:
+    """On another clock than the commands."""
+    return replace(source, stamp=source.stamp + 1_700_000_000 * SECOND)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "outcomes", "words"),
+    [
+        (nothing, {"invalid": 5999}, ("5999 rows", "no finite radial value", "invalid")),
+        (of_the_epoch, {"fused": 5999}, ("after the last command", "one clock")),
+    ],
+)
+def test_a_sensor_that_says_nothing_of_the_run_changes_nothing(
+    scan: pf.Run,
+    config: pf.FusionConfig,
+    camera_alone: pf.Estimates,
+    spoil: Callable[[Source], Source],
+    outcomes: dict[str, int],
+    words: tuple[str, ...],
 ) -> None:
-    """A minute of NaN: every measurement invalid, counted on each axis, and the estimates are the camera's alone."""
-    est, summary = fused(scan, config, lambda source: changed(source, lambda value: np.full_like(value, np.nan)))
-    check_same(est, camera_alone)
+    """The same estimates as of the camera alone to rounding, and no surer; what is wrong is said."""
+    est, summary = fused(scan, config, spoil)
     for axis in AXES:
-        assert said(summary, "5999 rows", f"no finite {axis} value", "invalid")
-        found = summary.axes[axis].sensors["tracker"]
-        assert found.outcomes == {"invalid": 5999}
-        assert found.verdict == "nothing fused"
-        assert found.nis_mean is None
-
-
-def shifted(seconds: float) -> Callable[[Source], Source]:
-    return lambda source: replace(source, stamp=source.stamp + int(seconds * 1e9))
-
-
-def test_a_sensor_on_the_epoch_s_clock_is_asked_about(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
-) -> None:
-    """Stamps of 2023 beside commands from 0 s: asked whether one clock stamped both; nothing of the run is touched."""
-    est, summary = fused(scan, config, shifted(1.7e9))
-    check_same(est, camera_alone)
-    assert said(summary, "after the last command", "one clock")
-
-
-def test_a_sensor_on_a_clock_since_boot_is_asked_about(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
-) -> None:
-    """The other way round everything lies before the first command: before_start, and the same question."""
-    early = replace(scan, command=shifted(1.7e9)(scan.command), reference=None)
-    early = replace(early, sensors={"vision": shifted(1.7e9)(scan.sensors["vision"])})
-    early = replace(early, sensors={**early.sensors, "tracker": scan.sensors["tracker"]})
-    est, summary = fused(early, config, lambda source: source)
-    check_same(est, camera_alone)
-    assert said(summary, "5999 rows have a time before the first command", "before_start")
-    assert said(summary, "before the first command", "one clock")
-    assert summary.axes["radial"].sensors["tracker"].outcomes == {"before_start": 5999}
+        np.testing.assert_allclose(est[axis].position, camera_alone[axis].position, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(est[axis].position_sd, camera_alone[axis].position_sd, rtol=1e-9)
+    assert said(summary, *words)
+    assert summary.axes["radial"].sensors["tracker"].outcomes == outcomes
+    if spoil is nothing:
+        assert summary.axes["radial"].sensors["tracker"].verdict == "nothing fused"

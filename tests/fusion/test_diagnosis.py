@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -22,8 +21,8 @@ from pumafuse.logs.run import Source
 from tuning_runs import LONG, SCENARIOS, scenario
 
 REPOSITORY = Path(__file__).parents[2]
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 DATA = Path(pf.__file__).parent / "data"
-SHARED = REPOSITORY.parent / "shared" / "data"
 LOGS = {
     "scan1": (DATA / "scan1", DATA / "fusion.toml"),
     "my-run": (REPOSITORY / "examples/my-run", REPOSITORY / "examples/my-run/fusion.toml"),
@@ -76,9 +75,7 @@ def moved_by(far: float, axis: str) -> Change:
 
 def notes(run: pf.Run, log: str) -> list[str]:
     """What ``fuse`` says, the cause first."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        return list(pf.fuse(run, logged(log)[1]).notes)
+    return list(pf.fuse(run, logged(log)[1]).notes)
 
 
 def refusal(run: pf.Run, log: str) -> str:
@@ -335,26 +332,8 @@ def test_no_scenario_gives_an_alarm(path: Path) -> None:
         pytest.skip("an arm")
     for seed in (1, 2, 3):
         sim = pf.simulate(pf.Scenario.load(path), seed)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", pf.PumafuseWarning)
-            found = pf.fuse(sim.run, sim.config).notes
+        found = pf.fuse(sim.run, sim.config).notes
         assert not [one for one in found if one.startswith("sensor '") and "contradicts" not in one]
-
-
-@pytest.mark.parametrize("place", ["puma-virtual/scan1", "servo/sin_sin", "servo/sin_time_square"])
-def test_recordings_of_others_give_no_alarm(place: str) -> None:
-    """With an arm and sensors that are guessed: nothing but the distance that falls, which is one."""
-    if not SHARED.exists():
-        pytest.skip("these recordings are not part of this repository")
-    run = pf.Run.read(SHARED / place)
-    period = float(np.median(np.diff(run.command.stamp))) / 1e9
-    plant = pf.FirstOrder(time_constant=0.045)
-    axes = {axis: pf.AxisModel(kind=run.kinds.get(axis, "length"), plant=plant) for axis in run.axes}
-    arm = pf.ArmModel(name="guess", update_period=period, delay=0.06, axes=axes)
-    config = pf.FusionConfig(arm=arm, sensors={name: pf.Sensor(sd=5e-4) for name in run.sensors})
-    assert [one.split(" (")[0] for one in alarms(run, config)] == (
-        ["sensor 'range' moves against the commands of radial"] if place.endswith("scan1") else []
-    )
 
 
 COMMANDS: dict[str, Callable[[FloatArray], FloatArray]] = {
