@@ -415,30 +415,6 @@ def test_an_encoder_for_each_axis_is_gated_apart(
     assert pf.Sensor(sd=sd, gate_rows=gate_rows).gates_rows(mixed(tmp_path)[1].arm) is wanted
 
 
-@pytest.mark.long
-def test_tune_says_the_keys_of_an_angle(folders: dict[str, Path]) -> None:
-    """Parameters have the names that files of an angle have, and the numbers that mm have for a length."""
-    found = {}
-    for unit in ("mm", "deg"):
-        folder = folders[unit]
-        config = pf.FusionConfig.load(folder / "fusion.toml")
-        run = pf.Run.read(folder)
-        fixed = ["disturbance_sd_mm", "gauge"] if unit == "mm" else ["disturbance_sd_deg", "gauge"]
-        tuned = pf.tune([run], config, fit=["noise", "delay"], fix=fixed, sd_prior=False)
-        found[unit] = json.loads(tuned.to_json())
-    length, angle = found["mm"], found["deg"]
-    assert [one["key"] for one in angle["parameters"]] == [
-        ".".join(of_kind(part, "angle") for part in one["key"].split(".")) for one in length["parameters"]
-    ]
-    assert "sensors.eye.sd_deg.a" in [one["key"] for one in angle["parameters"]]
-    for one, other in zip(length["parameters"], angle["parameters"], strict=True):
-        if one["key"].endswith("sd_mm.a") or one["key"].endswith("delay_ms"):
-            assert other["value"] == pytest.approx(one["value"], rel=0.02)
-    assert {bias["axis"]: f"{bias['bias_deg']:.2f}" for bias in angle["biases"]} == {
-        bias["axis"]: f"{bias['bias_mm']:.2f}" for bias in length["biases"]
-    }
-
-
 WRONG = [  # with the keys of angles, what is replaced by what, and what is said
     ("sd_deg = { a", "sd_mm = { a", "sensors.eye.sd_mm: no axis of the arm is an angle|sensors.eye.sd_mm.*give sd_deg"),
     ("input_noise_deg_rtHz", "input_noise_mm_rtHz", "input_noise_mm_rtHz.*input_noise_deg_rtHz"),

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from pumafuse.errors import ConfigError, PumafuseError, UnknownNameError
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
+from pumafuse.logs.frames import Cylindrical, Rotated
 from pumafuse.model.arm import ArmModel
 from refusals import one_line
 
@@ -100,6 +101,9 @@ configurations = st.builds(
     arm=st.sampled_from([ArmModel.load(PRESET), ArmModel.load("puma560-external")]),
     start=st.builds(Start, offset_sd=not_negative),
     process=st.dictionaries(st.sampled_from(AXES), processes),
+    frame=st.sampled_from(
+        [None, Cylindrical(base=(0.1, -0.2), positive="clockwise"), Rotated(azimuth=0.58, positive="clockwise")]
+    ),
     sensors=st.dictionaries(st.sampled_from(["tracker", "a b", "ä.β", '"', "0"]), sensors),
 )
 

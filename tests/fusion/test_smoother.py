@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import msgspec
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
+from executable import FUSION, SCAN
 from fusion.test_oracle import MODES, MS, UNDER, Case, Seen, T, cases, every, one, sensor, tame
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
@@ -111,16 +110,14 @@ def test_any_gated_run_is_fused_like_the_conditional_gaussian(case: Case, mode: 
 
 # ---- the shipped scan -----------------------------------------------------------------------------------------------
 
-DATA = Path(pf.__file__).parent / "data"
 LIMITS = {"tangential": 0.050e-3, "radial": 0.034e-3, "vertical": 0.040e-3}
 
 
 def test_the_scan_is_smoothed_as_well_as_promised() -> None:
     """With tracker and vision: errors within 0.050 / 0.034 / 0.040 mm of the truth, and error bars that hold."""
-    run, config = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    est = pf.fuse(run, config, sensors=["tracker", "vision"], rate=200.0, mode="smoothed")
+    run, config = pf.Run.read(SCAN), pf.FusionConfig.load(FUSION)
+    summary = pf.summarise(pf.fuse(run, config, sensors=["tracker", "vision"], rate=200.0, mode="smoothed"))
     for axis, limit in LIMITS.items():
-        found = pf.score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)
-        assert found.rows > 11_000
-        assert found.rmse <= limit
-        assert 0.90 <= found.coverage <= 0.99
+        found = summary.axes[axis].score
+        assert found is not None and found.rows > 11_000
+        assert found.rmse <= limit and 0.90 <= found.coverage <= 0.99
