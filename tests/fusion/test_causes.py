@@ -20,6 +20,7 @@ from pumafuse.filter.response import response
 from pumafuse.fusion.causes import Cause, Tried, evidence_of, suspects, together
 from pumafuse.fusion.consistency import Consistency, Finding, consistency, log_likelihood
 from pumafuse.fusion.summary import decode, encode
+from pumafuse.fusion.verdicts import sentence
 from tuning_runs import with_sensors
 
 changed = msgspec.structs.replace
@@ -159,9 +160,9 @@ def test_the_one_thing_that_is_wrong_is_named_first_with_its_size(world: str) ->
     """On both axes, its size to a quarter; of a lag alone a latency is said."""
     run, known, cause, size = WORLDS[world]
     for one in found(run(), known):
-        assert one.causes[0].cause is cause, one.verdict
+        assert one.causes[0].cause is cause, sentence(one)
         assert one.causes[0].size == pytest.approx(size, rel=0.25)
-        assert ("latency_ms" in one.verdict) == (cause in (Cause.LAG, Cause.PLANT)), one.verdict
+        assert ("latency_ms" in sentence(one)) == (cause in (Cause.LAG, Cause.PLANT)), sentence(one)
 
 
 @pytest.mark.parametrize(
@@ -171,8 +172,8 @@ def test_smoothed_noise_is_not_taken_for_small_noise(change: Callable[[np.ndarra
     """Filtered values, their lag known: innovations are too small, but a smaller sd alone is not the advice."""
     for one in found(recorded(seen=change), config(latency=late)):
         assert one.finding is Finding.TOO_SMALL
-        assert Cause.CORRELATED in [each.cause for each in one.causes], one.verdict
-        assert "the noise is correlated" in one.verdict and "latency_ms" not in one.verdict
+        assert Cause.CORRELATED in [each.cause for each in one.causes], sentence(one)
+        assert "the noise is correlated" in sentence(one) and "latency_ms" not in sentence(one)
 
 
 def test_where_nothing_is_wrong_no_cause_is_named() -> None:
@@ -196,7 +197,7 @@ def test_beside_another_sensor_the_wrong_one_is_named(sensor: str) -> None:
         assert first.size == pytest.approx(0.02, rel=0.1)
         if one.causes:
             whose = "latency_ms is" if sensor == "camera" else "latency_ms of camera is"
-            assert re.search(rf": {whose} (19|20|21)[.\d]* ms too small", one.verdict), one.verdict
+            assert re.search(rf": {whose} (19|20|21)[.\d]* ms too small", sentence(one)), sentence(one)
 
 
 def test_score_and_information_are_those_of_generalised_least_squares() -> None:

@@ -30,6 +30,7 @@ from pumafuse.fusion.consistency import (
     ljung_box,
     log_likelihood,
 )
+from pumafuse.fusion.verdicts import sentence
 from tuning_runs import with_sensors
 
 PERIOD, DELAY, TAU = 28_000_000, 60_450_000, 0.0425  # ns, ns, s
@@ -184,7 +185,7 @@ def test_the_innovations_of_a_right_filter_are_white(matched: Mapping[str, Consi
 
 def test_a_right_filter_is_called_consistent(matched: Mapping[str, Consistency]) -> None:
     """In at least nine seeds of ten; none is blamed on latency or colour."""
-    verdicts = [found.verdict for found in matched.values()]
+    verdicts = [sentence(found) for found in matched.values()]
     assert sum(verdict.endswith(": consistent") for verdict in verdicts) >= 0.9 * SEEDS
     assert not any("latency_ms" in verdict for verdict in verdicts)
 
@@ -208,14 +209,14 @@ def moving() -> pf.Run:
 def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, latency: float, verdict: str) -> None:
     """A latency that is 5 and 30 ms too small and too large: on every axis."""
     for axis, found in judged(moving, World(latency=latency)).items():
-        assert re.search(verdict, found.verdict), (axis, found.verdict)
+        assert re.search(verdict, sentence(found)), (axis, sentence(found))
 
 
 @pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 def test_a_verdict_on_what_a_gate_has_left_says_so(moving: pf.Run) -> None:
     """With a third of the noise and a gate of 2 the rest fits by selection: the verdict is how many were rejected."""
     for axis, found in judged(moving, World(sd=0.17e-3, gate=2.0)).items():
-        assert re.search(r"but \d\d% were rejected", found.verdict), (axis, found.verdict)
+        assert re.search(r"but \d\d% were rejected", sentence(found)), (axis, sentence(found))
 
 
 def test_innovations_are_looked_at_beyond_the_next_one(moving: pf.Run) -> None:
@@ -229,14 +230,14 @@ def test_innovations_are_looked_at_beyond_the_next_one(moving: pf.Run) -> None:
     innovation[order] = coloured * est.measurements.innovation_sd[order]
     spoilt = replace(est, measurements=replace(est.measurements, innovation=innovation))
     found = [consistency(spoilt, "camera", axis) for axis in est.axes]
-    assert found and all(re.search(r"not white \(lag 3: \+0\.[345]", one.verdict) for one in found if one)
+    assert found and all(re.search(r"not white \(lag 3: \+0\.[345]", sentence(one)) for one in found if one)
 
 
 def test_the_verdict_on_smoothed_estimates_needs_no_velocity_of_theirs(moving: pf.Run) -> None:
     """They have none; a latency 30 ms too long is still found on every axis."""
     est = pf.fuse(moving, World(latency=0.050).config(moving), mode="smoothed")
     for axis in est.axes:
-        assert re.search("is (29|30|31).* ms too large", consistency(est, "camera", axis).verdict)
+        assert re.search("is (29|30|31).* ms too large", sentence(consistency(est, "camera", axis)))
 
 
 @pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")

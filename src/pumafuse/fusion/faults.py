@@ -81,11 +81,7 @@ class Fault:
 
 
 def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
-    """A sentence on each fault of a configured sensor, or of the commands.
-
-    Raises:
-        RunError: A sensor, or the commands, are in another unit than their name says.
-    """
+    """A sentence on each fault of a configured sensor, or of the commands."""
     faults = faults_of(segment, config)
     if refused := [one.sentence for one in faults if one.refused]:
         raise RunError(refused[0])

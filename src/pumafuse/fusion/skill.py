@@ -73,12 +73,7 @@ class Skill(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def skill(est: Estimates, measured: Measurements) -> Skill | None:
-    """Errors of predicting the next measurement of a sensor on an axis; None with fewer than two in every segment.
-
-    Args:
-        est: The estimates.
-        measured: Their components of one sensor on one axis.
-    """
+    """Errors of predicting the next measurement of a sensor on an axis; None with fewer than two in every segment."""
     predicted = np.isfinite(measured.innovation)
     parts = [measured.where(predicted & (measured.segment == number)) for number in range(len(est.segments))]
     if turn := _turn(est, measured):

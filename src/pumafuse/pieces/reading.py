@@ -58,15 +58,7 @@ class Log:
         return all(one.ended for one in self._tables.values())
 
     def read_on(self, rows: int) -> int:
-        """Read about as many more ``rows``, from whichever table is behind the others.
-
-        Returns:
-            Before which instant all rows are there, int ns, but for those that come more than 10 s too late; ``NEVER``
-            when everything is read.
-
-        Raises:
-            RunError: A table cannot be read, or is not in the order of time.
-        """
+        """Read about as many more ``rows``, from whichever table is behind the others."""
         until = self.done + rows
         while not self.ended and self.done < until:
             behind = min((one for one in self._tables.values() if not one.ended), key=lambda one: one.frontier)
@@ -76,11 +68,7 @@ class Log:
         return self._cut
 
     def run(self) -> Run | None:
-        """The run of the rows at hand; None as long as these do not command every axis.
-
-        Raises:
-            RunError: They are no recorded run.
-        """
+        """The run of the rows at hand; None as long as these do not command every axis."""
         try:
             if self._listed is None:
                 return of_table(self._tables[()].table())
@@ -100,9 +88,6 @@ def rows_of(path: Path) -> int:
     """How many rows a run has that can be read piece by piece; 0 for one that cannot.
 
     It can if all its tables are Parquet, each with one column of stamps, and no rows are chosen by ``where``.
-
-    Raises:
-        ConfigError: ``run.toml`` is wrong.
     """
     if path.suffix == ".parquet":
         return tables.row_count(path)
@@ -202,11 +187,7 @@ class _Rows:
         return part.rows
 
     def _leave_out(self, late: BoolArray, stray: BoolArray) -> None:
-        """Leave out rows that come too late, if each is a stray one, and they are few.
-
-        Raises:
-            RunError: They are not.
-        """
+        """Leave out rows that come too late, if each is a stray one, and they are few."""
         self._left_out += int(np.count_nonzero(late))
         rows = np.flatnonzero(late & ~stray if self._left_out <= _MOST_LATE else late)
         if len(rows):
