@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -43,11 +43,13 @@ def arm(tau: float = TAU, delay: float = DELAY) -> pf.ArmModel:
     return pf.ArmModel(name="arm", update_period=PERIOD, delay=delay, axes=dict.fromkeys(AXES, plant))
 
 
-def config(**sensor: float) -> pf.FusionConfig:
+def config(run: pf.Run | None = None, **sensor: float) -> pf.FusionConfig:
+    """What is true of runs that are not changed, of their axes."""
     known = changed(pf.Sensor(sd=SD, latency=LATENCY, gate=0.0), **sensor)
-    process = pf.Process(input_noise=0.05e-3, drift=0.3e-3)
-    start = pf.Start(offset_sd=2e-3)
-    return pf.FusionConfig(arm=arm(), start=start, process=dict.fromkeys(AXES, process), sensors={"camera": known})
+    axes = AXES if run is None else run.axes
+    model = changed(arm(), axes=dict.fromkeys(axes, arm().axes["a"]))
+    process = dict.fromkeys(axes, pf.Process(input_noise=0.05e-3, drift=0.3e-3))
+    return pf.FusionConfig(arm=model, start=pf.Start(offset_sd=2e-3), process=process, sensors={"camera": known})
 
 
 def recorded(
@@ -60,8 +62,11 @@ def recorded(
     late: float = LATENCY,
     others: Mapping[str, float] | None = None,
     seed: int = 1,
+    axes: Sequence[str] = AXES,
+    seconds: float = 40.0,
+    told: Callable[[int], np.ndarray] = raster,
 ) -> pf.Run:
-    """40 s of a raster.
+    """A run with one thing changed.
 
     Args:
         moved: What the arm makes of its response, every 2 ms.
@@ -72,16 +77,19 @@ def recorded(
         late: The sensor's true latency [s].
         others: More sensors by name with their sd, as late as they are configured.
         seed: Of all noise.
+        axes: Which all have the same commands.
+        seconds: How long it is.
+        told: So many commands.
     """
     rng, true = np.random.default_rng(seed), model or arm()
-    command, fine = raster(1430), np.arange(0, 40 * 10**9, 2 * 10**6)
+    command, fine = told(int(seconds / PERIOD) + 2), np.arange(0, round(seconds * 1e9), 2 * 10**6)
     given = np.rint(np.arange(len(command)) * PERIOD * 1e9).astype(np.int64)
     led = moved(response(true.axes["a"], PERIOD, true.delay, given, command, 0.0, fine))
-    valid = np.rint(np.arange(0.2, 39.9, EVERY) * 1e9).astype(np.int64)
+    valid = np.rint(np.arange(0.2, seconds - 0.1, EVERY) * 1e9).astype(np.int64)
     decay = math.exp(-0.002 / TAU)
     spread = process * 0.05e-3 * math.sqrt((1.0 - decay**2) / (2.0 * TAU))
     values: dict[str, dict[str, np.ndarray]] = {name: {} for name in ("camera", *(others or {}))}
-    for axis in AXES:
+    for axis in axes:
         strays = lfilter([1.0], [1.0, -decay], spread * rng.standard_normal(len(fine)))
         walk = (
             2e-3 * rng.standard_normal() + process * 0.3e-3 * math.sqrt(0.002) * rng.standard_normal(len(fine)).cumsum()
@@ -92,7 +100,7 @@ def recorded(
             values[name][axis] = position + sd * rng.standard_normal(len(valid))
     stamps = {name: valid + round((late if name == "camera" else 0.0) * 1e9) for name in values}
     sensors = {name: (stamps[name], values[name]) for name in values}
-    return pf.Run.from_arrays(given, dict.fromkeys(AXES, command), sensors)
+    return pf.Run.from_arrays(given, dict.fromkeys(axes, command), sensors)
 
 
 def found(run: pf.Run, known: pf.FusionConfig, sensor: str = "camera") -> list[Consistency]:

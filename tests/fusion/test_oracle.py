@@ -134,7 +134,7 @@ def check(case: Case, mode: str = "filtered", engine: str = "compiled") -> None:
         oracle = AxisOracle(run, config, axis)
         check_innovations(fused.where(fused.axis == number), oracle)
         check_estimates(estimates[axis], getattr(oracle, mode)(times))
-        if mode != "as_live":
+        if mode != "as_live" and estimates.biases:
             check_biases(estimates, axis, oracle)
 
 
@@ -413,7 +413,7 @@ def tame(case: Case) -> Case:
     return replace(case, seen=seen, process=process, offset_sd=min(case.offset_sd, 5e-3))
 
 
-@settings(max_examples=100)
+@settings(max_examples=80)
 @given(cases(), st.sampled_from(list(MODES)))
 def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
     """Random plants, delays, gains, gaps, noise and sensors: nothing deviates from the joint Gaussian."""
