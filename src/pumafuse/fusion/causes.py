@@ -264,10 +264,7 @@ class _Part(NamedTuple):
 
     def position(self, model: AxisModel, time: TimeArray) -> FloatArray:
         """Where all commands lead an axis like this, (n,)."""
-        arm, start = self.config.arm, self.segment.start[self.axis]
-        return start + response(
-            model, arm.update_period, arm.delay_of(self.axis), *self.segment.given(self.axis), start, time
-        )
+        return self.segment.start[self.axis] + self.segment.led(self.config.arm, self.axis, time, model)
 
 
 def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -> _Part:

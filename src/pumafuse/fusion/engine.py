@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import NO_STAMP, CodeArray, FloatArray, TimeArray
-from ..filter.core import Filter, Model, Record, linearise
+from ..filter.core import Filter, Model, linearise
 from ..filter.events import Events, Results
 from ..filter.outcome import Outcome
 from .config import FusionConfig
@@ -77,7 +77,7 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     results = _undecided(events)
     if outcome is not None:
         results.outcome[place] = outcome
-    core = Filter(_certain_model(segment, config), segment.origin)
+    core = Filter(_certain(model_of(segment, config)), segment.origin)
     core.run(events, results, _NO_TIMES, "filtered" if outcome is None else "repeated")
     return results.rows(place)
 
@@ -95,7 +95,7 @@ def linearised(
     events, place = segment.events(config)
     results = _undecided(events)
     results.outcome[place] = outcome
-    model = _certain_model(segment, config)
+    model = _certain(model_of(segment, config))
     tangents = [_slope(segment, config, model, *each) for each in beside]
     d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
     return results.rows(place), d_nu[:, place], d_s[:, place]
@@ -121,7 +121,7 @@ def _model_beside(segment: Segment, config: FusionConfig, model: Model, other: F
         model = Model(model.axis, *sensors_of(other, segment.axes, segment.sensors, biased))
     if other.arm is config.arm and other.process is config.process and other.start is config.start:
         return model
-    return model._replace(axis=_certain(axes_of(other, segment.axes, segment.start)))
+    return _certain(model._replace(axis=axes_of(other, segment.axes, segment.start)))
 
 
 def model_of(segment: Segment, config: FusionConfig) -> Model:
@@ -129,15 +129,10 @@ def model_of(segment: Segment, config: FusionConfig) -> Model:
     return filter_model(config, segment.axes, segment.sensors, segment.start, biased_sensors(segment, config))
 
 
-def _certain_model(segment: Segment, config: FusionConfig) -> Model:
+def _certain(model: Model) -> Model:
     """The same without error bars of lag and gain, which depend on the numbers that are fitted and change no ν."""
-    model = model_of(segment, config)
-    return model._replace(axis=_certain(model.axis))
-
-
-def _certain(axis: Record) -> Record:
-    axis["lag_sd"] = axis["gain_sd"] = 0.0
-    return axis
+    model.axis["lag_sd"] = model.axis["gain_sd"] = 0.0
+    return model
 
 
 def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:

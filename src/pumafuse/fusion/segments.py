@@ -21,12 +21,13 @@ from ..errors import RunError, UnknownNameError
 from ..filter.core import Model, classify
 from ..filter.events import COMMAND, Events, joined
 from ..filter.outcome import ABSENT, Outcome
+from ..filter.response import response
 from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind, in_order
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
 from ..logs.screening import held
-from ..model.arm import ArmModel
+from ..model.arm import ArmModel, AxisModel
 from ..units import AN, of_kind, seconds
 from .config import FusionConfig
 from .setup import filter_model
@@ -140,6 +141,18 @@ class Segment:
         number, rows = self.axes.index(axis), self.command_rows
         chosen = np.flatnonzero(rows.known[:, number] == _FUSED)
         return rows.stamp.take(chosen), rows.value[:, number].take(chosen)
+
+    def led(self, arm: ArmModel, axis: str, time: TimeArray, model: AxisModel | None = None) -> FloatArray:
+        """Where the commands lead an axis [m or rad], beyond its start, at ``time`` [int64 ns], (n,).
+
+        Args:
+            arm: Says how the axis answers.
+            axis: Which.
+            time: Ascending, (n,).
+            model: How it answers instead, but for its delay.
+        """
+        model, delay = model or arm.axes[axis], arm.delay_of(axis)
+        return response(model, arm.update_period, delay, *self.given(axis), self.start[axis], time)
 
     def rows_by_sensor(self) -> dict[str, Events]:
         """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
