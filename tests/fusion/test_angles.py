@@ -79,15 +79,11 @@ def write_run(folder: Path, unit: str, values: float = 1.0, rows: int = 300) -> 
     columns = {"a": u, "b": 0.5 * u}
 
     def table(name: str, at: np.ndarray, sd: float) -> None:
-        head = ",".join(["time_s", *(f"{axis}_{unit}" for axis in columns)])
-        noisy = {
-            axis: np.interp(at - 0.08, time, value) + rng.normal(0.0, sd, len(at)) for axis, value in columns.items()
+        seen = {
+            f"{axis}_{unit}": np.round(np.interp(at - 0.08, time, value) + rng.normal(0.0, sd, len(at)), 6) * values
+            for axis, value in columns.items()
         }
-        body = [
-            ",".join([repr(float(at[n])), *(repr(float(np.round(part[n], 6) * values)) for part in noisy.values())])
-            for n in range(len(at))
-        ]
-        (folder / f"{name}.csv").write_text("\n".join([head, *body, ""]))
+        pacsv.write_csv(pa.table({"time_s": at, **seen}), folder / f"{name}.csv")
 
     table("commands", time + 0.08, 0.0)
     table("eye", np.arange(10, 560) * 0.01, 0.2)

@@ -40,7 +40,7 @@ def hostile_commands(draw: st.DrawFn) -> tuple[list[int], dict[str, list[float]]
     return [row[0] for row in rows], {"radial": [row[1] for row in rows], "vertical": [row[2] for row in rows]}
 
 
-@settings(properties, max_examples=60)
+@settings(properties, max_examples=40)
 @given(
     crowded_runs(),
     hostile_commands(),

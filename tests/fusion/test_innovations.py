@@ -47,7 +47,7 @@ def check(run: Run, config: FusionConfig) -> Results:
     return found
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(cases())
 def test_innovations_of_any_run_are_those_of_its_fusion(case: Case) -> None:
     """Random plants, noise and sensors, gates narrow enough to reject."""

@@ -42,7 +42,7 @@ ARM = ArmModel(
     },
 )
 
-properties = settings(max_examples=100)
+properties = settings(max_examples=60)
 
 Rows = tuple[Sequence[int], Mapping[str, Sequence[float]]]  # stamps and values by axis
 

@@ -97,7 +97,7 @@ def test_a_reacquired_gate_is_a_jump_of_the_offset(mode: str) -> None:
     assert rows[Outcome.REACQUIRED] == {("tracker", 26), ("tracker", 36)}
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(cases(), st.sampled_from(["filtered", "smoothed"]))
 def test_any_gated_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
     """Gates narrow enough to reject and to re-acquire."""
