@@ -72,11 +72,10 @@ def test_error_bars_that_hold_have_95_percent_coverage() -> None:
 
 def test_without_velocity_or_reference_there_is_no_score() -> None:
     """Smoothed estimates have no velocity; a reference of another axis or another time has none to compare with."""
-    time = PERIOD * np.arange(10)
+    time, nothing = PERIOD * np.arange(10), np.zeros(10, dtype=np.int64)
     reference = track(time, path(time))
     assert score(time, np.full(10, np.nan), np.nan, reference) is None
     assert score(time + 100.0, mean_velocity(time), 1e-3, reference) is None
-    nothing = np.zeros(10, dtype=np.int64)
     assert score_velocity(time, nothing, path(time), path(time), reference, "vertical", PERIOD) is None
 
 
