@@ -191,35 +191,23 @@ def test_the_wire_is_in_degrees_and_a_record_reads_back(folders: dict[str, Path]
     assert last["a"]["position_deg"] == pytest.approx(stream.live.estimate(59 * T)["a"].position / DEG, rel=1e-14)
 
 
-MIXED = """
-name = "both"
-update_period_ms = 20.0
-delay_ms = 30.0
-[axes.x]
-plant = "first-order"
-time_constant_ms = 50.0
-[axes.yaw]
-kind = "angle"
-plant = "first-order"
-time_constant_ms = 40.0
-"""
-BOTH = """
-arm = "arm.toml"
-[process]
-input_noise_mm_rtHz = 0.5
-input_noise_deg_rtHz = 0.7
-[sensors.camera]
-sd_mm = 0.3
-sd_deg = 0.1
-bias_sd_deg = 2.0
-turn_deg = 360.0
-"""
+BOTH = {
+    "arm": {
+        "name": "both",
+        "update_period_ms": 20.0,
+        "delay_ms": 30.0,
+        "axes": {
+            "x": {"plant": "first-order", "time_constant_ms": 50.0},
+            "yaw": {"kind": "angle", "plant": "first-order", "time_constant_ms": 40.0},
+        },
+    },
+    "process": {"input_noise_mm_rtHz": 0.5, "input_noise_deg_rtHz": 0.7},
+    "sensors": {"camera": {"sd_mm": 0.3, "sd_deg": 0.1, "bias_sd_deg": 2.0, "turn_deg": 360.0}},
+}
 
 
-def mixed(folder: Path, turns: float = 0.0) -> tuple[pf.Run, pf.FusionConfig]:
+def mixed(turns: float = 0.0) -> tuple[pf.Run, pf.FusionConfig]:
     """An arm with x and yaw, and a camera that sees both; yaw goes round, measured within a turn or not."""
-    (folder / "arm.toml").write_text(MIXED)
-    (folder / "fusion.toml").write_text(BOTH)
     rng, time = np.random.default_rng(11), np.arange(150) * T
     x, yaw = 30.0 * np.sin(time), 150.0 + 180.0 * time
     seen = np.interp(time - 0.09, time, yaw) + rng.normal(0.0, 0.1, 150)
@@ -236,12 +224,12 @@ def mixed(folder: Path, turns: float = 0.0) -> tuple[pf.Run, pf.FusionConfig]:
         },
         reference=(time, {"x": x / 1e3, "yaw": yaw * DEG}),
     )
-    return run, pf.FusionConfig.load(folder / "fusion.toml")
+    return run, pf.FusionConfig.parse(BOTH)
 
 
 def test_one_run_may_have_both(tmp_path: Path) -> None:
     """Columns, keys and tables of each axis are in its own unit, and a configuration reads back."""
-    run, config = mixed(tmp_path)
+    run, config = mixed()
     est = pf.fuse(run, config)
     summary = results.write(est, tmp_path / "out", force=False)
     table = papq.read_table(tmp_path / "out" / "measurements.parquet").to_pydict()
@@ -261,9 +249,9 @@ def test_one_run_may_have_both(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [{}, {"mode": "as-live"}, {"mode": "smoothed"}, {"engine": "filterpy"}])
-def test_a_sensor_within_a_turn_is_as_good_as_one_that_counts_them(tmp_path: Path, mode: dict[str, Any]) -> None:
+def test_a_sensor_within_a_turn_is_as_good_as_one_that_counts_them(mode: dict[str, Any]) -> None:
     """Estimates are those of the same measurements without the jumps by 360°, and so is the skill."""
-    whole, within = (pf.fuse(*mixed(tmp_path, turns), **mode) for turns in (0.0, 1.0))
+    whole, within = (pf.fuse(*mixed(turns), **mode) for turns in (0.0, 1.0))
     assert np.ptp(within.measurements.of("camera", "yaw").value) <= 360.0 * DEG < np.ptp(within["yaw"].position)
     sd = whole["yaw"].position_sd
     assert np.max(np.abs(within["yaw"].position - whole["yaw"].position) / sd) < 1e-8
@@ -334,13 +322,12 @@ def turned(folder: Path, how: str, command: str = "", sensor: str = "") -> pf.Ru
     return pf.Run.read(folder)
 
 
-def turning(folder: Path, more: str = "") -> pf.FusionConfig:
+def turning(turn_deg: float = 0.0) -> pf.FusionConfig:
     """A table that turns and a sensor of it."""
-    (folder / "arm.toml").write_text(MIXED.replace('[axes.x]\nplant = "first-order"\ntime_constant_ms = 50.0\n', ""))
-    (folder / "fusion.toml").write_text(
-        f'arm = "arm.toml"\n[process]\ninput_noise_deg_rtHz = 0.3\n[sensors.eye]\nsd_deg = 0.1\n{more}'
-    )
-    return pf.FusionConfig.load(folder / "fusion.toml")
+    axes = {"yaw": {"kind": "angle", "plant": "first-order", "time_constant_ms": 40.0}}
+    arm = {"name": "table", "update_period_ms": 20.0, "delay_ms": 30.0, "axes": axes}
+    sensors = {"eye": {"sd_deg": 0.1, "turn_deg": turn_deg}}
+    return pf.FusionConfig.parse({"arm": arm, "process": {"input_noise_deg_rtHz": 0.3}, "sensors": sensors})
 
 
 @pytest.mark.parametrize("turn", [", turn_deg = 360", ', unit = "deg", turn_deg = 360.0'])
@@ -354,7 +341,7 @@ def test_columns_within_a_turn_go_on_beside_the_commands(turn: str, tmp_path: Pa
     ):
         assert one is not None and other is not None
         np.testing.assert_allclose(other.values["yaw"], one.values["yaw"], atol=1e-9)
-    config = turning(tmp_path)
+    config = turning()
     first, second = (pf.fuse(run, config) for run in (whole, made))
     np.testing.assert_allclose(first["yaw"].position, second["yaw"].position, atol=1e-9)
     assert np.ptp(first["yaw"].position) > 600.0 * DEG
@@ -362,14 +349,14 @@ def test_columns_within_a_turn_go_on_beside_the_commands(turn: str, tmp_path: Pa
 
 def test_columns_within_a_turn_are_said(tmp_path: Path) -> None:
     """Without ``turn_deg`` the model goes back by a turn: commands and sensor are named, with how often."""
-    notes = pf.fuse(turned(tmp_path / "run", "within"), turning(tmp_path)).notes
+    notes = pf.fuse(turned(tmp_path / "run", "within"), turning()).notes
     assert any(
         note.startswith("the commands: an angle that begins anew on yaw after each turn, 3 times: ") for note in notes
     ), notes
     assert any(
         note.startswith("sensor 'eye': an angle that begins anew on yaw after each turn, 2 times: ") for note in notes
     )
-    notes = pf.fuse(turned(tmp_path / "other", "within"), turning(tmp_path, "turn_deg = 360\n")).notes
+    notes = pf.fuse(turned(tmp_path / "other", "within"), turning(360.0)).notes
     assert not any("sensor 'eye': an angle" in note for note in notes)
     turned(tmp_path / "mm", "whole")
     lengths = (tmp_path / "mm" / "run.toml").read_text().replace('"yaw_deg"', '"yaw_deg", unit = "mm", turn_deg = 360')
@@ -378,9 +365,9 @@ def test_columns_within_a_turn_are_said(tmp_path: Path) -> None:
         pf.Run.read(tmp_path / "mm")
 
 
-def test_two_rejected_measurements_on_both_sides_of_the_turn_agree(tmp_path: Path) -> None:
+def test_two_rejected_measurements_on_both_sides_of_the_turn_agree() -> None:
     """A slip by about half a turn is seen as +179.5° and −179.5°: one degree apart, so the second is believed."""
-    _, config = mixed(tmp_path)
+    _, config = mixed()
     time = np.arange(100) * T
     yaw = np.full(100, 10.0)
     seen = yaw.copy()
@@ -405,10 +392,10 @@ def test_two_rejected_measurements_on_both_sides_of_the_turn_agree(tmp_path: Pat
     ],
 )
 def test_an_encoder_for_each_axis_is_gated_apart(
-    tmp_path: Path, sd: float | dict[str, float], gate_rows: bool | None, wanted: bool
+    sd: float | dict[str, float], gate_rows: bool | None, wanted: bool
 ) -> None:
     """A sensor of angles alone rejects one axis, one of lengths the row, unless the configuration says otherwise."""
-    assert pf.Sensor(sd=sd, gate_rows=gate_rows).gates_rows(mixed(tmp_path)[1].arm) is wanted
+    assert pf.Sensor(sd=sd, gate_rows=gate_rows).gates_rows(mixed()[1].arm) is wanted
 
 
 WRONG = [  # with the keys of angles, what is replaced by what, and what is said
