@@ -64,6 +64,12 @@ def test_half_a_start_level_is_refused(start):
         in_axes(replace(arc(), start=start), None)
 
 
+def test_a_sensor_in_x_y_without_a_frame_is_refused():
+    """Its axes are none of the arm's."""
+    run = pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]}, {"camera": ([0.01], {"x": [0.5], "y": [0.0]})})
+    assert "give a [frame]" in one_line(pf.RunError, lambda: pf.fuse(run, config()))
+
+
 def test_compare_takes_the_reference_of_a_framed_run(tmp_path):
     """From the log itself or from the result folder."""
     (tmp_path / "log.csv").write_text(
