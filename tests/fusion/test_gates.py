@@ -143,18 +143,19 @@ def test_a_sensor_stands_for_what_is_believed_for_half_a_second(since: float, wa
     assert outcomes(fused(rows, BOTH), "camera") == [REJECTED, wanted]
 
 
+@pytest.mark.parametrize("engine", ["compiled", "filterpy"])
 @pytest.mark.parametrize(
     ("settled", "quarrel", "wanted"),
     [(4.5, [], REACQUIRED), (5.5, [], REJECTED), (5.5, [3 * OFF, 5 * OFF], REACQUIRED)],
 )
 def test_re_acquisitions_are_forgotten_after_five_seconds_of_agreement(
-    settled: float, quarrel: list[float], wanted: Outcome
+    settled: float, quarrel: list[float], wanted: Outcome, engine: str
 ) -> None:
     """Until then a sensor that followed the arm by itself does not stand against one that did not."""
     seen = [0.0] * 4 + [OFF] * round(10 * settled + 5)
     seen[30 : 30 + len(quarrel)] = quarrel
     rows = every(100, [0.0, *seen, *[OFF] * 10]) + every(100, [*seen, 2 * OFF, 2 * OFF], 30, "camera")
-    estimates = fused(rows, BOTH)
+    estimates = fused(rows, BOTH, engine=engine)
     assert outcomes(estimates)[4:10] == [FUSED, *[REJECTED] * 4, REACQUIRED]
     assert outcomes(estimates, "camera")[-2:] == [REJECTED, wanted]
 
