@@ -48,6 +48,13 @@ def _here(words: list[str]) -> subprocess.CompletedProcess[str]:
     return subprocess.CompletedProcess(words, int(ended.value.code or 0), out.getvalue(), err.getvalue())
 
 
+def printed(*arguments: object) -> str:
+    """What a command that succeeds prints, run in this process, which saves the start of another one."""
+    done = _here([str(EXECUTABLE), *map(str, arguments)])
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def refused(*arguments: object) -> str:
     """The one line that a refusal prints, beside warnings; nothing on stdout."""
     done = pumafuse(*arguments, code=1)

@@ -17,6 +17,7 @@ TimeArray: TypeAlias = npt.NDArray[np.int64]  # absolute stamps, int64 ns
 
 NO_STAMP = -(2**63)  # in a TimeArray: a row without a readable stamp (numpy's NaT)
 NEVER, ALWAYS = 2**63 - 1, 1 - 2**63  # in a TimeArray: after all stamps, before all stamps
+SD_OF_MEDIAN = 1.4826  # the standard deviation of normal errors, over the median of their sizes
 REACH_NS = 4.6e18  # |stamp| whose differences int64 ns can hold: the years 1824 to 2115
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +16,7 @@ from pumafuse.tuning.likelihood import Likelihood
 from refusals import one_line
 from tuning_runs import outage, scenario
 
+quiet = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 PARTS = {
     "gain and recovery": Case(one(UNDER, gain=pf.Gain(slope=0.08, intercept=0.93), gain_recovery=0.1)),
     "disturbance, bias and latencies": Case(
@@ -44,12 +44,6 @@ def with_all_commands(run: pf.Run, since: float, until: float) -> pf.Run:
     return replace(cut(run, since, until), command=cut(run, -np.inf, until).command, start=run.start)
 
 
-def quiet(run: pf.Run, config: pf.FusionConfig, **how: object) -> Estimates:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        return pf.fuse(run, config, **how)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("how", [*MODES, "filterpy"])
 @pytest.mark.parametrize("case", PARTS.values(), ids=PARTS.keys())
 def test_a_part_is_the_conditional_gaussian_given_its_measurements(case: Case, how: str) -> None:
@@ -67,11 +61,12 @@ def test_a_part_is_the_conditional_gaussian_given_its_measurements(case: Case, h
     check_estimates(est["radial"], getattr(oracle, "filtered" if how == "filterpy" else how)(times))
 
 
+@quiet
 def test_an_arm_in_motion_is_in_motion_where_a_part_begins() -> None:
     """Within 4 sd throughout; a file that is cut there is off by speed times lag, twenty times as much."""
     found, since = scenario("panel-tracker-outage", 0.1, 0.02), 0.9
     sim = pf.simulate(replace_(found, start=replace_(found.start, offset_sd=1e-4)), 1)
-    part, file = quiet(sim.run.between(since), sim.config), quiet(cut(sim.run, since), sim.config)
+    part, file = pf.fuse(sim.run.between(since), sim.config), pf.fuse(cut(sim.run, since), sim.config)
     begin = int(np.searchsorted(sim.run.command.stamp, sim.run.command.stamp[0] + since * 1e9))
     assert part.time[0] == (sim.run.command.stamp[begin] - sim.run.command.stamp[0]) / 1e9
     assert part.origin + round(part.time[0] * 1e9) == file.origin
@@ -88,10 +83,11 @@ def true(run: pf.Run, est: Estimates) -> np.ndarray:
     return np.interp(est.time, (reference.stamp - est.origin) / 1e9, reference.values["tangential"])
 
 
+@quiet
 def test_a_part_from_the_beginning_is_a_file_that_ends_there() -> None:
     """Estimates, outcomes, skill and notes to the last bit, but for the reference at the very end."""
     sim = outage(1)
-    part, file = (quiet(run, sim.config) for run in (sim.run.between(until=2.0), cut(sim.run, 0.0, 2.0)))
+    part, file = (pf.fuse(run, sim.config) for run in (sim.run.between(until=2.0), cut(sim.run, 0.0, 2.0)))
     assert part["tangential"].position.tolist() == file["tangential"].position.tolist()
     one, other = pf.summarise(part), pf.summarise(file)
     assert (one.from_s, one.to_s) == (None, 2.0)
@@ -100,6 +96,7 @@ def test_a_part_from_the_beginning_is_a_file_that_ends_there() -> None:
     assert replace_(one, to_s=None) == other
 
 
+@quiet
 def test_tuning_on_a_part_is_tuning_on_its_measurements() -> None:
     """The likelihood is that of a file without the others, and a search leaves the rest of the part for validation."""
     sim = outage(1)
@@ -107,14 +104,13 @@ def test_tuning_on_a_part_is_tuning_on_its_measurements() -> None:
     assert Likelihood([part], sim.config).evaluate(sim.config).axes.tolist() == pytest.approx(
         Likelihood([file], sim.config).evaluate(sim.config).axes.tolist(), abs=1e-9
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        found = pf.tune([part], sim.config, fix=["process"])
+    found = pf.tune([part], sim.config, fix=["process"])
     assert found.details.parts == {sim.run.name: (1.0, 3.0)}
     assert {check.since_s for check in found.details.validation or []} == {1.0 + 2.0 / 3.0 * 2.0}
     assert len({check.axis for check in found.details.validation or []}) == 2
 
 
+@quiet
 def test_a_part_that_cannot_be_used_is_one_line() -> None:
     """No interval, nothing measured or asked for there, and a clock that was set back."""
     sim = outage(1)
@@ -127,22 +123,23 @@ def test_a_part_that_cannot_be_used_is_one_line() -> None:
         (1.0, 1.0 + 2e-9, "no meas"),
     ):
         part = sim.run.between(since, until)
-        line = one_line(pf.RunError, lambda part=part: quiet(part, sim.config))
+        line = one_line(pf.RunError, lambda part=part: pf.fuse(part, sim.config))
         assert said in line, line
-    whole = quiet(sim.run.between(0.0, 1e300), sim.config)
-    assert np.array_equal(whole["vertical"].position, quiet(sim.run, sim.config)["vertical"].position)
+    whole = pf.fuse(sim.run.between(0.0, 1e300), sim.config)
+    assert np.array_equal(whole["vertical"].position, pf.fuse(sim.run, sim.config)["vertical"].position)
     back = sim.run.each(lambda _, one: replace(one, stamp=one.stamp - (one.stamp > 2e9) * 3_600_000_000_000))
-    assert len(quiet(back, sim.config).segments) == 2
-    assert "set back" in one_line(pf.RunError, lambda: quiet(back.between(1.0), sim.config))
+    assert len(pf.fuse(back, sim.config).segments) == 2
+    assert "set back" in one_line(pf.RunError, lambda: pf.fuse(back.between(1.0), sim.config))
 
 
+@quiet
 def test_faults_outside_of_a_part_are_not_told() -> None:
     """A value that is not finite, with its row in the log, where it is in the part; nothing otherwise."""
     sim = outage(1)
     row = int(np.searchsorted(sim.run.sensors["vision"].stamp, sim.run.command.stamp[0] + 1_500_000_000))
     sim.run.sensors["vision"].values["tangential"][row] = np.nan
     told = [
-        [note for note in quiet(sim.run.between(since), sim.config).notes if "no finite" in note]
+        [note for note in pf.fuse(sim.run.between(since), sim.config).notes if "no finite" in note]
         for since in (1.0, 2.0)
     ]
     assert f"(first: row {row + 1})" in told[0][0] and not told[1]

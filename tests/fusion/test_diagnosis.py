@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -19,11 +18,11 @@ from pumafuse.fusion.faults import not_following, sensor_faults
 from pumafuse.fusion.segments import build
 from pumafuse.logs.clock import clock_faults
 from pumafuse.logs.run import Source
-from tuning_runs import LONG, SCENARIOS, scenario
+from tuning_runs import scenario, with_sensors
 
 REPOSITORY = Path(__file__).parents[2]
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 DATA = Path(pf.__file__).parent / "data"
-SHARED = REPOSITORY.parent / "shared" / "data"
 LOGS = {
     "scan1": (DATA / "scan1", DATA / "fusion.toml"),
     "my-run": (REPOSITORY / "examples/my-run", REPOSITORY / "examples/my-run/fusion.toml"),
@@ -70,15 +69,13 @@ def exchanged(first: str, second: str) -> Change:
     return lambda one: replace(one, values={**one.values, first: one.values[second], second: one.values[first]})
 
 
-def moved_by(far: float, axis: str) -> Change:
+def moved_by(far: float | FloatArray, axis: str) -> Change:
     return lambda one: replace(one, values={**one.values, axis: one.values[axis] + far})
 
 
 def notes(run: pf.Run, log: str) -> list[str]:
     """What ``fuse`` says, the cause first."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        return list(pf.fuse(run, logged(log)[1]).notes)
+    return list(pf.fuse(run, logged(log)[1]).notes)
 
 
 def refusal(run: pf.Run, log: str) -> str:
@@ -116,12 +113,11 @@ def test_commands_in_another_unit_are_told_by_all_sensors(factor: float) -> None
     assert line.startswith("sensor 'tracker' moves") and "'vision' too: is it the unit of the commands?" in line
 
 
-def test_a_scale_that_no_unit_explains_is_a_warning() -> None:
+@pytest.mark.parametrize(("factor", "words"), [(7.0, "moves 7 times as far as"), (100.0, "cm called m")])
+def test_a_scale_that_no_unit_explains_is_a_warning(factor: float, words: str) -> None:
     """Seven times as far; a hundred times may be cm, or a scale."""
-    (first, *_) = notes(of_sensor("my-run", "camera", scaled(7.0)), "my-run")
-    assert "moves 7 times as far as the commands of x" in first and "scale" in first
-    (first, *_) = notes(of_sensor("my-run", "camera", scaled(100.0)), "my-run")
-    assert "cm called m" in first and "scale" in first
+    (first, *_) = notes(of_sensor("my-run", "camera", scaled(factor)), "my-run")
+    assert words in first and "scale" in first
 
 
 @of_every_log
@@ -157,9 +153,7 @@ def test_another_clock_is_found_in_both_directions(log: str, sensor: str, second
     assert f"{'late' if seconds > 0 else 'early'}: it follows the commands of " in note
     assert number_before(" s ", note) == pytest.approx(abs(seconds), abs=0.03)
     latency = float(note.split("latency_ms = ")[1].split()[0]) / 1e3
-    config = logged(log)[1]
-    told = msgspec.structs.replace(config.sensors[sensor], latency=latency)
-    config = msgspec.structs.replace(config, sensors={**config.sensors, sensor: told})
+    config = with_sensors(logged(log)[1], sensor, latency=latency)
     assert not_following(build(run, config), config) == []
 
 
@@ -235,8 +229,7 @@ def test_a_zero_that_differs_is_told_with_the_key(log: str, sensor: str, far: fl
     assert number_before(f" {screen.unit} on {axis} (", note) == pytest.approx(far * screen.scale, rel=0.3, abs=2.0)
     assert f"bias_sd_{screen.unit} = {{ {axis} = " in note and f"[start] offset_sd_{screen.unit} = {{" in note
     width = float(note.split(f"bias_sd_{screen.unit} = {{ {axis} = ")[1].split(" }")[0]) / screen.scale
-    told = msgspec.structs.replace(config.sensors[sensor], bias_sd={axis: width})
-    config = msgspec.structs.replace(config, sensors={**config.sensors, sensor: told})
+    config = with_sensors(config, sensor, bias_sd={axis: width})
     assert sensor_faults(build(moved, config), config) == []
 
 
@@ -301,6 +294,38 @@ def test_a_misspelt_sensor_is_named_with_the_other_name() -> None:
     assert any("1704 rows have no sensor of this name" in note for note in found)
 
 
+# ---- a sensor that says the same, or is wild -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", ["radial", "vertical"])
+def test_a_frozen_axis_is_held_and_when_it_thaws_estimates_are_as_good_as_ever(axis: str) -> None:
+    """One value for 20 s: said of this axis alone, from when to when."""
+    run, config = logged("scan1")
+    since = run.sensors["tracker"].stamp - run.command.stamp.min()
+    frozen = (since >= 20e9) & (since < 40e9)
+
+    def freeze(one: Source) -> Source:
+        value = one.values[axis]
+        return replace(one, values={**one.values, axis: np.where(frozen, value[frozen.argmax()], value)})
+
+    est, good = pf.fuse(of_sensor("scan1", "tracker", freeze), config), pf.fuse(run, config)
+    (note,) = [note for note in est.notes if "repeats its value" in note]
+    assert note.startswith("tracker") and f"{axis} repeats its value" in note
+    assert "from 20.02 to 40.00 s" in note and "1999 are held" in note
+    assert est.measurements.of("tracker", axis).counts()["held"] == 1999
+    after = good.time > 41.0
+    np.testing.assert_allclose(est[axis].position[after], good[axis].position[after], rtol=0.0, atol=1e-5)
+
+
+def test_of_a_sensor_the_share_of_all_its_components_is_said() -> None:
+    """Half of the values of one axis of three are wild, which do not reject the others: a sixth."""
+    run, config = logged("scan1")
+    sides = np.random.default_rng(0).choice([-0.4, 0.0, 0.0, 0.4], len(run.sensors["tracker"].stamp))
+    wild = of_sensor("scan1", "tracker", moved_by(sides, "vertical"))
+    (note,) = [note for note in pf.fuse(wild, with_sensors(config, gate_rows=False)).notes if "were rejected" in note]
+    assert note.startswith(("tracker: 16%", "tracker: 17%"))
+
+
 # ---- no false alarm -------------------------------------------------------------------------------------------------
 
 
@@ -325,36 +350,6 @@ def test_simulated_logs_give_no_alarm(name: str, seed: int) -> None:
     """Short ones, with outliers, outages, an arm and a latency that are wrong."""
     sim = pf.simulate(scenario(name, 0.1, 0.02), seed)
     assert alarms(sim.run, sim.config) == []
-
-
-@LONG
-@pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*.toml")), ids=lambda path: path.stem)
-def test_no_scenario_gives_an_alarm(path: Path) -> None:
-    """As they are shipped, with three seeds."""
-    if "[trajectory]" not in path.read_text(encoding="utf-8"):
-        pytest.skip("an arm")
-    for seed in (1, 2, 3):
-        sim = pf.simulate(pf.Scenario.load(path), seed)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", pf.PumafuseWarning)
-            found = pf.fuse(sim.run, sim.config).notes
-        assert not [one for one in found if one.startswith("sensor '") and "contradicts" not in one]
-
-
-@pytest.mark.parametrize("place", ["puma-virtual/scan1", "servo/sin_sin", "servo/sin_time_square"])
-def test_recordings_of_others_give_no_alarm(place: str) -> None:
-    """With an arm and sensors that are guessed: nothing but the distance that falls, which is one."""
-    if not SHARED.exists():
-        pytest.skip("these recordings are not part of this repository")
-    run = pf.Run.read(SHARED / place)
-    period = float(np.median(np.diff(run.command.stamp))) / 1e9
-    plant = pf.FirstOrder(time_constant=0.045)
-    axes = {axis: pf.AxisModel(kind=run.kinds.get(axis, "length"), plant=plant) for axis in run.axes}
-    arm = pf.ArmModel(name="guess", update_period=period, delay=0.06, axes=axes)
-    config = pf.FusionConfig(arm=arm, sensors={name: pf.Sensor(sd=5e-4) for name in run.sensors})
-    assert [one.split(" (")[0] for one in alarms(run, config)] == (
-        ["sensor 'range' moves against the commands of radial"] if place.endswith("scan1") else []
-    )
 
 
 COMMANDS: dict[str, Callable[[FloatArray], FloatArray]] = {
@@ -437,18 +432,15 @@ def test_a_long_gap_of_commands_is_told_where_they_jump_over_it() -> None:
     assert "40 of " in note and f"from {begin:.2f} s on" in note
 
 
-def test_every_other_command_alone_is_told() -> None:
-    """Twice the update period is far from it."""
-    run, config = logged("scan1")
-    half = replace(run, command=run.command.rows(np.arange(0, len(run.command.stamp), 2)))
-    assert "2 times the arm's update_period_ms" in " ".join(clock_faults(half, config.arm.update_period, []))
-
-
-@pytest.mark.parametrize("every", [3, 5, 20])
-def test_a_log_without_most_commands_is_refused(every: int) -> None:
-    """Steady ones, that is: the model would hold each for periods in which the arm went on."""
-    rows = slice(None, None, every)
-    line = refusal(of_commands("scan1", lambda one: one.rows(np.arange(len(one.stamp))[rows])), "scan1")
+@pytest.mark.parametrize("every", [2, 3, 20])
+def test_a_log_without_most_commands_is_told_or_refused(every: int) -> None:
+    """Of steady ones, that is: the model would hold each for periods in which the arm went on."""
+    config = logged("scan1")[1]
+    some = of_commands("scan1", lambda one: one.rows(np.arange(0, len(one.stamp), every)))
+    if every == 2:
+        assert "2 times the arm's update_period_ms" in " ".join(clock_faults(some, config.arm.update_period, []))
+        return
+    line = refusal(some, "scan1")
     assert "commands come every" in line and f"{every} times the arm's update_period_ms = 28" in line
     assert line.endswith("Log every command, or correct update_period_ms in arm.toml")
 

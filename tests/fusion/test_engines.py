@@ -6,29 +6,27 @@ near.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
+from fusion.test_oracle import LAG, MS, Case, cases, every, replace_
 from fusion_oracle import AxisOracle, nanoseconds
-from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.engine import Filtered, filter_segment
+from pumafuse.fusion.estimates import Mode
 from pumafuse.fusion.segments import build, output_times
 from pumafuse.logs.run import Run
-from pumafuse.model.plants import Plant
+from pumafuse.model.arm import AxisModel
 
-MS = 1_000_000  # ns
 FIELDS = ("position", "velocity", "offset", "disturbance")
 DATA = Path(pf.__file__).parent / "data"
-PAPER = pf.Gain(slope=0.0818, intercept=0.933, intercept_ci95=(0.9, 0.95))
 
 
 def both(run: Run, config: pf.FusionConfig, rate: float | None = None) -> tuple[Filtered, Filtered]:
@@ -45,18 +43,24 @@ def agree(got: Filtered, wanted: Filtered, tolerance: float = 1e-9) -> None:
     np.testing.assert_array_equal(got.results.contradicts, wanted.results.contradicts)
     pairs = [(part.results.innovation, part.results.innovation_sd) for part in (got, wanted)]
     _close("innovation", *pairs[0], *pairs[1], tolerance)
-    assert tuple(got.axes) == tuple(wanted.axes)
-    for axis in wanted.axes:
-        for field in FIELDS:
-            mine, theirs = ((getattr(e.axes[axis], field), getattr(e.axes[axis], f"{field}_sd")) for e in (got, wanted))
-            assert not np.isnan(theirs).any()
-            _close(f"{axis} {field}", *mine, *theirs, tolerance)
+    agree_on_axes(got.axes, wanted.axes, tolerance)
     assert got.biases.keys() == wanted.biases.keys()
     for name, of in wanted.biases.items():
         assert got.biases[name].keys() == of.keys()
         for axis, bias in of.items():
             mine = got.biases[name][axis]
             _close(f"bias of {name} on {axis}", *map(np.array, (mine.value, mine.sd, bias.value, bias.sd)), tolerance)
+
+
+def agree_on_axes(
+    got: Mapping[str, pf.AxisEstimate], wanted: Mapping[str, pf.AxisEstimate], tolerance: float = 1e-9
+) -> None:
+    assert tuple(got) == tuple(wanted)
+    for axis in wanted:
+        for field in FIELDS:
+            mine, theirs = ((getattr(of[axis], field), getattr(of[axis], f"{field}_sd")) for of in (got, wanted))
+            assert not np.isnan(theirs).any()
+            _close(f"{axis} {field}", *mine, *theirs, tolerance)
 
 
 def _close(
@@ -68,166 +72,49 @@ def _close(
     np.testing.assert_allclose(sd[known] ** 2, right_sd[known] ** 2, rtol=tolerance, atol=0.0, err_msg=f"{what}, sd")
 
 
-# ---- whole logs: several axes and sensors, gates that reject and re-acquire, all a logger does --------------------
-
-AXES = ("tangential", "radial", "vertical")
-OFF = 0.05  # m
-
-
-def every(rate: float, count: int, first: int = 0) -> np.ndarray:
-    return first + np.rint(np.arange(count) * 1e9 / rate).astype(np.int64)
+# ---- any run --------------------------------------------------------------------------------------------------------
 
 
 @st.composite
-def plants(draw: st.DrawFn) -> Plant:
-    if draw(st.booleans()):
-        return pf.FirstOrder(time_constant=draw(st.floats(0.01, 0.1)))
-    damping = st.floats(0.3, 3.0) | st.sampled_from([1.0, 1.0 + 1e-9, 1.0 - 1e-7])
-    return pf.SecondOrder(natural_frequency=draw(st.floats(15.0, 90.0)), damping=draw(damping))
+def gated(draw: st.DrawFn, bent: bool = False) -> Case:
+    """Runs of the oracle, with two axes, gates, latencies that wander, an arm that is hardly known; or that bends."""
 
+    def some(*values: Any) -> Any:
+        return draw(st.sampled_from(values))
 
-def some(draw: st.DrawFn, *values: object) -> object:
-    return draw(st.sampled_from(values))
-
-
-@st.composite
-def sensors(draw: st.DrawFn, axes: tuple[str, ...]) -> pf.Sensor:
-    sd = some(draw, 0.2e-3, 1e-3, {axis: 0.3e-3 * (1 + place) for place, axis in enumerate(axes)})
-    return pf.Sensor(
-        sd=sd,
-        latency=some(draw, 0.0, 0.008, 0.09, 0.31, -0.02),
-        latency_sd=some(draw, 0.0, 0.0, 0.003),
-        scale=some(draw, 1.0, -1.0, 2.5),
-        bias_sd=some(draw, 0.0, 0.0, 5e-3),
-        bias_drift_sd=some(draw, 0.0, 1e-3),
-        bias_time=some(draw, 0.05, 10.0),
-        gate=some(draw, 0.0, 2.0, 3.0, 5.0),
-        gate_rows=draw(st.booleans()),
-    )
-
-
-def logged(
-    rng: np.random.Generator, of: pf.Sensor, valid: np.ndarray, near: Mapping[str, np.ndarray], spells: float
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """A sensor's rows as a bad logger has them: outliers one by one and by spells, NaN, twice, out of order, gaps."""
-    kept = np.ones(len(valid), dtype=bool)
-    if len(valid) > 20:
-        gap = rng.integers(len(valid) - 10)
-        kept[gap : gap + rng.integers(10)] = False
-    valid = valid[kept]
-    second = valid / 1e9
-    values = {}
-    for axis, position in near.items():
-        here = position[kept] + rng.normal(0.0, 0.5e-3, len(valid))
-        here += OFF * (np.sin(second * 2.1 + rng.uniform(0.0, 7.0)) > 1.0 - spells)  # off for up to a second or two
-        here += np.where(rng.random(len(valid)) < 0.03, rng.normal(0.0, 0.02, len(valid)), 0.0)
-        values[axis] = of.scale * here + of.bias_sd * rng.normal()
-        values[axis][rng.random(len(valid)) < 0.05] = np.nan
-        values[axis][rng.random(len(valid)) < 0.01] = np.inf
-    rows = np.arange(len(valid)).repeat(1 + (rng.random(len(valid)) < 0.05))  # some twice
-    order = rows[np.argsort(rows + rng.uniform(0.0, 3.0, len(rows)) * (rng.random(len(rows)) < 0.1), kind="stable")]
-    stamp = valid + round(of.latency * 1e9)
-    return stamp[order], {axis: value[order] for axis, value in values.items()}
-
-
-@st.composite
-def bends(draw: st.DrawFn) -> dict[str, object]:
-    """A fastest speed, play and sag, one of them at least."""
-    curve = pf.Sag(offset=1e-3, slope=-0.05, knee=0.5, slope_beyond=0.1, knee_below=0.49, slope_below=-0.9)
-    one = {
-        "max_speed": some(draw, 0.01, 0.05),
-        "play": some(draw, 0.2e-3, 3e-3),
-        "sag": some(draw, pf.Sag(slope=0.2), curve),
-    }
-    return {key: one[key] for key in draw(st.sets(st.sampled_from(sorted(one)), min_size=1))}
-
-
-@st.composite
-def logs(draw: st.DrawFn, bent: bool = False) -> tuple[Run, pf.FusionConfig, float | None]:
-    """A run of 2 to 4 s with its configuration, and the rate of the estimates; of one axis that is ``bent``."""
-    axes = AXES[: 1 if bent else draw(st.integers(1, 3))]
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    period = some(draw, 28 * MS, 20 * MS + 1)
-    gaps = rng.choice([period, period, period, period + 3 * MS, 5, 4 * period], draw(st.integers(60, 110)))
-    time = np.cumsum([0, *gaps])
-    model = {
-        axis: pf.AxisModel(
-            plant=draw(plants()),
-            gain=some(draw, pf.Gain(slope=0.0, intercept=1.0), pf.Gain(slope=0.0, intercept=0.8), PAPER),
-            gain_recovery=some(draw, None, 0.1, 0.004, 3.0),
-            delay=some(draw, None, 0.0, 0.033),
-            lag_ci95=some(draw, None, (0.08, 0.12)),
-            **(draw(bends()) if bent else {}),
+    case = draw(cases())
+    seen = {
+        name: replace(
+            each,
+            sensor=replace_(
+                each.sensor, gate=some(0.0, 1.0, 2.0), latency_sd=some(0.0, 0.003), gate_rows=some(False, True)
+            ),
         )
-        for axis in axes
+        for name, each in case.seen.items()
     }
-    level = st.sampled_from([0.0, 0.2e-3, 1e-3])
-    noise = {
-        axis: pf.Process(
-            input_noise=draw(level),
-            drift=draw(level),
-            maneuver_noise=draw(level),
-            maneuver_drift=10 * draw(level),
-            disturbance_sd=some(draw, 0.0, 1e-3),
-            disturbance_time=some(draw, 0.02, 0.1, 3.0),
-            disturbance_kind=some(draw, "matern", "ou"),
-        )
-        for axis in axes
-    }
-    command, near = {}, {}
-    for axis in axes:
-        command[axis] = 0.5 + np.cumsum(rng.normal(0.0, 0.5e-3, len(time)))
-        command[axis][rng.random(len(time)) < 0.1] = np.nan
-        command[axis][rng.random(len(time)) < 0.1] = 0.5  # there and back: a maneuver
-        command[axis][0] = 0.5
-        given = np.isfinite(command[axis])
-        near[axis] = time[given], command[axis][given]
-    names = draw(st.permutations(["tracker", "vision", "panel", "probe"]))[: draw(st.integers(1, 4))]
-    known, streams = {}, {}
-    for name in names:
-        seen = axes if draw(st.booleans()) else axes[:1]
-        known[name] = draw(sensors(axes))
-        rate, first = some(draw, 12.0, 25.0, 60.0), some(draw, 0, 28 * MS, -100 * MS, 700 * MS)
-        valid = every(rate, int(time[-1] / 1e9 * rate) + 3, first)
-        positions = {axis: np.interp(valid, *near[axis]) for axis in seen}
-        streams[name] = logged(rng, known[name], valid, positions, some(draw, 0.0, 0.3, 1.0))
-    config = pf.FusionConfig(
-        arm=pf.ArmModel(name="an arm", update_period=period / 1e9, delay=some(draw, 0.06045, 0.0, 0.056), axes=model),
-        start=pf.Start(offset_sd=some(draw, 0.0, 1e-3, 5e-3)),
-        process=noise,
-        sensors=known,
-    )
-    order = rng.permutation(len(time)) if draw(st.booleans()) else np.arange(len(time))
-    order = np.argsort(np.arange(len(time)) + 3.0 * rng.random(len(time)) * (order > len(time) // 2), kind="stable")
-    shuffled = {axis: value[order] for axis, value in command.items()}
-    start = some(draw, {}, {axes[0]: 0.505})
-    run = Run.from_arrays(time[order], shuffled, {**streams, "stranger": streams[names[0]]}, start=start)
-    return run, config, some(draw, None, 70.0)
+    (model,) = case.axes.values()
+    if bent:
+        curve = pf.Sag(offset=1e-3, slope=-0.05, knee=0.5, slope_beyond=0.1, knee_below=0.49, slope_below=-0.9)
+        bends = {"max_speed": some(0.01, 0.05), "play": some(0.2e-3, 3e-3), "sag": some(pf.Sag(slope=0.2), curve)}
+        chosen = draw(st.sets(st.sampled_from(sorted(bends)), min_size=1))
+        return replace(case, axes={"radial": replace_(model, **{name: bends[name] for name in chosen})}, seen=seen)
+    axes = {"radial": replace_(model, lag_ci95=some(None, (0.08, 0.12))), "vertical": AxisModel(plant=LAG, delay=0.033)}
+    return replace(case, axes=axes, seen=seen)
 
 
-def test_both_engines_make_the_same_of_any_log() -> None:
-    """Random axes, delays, gains, noise, sensors, gates, outliers, gaps: every fate and estimate is the same."""
-    seen = dict.fromkeys(Outcome, 0)
-
-    @settings(max_examples=12)
-    @given(logs())
-    def check(log: tuple[Run, pf.FusionConfig, float | None]) -> None:
-        got, wanted = both(*log)
-        agree(got, wanted)
-        for outcome in Outcome:
-            seen[outcome] += bool((wanted.results.outcome == outcome).any())
-
-    check()
-    decided_before = {Outcome.TOO_LATE, Outcome.STRAY, Outcome.HELD}
-    assert all(seen[outcome] for outcome in set(Outcome) - decided_before)
+@settings(max_examples=30)
+@given(gated())
+def test_both_engines_make_the_same_of_any_run(case: Case) -> None:
+    """Random delays, gains, noise, sensors, gates: every fate and estimate is the same."""
+    agree(*both(*case.made(), case.rate))
 
 
 @pytest.mark.long
 @settings(max_examples=6)
-@given(logs(bent=True))
-def test_both_engines_make_the_same_of_an_axis_that_bends(log: tuple[Run, pf.FusionConfig, float | None]) -> None:
+@given(gated(bent=True))
+def test_both_engines_make_the_same_of_an_axis_that_bends(case: Case) -> None:
     """A fastest speed, play and sag in closed form and by an ODE solver: every fate and estimate, to 1e-4 sd."""
-    agree(*both(*log), 1e-4)
+    agree(*both(*case.made(), case.rate), 1e-4)
 
 
 @pytest.mark.parametrize(("lasts", "pause"), [(0.3, 200.0), (0.001, 0.0), (1e-6, 0.0)])
@@ -237,44 +124,34 @@ def test_a_smooth_disturbance_is_forgotten_in_any_pause(lasts: float, pause: flo
     time[30:] += pause
     position = 0.01 * np.sin(3.0 * np.arange(60) * 0.028)
     run = pf.Run.from_arrays(time, {"x": position}, {"camera": (time + 0.01, {"x": position})})
-    arm = pf.ArmModel(
-        name="one", update_period=0.028, delay=0.05, axes={"x": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))}
+    axes = {"x": AxisModel(plant=LAG)}
+    config = pf.FusionConfig(
+        arm=pf.ArmModel(name="one", update_period=0.028, delay=0.05, axes=axes),
+        process={"x": pf.Process(disturbance_sd=1e-3, disturbance_time=lasts)},
+        sensors={"camera": pf.Sensor(sd=1e-3)},
     )
-    process = {"x": pf.Process(disturbance_sd=1e-3, disturbance_time=lasts)}
-    config = pf.FusionConfig(arm=arm, process=process, sensors={"camera": pf.Sensor(sd=1e-3)})
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        got, wanted = pf.fuse(run, config)["x"], pf.fuse(run, config, engine="filterpy")["x"]
-    assert np.abs(got.position - wanted.position).max() < 1e-9 * got.position_sd.min()
-    assert got.position_sd == pytest.approx(wanted.position_sd, rel=1e-9)
+    agree(*both(run, config))
 
 
 @pytest.mark.long
-def test_fuse_by_filterpy_says_the_same() -> None:
-    """Measurements, notes and estimates of `fuse` by either engine; progress goes up; other modes are refused."""
-    scan, config = Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    until = scan.command.stamp[0] + 3_000_000_000
-    run = replace(
-        scan,
-        command=scan.command.rows(scan.command.stamp < until),
-        sensors={name: source.rows(source.stamp < until) for name, source in scan.sensors.items()},
-    )
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+def test_fuse_by_filterpy_says_the_same_of_the_scan() -> None:
+    """Measurements, notes and estimates of `fuse` by either engine, of 10 s with all its sensors; progress goes up."""
+    run, config = Run.read(DATA / "scan1").between(until=10.0), pf.FusionConfig.load(DATA / "fusion.toml")
     done: list[float] = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        got = pf.fuse(run, config)
-        wanted = pf.fuse(run, config, engine="filterpy", progress=done.append)
+    got, wanted = pf.fuse(run, config), pf.fuse(run, config, engine="filterpy", progress=done.append)
     assert (got.engine, wanted.engine) == ("compiled", "filterpy")
     assert got.notes == wanted.notes
     for name in ("time", "stamp", "sensor", "axis", "value", "outcome"):
         np.testing.assert_array_equal(getattr(got.measurements, name), getattr(wanted.measurements, name))
-    for axis in wanted.axes:
-        np.testing.assert_allclose(got[axis].position, wanted[axis].position, rtol=0.0, atol=1e-11)
+    agree_on_axes(got.axes, wanted.axes)
     assert done == sorted(done)
-    for mode in ({"mode": "smoothed"}, {"mode": "as-live"}):
-        with pytest.raises(ValueError, match="filterpy"):
-            pf.fuse(run, config, engine="filterpy", **mode)
+
+
+@pytest.mark.parametrize("mode", ["smoothed", "as-live"])
+def test_filterpy_only_filters(mode: Mode) -> None:
+    with pytest.raises(ValueError, match=f"mode '{mode}' needs the compiled one"):
+        pf.fuse(*wide("offset", 1e3), engine="filterpy", mode=mode)
 
 
 # ---- wide priors ----------------------------------------------------------------------------------------------------
@@ -329,15 +206,3 @@ def test_estimates_are_right_while_priors_are_wide(kind: str, ratio: float, tole
             getattr(e, name) for e in (estimates["radial"], belief) for name in (field, f"{field}_sd")
         )
         _close(field, mean, sd, right, right_sd, tolerance)
-
-
-# ---- the shipped scan -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("sensors", [["tracker", "vision"], ["vision"], ["range", "vision"]], ids="+".join)
-def test_both_engines_make_the_same_of_the_scan(sensors: list[str]) -> None:
-    """30 s of the shipped scan as configured: a camera's outliers, a tracker, a panel 1 m of bias away."""
-    run, config = Run.read(DATA / "scan1").between(until=30.0), pf.FusionConfig.load(DATA / "fusion.toml")
-    config = msgspec.structs.replace(config, sensors={name: config.sensors[name] for name in sensors})
-    agree(*both(replace(run, sensors={name: run.sensors[name] for name in sensors}), config))

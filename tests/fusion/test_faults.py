@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
-import msgspec
 import numpy as np
-import pyarrow.csv as pacsv
 import pytest
+from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
 from fusion.test_between import cut
@@ -18,20 +15,18 @@ from pumafuse.logs.run import Source
 from pumafuse.tuning.likelihood import Likelihood
 from tuning_runs import SCENARIOS, outage, scenario, with_process, with_sensors
 
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 CONFIG = outage(1).config
-LATENCY = {"camera": 0.045, "vision": 0.045, "tracker": 0.008}  # s, of recorded sensors
 
 
 def notes(run: pf.Run, config: pf.FusionConfig = CONFIG) -> list[str]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        given = [one for one in pf.fuse(run, config).notes if one.startswith(("sensor '", "sensors."))]
+    given = [one for one in pf.fuse(run, config).notes if one.startswith(("sensor '", "sensors."))]
     return [one for one in given if "contradicts" not in one]
 
 
-def with_vision(change: object) -> pf.Run:
+def with_vision(change: Callable[[Source], Source]) -> pf.Run:
     run = outage(1).run
-    return replace(run, sensors={**run.sensors, "vision": change(run.sensors["vision"])})  # type: ignore[operator]
+    return replace(run, sensors={**run.sensors, "vision": change(run.sensors["vision"])})
 
 
 def changed(one: Source, change: Callable[[np.ndarray], np.ndarray]) -> Source:
@@ -46,19 +41,15 @@ def elsewhere(run: pf.Run, config: pf.FusionConfig = CONFIG) -> list[str]:
     return [one for one in notes(run, config) if "where the commands lead" in one]
 
 
-@pytest.mark.parametrize("off", [-0.3, 0.05])
-def test_another_zero_is_said_with_its_distance(off: float) -> None:
+def test_another_zero_is_said_where_nothing_told_is_as_uncertain() -> None:
     """50 mm where noise and priors are 2 mm; not 3 mm, not with anything as uncertain as that, not in a good run."""
     assert not notes(outage(1).run) and not notes(with_vision(lambda one: moved(0.003, one)))
-    run = with_vision(lambda one: moved(off, one))
-    found = elsewhere(run)
-    assert len(found) == 1
-    numbers = [float(part.split()[-1]) for part in found[0].split(" mm on ")[:-1]]
-    assert np.abs(np.array(numbers) - off * 1e3).max() < 8.0 and len(numbers) == 2, found
+    run = with_vision(lambda one: moved(0.05, one))
+    assert len(elsewhere(run)) == 1
     for told in (
-        with_sensors(CONFIG, "vision", bias_sd=abs(off)),
-        with_sensors(CONFIG, "vision", bias_drift_sd=abs(off)),
-        with_process(CONFIG, disturbance_sd=abs(off)),
+        with_sensors(CONFIG, "vision", bias_sd=0.05),
+        with_sensors(CONFIG, "vision", bias_drift_sd=0.05),
+        with_process(CONFIG, disturbance_sd=0.05),
     ):
         assert not elsewhere(run, told)
 
@@ -92,10 +83,8 @@ def test_where_a_sensor_is_after_the_run_does_not_count() -> None:
 
 def test_a_negative_latency_is_questioned() -> None:
     """By its key and value, for a sensor that is in the run."""
-    early = msgspec.structs.replace(CONFIG.sensors["vision"], latency=-0.02)
-    config = msgspec.structs.replace(CONFIG, sensors={**CONFIG.sensors, "vision": early})
-    assert [one[:35] for one in notes(outage(1).run, config)] == ["sensors.vision.latency_ms is -20, s"[:35]]
-    run = outage(1).run
+    config, run = with_sensors(CONFIG, "vision", latency=-0.02), outage(1).run
+    assert [one[:33] for one in notes(run, config)] == ["sensors.vision.latency_ms is -20,"]
     assert not notes(replace(run, sensors={"tracker": run.sensors["tracker"]}), config)[1:]
 
 
@@ -103,9 +92,7 @@ def test_a_negative_latency_is_questioned() -> None:
 
 
 def begun(run: pf.Run, config: pf.FusionConfig) -> list[str]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        return [one for one in pf.fuse(run, config).notes if "begins in motion" in one]
+    return [one for one in pf.fuse(run, config).notes if "begins in motion" in one]
 
 
 @pytest.mark.parametrize("name", ["panel-tracker-outage", "panel-vision", "mismatched-arm", "smooth-disturbance"])
@@ -156,44 +143,7 @@ def test_runs_that_begin_at_rest_are_not_told_to_be_in_motion() -> None:
     first = int(np.flatnonzero(np.diff(steps.run.command.values["tangential"]))[0]) * 0.028
     for since in (0.0, first, first + 0.028):
         assert not begun(cut(steps.run, since), steps.config)
-    blind = {name: msgspec.structs.replace(one, sd=0.02) for name, one in CONFIG.sensors.items()}
-    assert not begun(cut(outage(1).run, 0.5), msgspec.structs.replace(CONFIG, sensors=blind))
-
-
-@pytest.mark.parametrize("name", ["trunk-servo", "puma-virtual"])
-def test_real_recordings_begin_at_rest(name: str) -> None:
-    """Six servos with camera or encoder, and the arm's scan and white noise: nothing is told of them, only when cut."""
-    place = Path(__file__).parents[3] / "shared" / "data" / name
-    if not place.exists():
-        pytest.skip("these recordings are not part of this repository")
-    runs = trunk(place) if name == "trunk-servo" else [pf.Run.read(path.parent) for path in place.rglob("run.toml")]
-    for run in runs:
-        assert not begun(run, guessed(run)), run.name
-    longest = [run for run in runs if run.name in ("encoder", "scan1")]
-    assert longest and all(begun(cut(run, 20.0), guessed(run)) for run in longest)
-
-
-def guessed(run: pf.Run) -> pf.FusionConfig:
-    """A first-order arm that is about right."""
-    axes = {axis: pf.AxisModel(plant=pf.FirstOrder(time_constant=0.045)) for axis in run.axes}
-    period = float(np.median(np.diff(run.command.stamp))) / 1e9
-    arm = pf.ArmModel(name="guess", update_period=period, delay=0.15 if "m1" in axes else 0.06, axes=axes)
-    sensors = {name: pf.Sensor(sd=5e-4, latency=LATENCY.get(name, 0.0)) for name in run.sensors}
-    return pf.FusionConfig(arm=arm, sensors=sensors)
-
-
-def trunk(place: Path) -> list[pf.Run]:
-    """Both recordings with the encoder, and with the camera; a degree is a mm."""
-    runs: list[pf.Run] = []
-    for folder in ("0g", "100g"):
-        tables = [pacsv.read_csv(place / folder / f"{name}.csv.gz") for name in ("commands", "encoder", "camera")]
-        (time, command), *seen = [
-            (table["time_s"].to_numpy(), {f"m{k}": table[f"m{k}"].to_numpy() * 1e-3 for k in range(1, 7)})
-            for table in tables
-        ]
-        for name, rows in zip(("encoder", "camera"), seen, strict=True):
-            runs.append(pf.Run.from_arrays(time, command, {name: rows}, name=name))
-    return runs
+    assert not begun(cut(outage(1).run, 0.5), with_sensors(CONFIG, sd=0.02))
 
 
 def looks_turned(run: pf.Run, config: pf.FusionConfig) -> list[float]:
@@ -205,25 +155,23 @@ def looks_turned(run: pf.Run, config: pf.FusionConfig) -> list[float]:
 
 def seen_turned(angle: float, axis: str = "y", noise: float = 5e-4) -> pf.Run:
     """A run in x, y, z of an arm that is 90 ms late; its camera stands elsewhere, turned about an axis [deg]."""
-    t, part = 0.02 * np.arange(1000), np.radians(angle)
+    t = 0.02 * np.arange(1000)
 
     def places(at: np.ndarray) -> np.ndarray:
         return np.array([0.15, 0.1, 0.2]) * (1.0 - np.cos(np.maximum(at, 0.0)[:, None] * np.array([0.9, 1.4, 0.6])))
 
-    one, two = (place for place in range(3) if "xyz"[place] != axis)
-    turn = np.eye(3)
-    turn[[one, one, two, two], [one, two, one, two]] = np.cos(part), np.sin(part), -np.sin(part), np.cos(part)
-    seen = places(t - 0.09) @ turn.T + np.random.default_rng(5).normal(0.0, noise, (1000, 3))
+    turn = Rotation.from_euler(axis, angle, degrees=True)
+    seen = turn.apply(places(t - 0.09)) + np.random.default_rng(5).normal(0.0, noise, (1000, 3))
     seen += np.array([1.0, -2.0, 0.5]) * bool(angle)
     told, measured = (dict(zip("xyz", value.T, strict=True)) for value in (places(t), seen))
     return pf.Run.from_arrays(t, told, {"camera": (t, measured)})
 
 
-def late_arm(delay: float = 80.0) -> pf.FusionConfig:
-    """An arm that is 10 ms later than its delay [ms], as it holds each command for 20 ms."""
-    axes = "".join(f'\n[axes.{axis}]\nplant = "first-order"\ntime_constant_ms = 0.1' for axis in "xyz")
-    arm = pf.ArmModel.parse(f"name = 'late'\nupdate_period_ms = 20.0\ndelay_ms = {delay}{axes}")
-    return pf.FusionConfig.parse('arm = "arm.toml"\n[sensors.camera]\nsd_mm = 0.5', arm)
+def late_arm(delay: float = 0.08) -> pf.FusionConfig:
+    """An arm that is 10 ms later than its delay [s], as it holds each command for 20 ms."""
+    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=1e-4))
+    arm = pf.ArmModel(name="late", update_period=0.02, delay=delay, axes=dict.fromkeys("xyz", axis))
+    return pf.FusionConfig(arm=arm, sensors={"camera": pf.Sensor(sd=5e-4)})
 
 
 def by_camera(run: pf.Run, **values: np.ndarray) -> pf.Run:
@@ -241,7 +189,7 @@ def test_a_sensor_that_is_turned_is_named_with_its_angle(angle: float, axis: str
     assert len(notes(run, late_arm())) == 1
 
 
-@pytest.mark.parametrize("delay", [30.0, 130.0])
+@pytest.mark.parametrize("delay", [0.03, 0.13])
 def test_an_arm_with_a_wrong_delay_has_no_turned_sensor(delay: float) -> None:
     """A model that is 50 ms off is off by the speed, in all directions alike."""
     assert not looks_turned(seen_turned(0.0), late_arm(delay))

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm, solve_discrete_are
 
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
@@ -20,6 +19,7 @@ from pumafuse.filter.events import Events, Results
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.engine import model_of
+from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.segments import build
 from pumafuse.logs.run import Run
@@ -133,16 +133,20 @@ def check(case: Case, mode: str = "filtered", engine: str = "compiled") -> None:
         oracle = AxisOracle(run, config, axis)
         check_innovations(fused.where(fused.axis == number), oracle)
         check_estimates(estimates[axis], getattr(oracle, mode)(times))
+        if mode != "as_live" and estimates.biases:
+            check_biases(estimates, axis, oracle)
+
+
+def check_biases(estimates: Estimates, axis: str, oracle: AxisOracle) -> None:
+    """Means given all measurements to 1e-9 sd + 1e-12 m, variances to 1e-9."""
+    found, wanted = {name: of[axis] for name, of in estimates.biases.items() if axis in of}, oracle.biases()
+    assert found.keys() == wanted.keys()
+    for name, (mean, sd) in wanted.items():
+        assert abs(found[name].value - mean) < 1e-9 * sd + 1e-12
+        assert found[name].sd ** 2 == pytest.approx(sd**2, rel=1e-9)
 
 
 NEARLY = SecondOrder(natural_frequency=45.0, damping=1.0 + 1e-9)
-
-
-def companion(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    if isinstance(plant, FirstOrder):
-        return np.array([[-1.0 / plant.time_constant]]), np.array([1.0 / plant.time_constant]), np.array([1.0])
-    w, zeta = plant.natural_frequency, plant.damping
-    return np.array([[0.0, 1.0], [-w * w, -2.0 * zeta * w]]), np.array([0.0, w * w]), np.array([1.0, 0.0])
 
 
 # ---- the filter -----------------------------------------------------------------------------------------------------
@@ -151,6 +155,7 @@ GRID = np.arange(16) * T
 IRREGULAR = np.cumsum([0, 28, 31, 20, 28, 3, 28, 400, 28, 28, 5, 28, 90, 28]) * MS
 TRACKER = Seen(sensor(latency=0.008), every(90, 36))
 VISION = Seen(sensor(0.4e-3, latency=0.090), every(25, 10, 7 * MS))
+LATE = replace(TRACKER, valid=every(90, 20, 240 * MS))
 SLOW = Seen(sensor(0.2e-3, latency=0.240), every(12.5, 5, 3 * MS))
 PANEL = Seen(sensor(0.3e-3, latency=0.004, scale=-1.0, bias_sd=1.0), every(40, 16, 2 * MS))
 AHEAD = Seen(sensor(0.3e-3, latency=-0.050), every(15, 6, 61 * MS))  # stamped before it is true
@@ -211,6 +216,22 @@ CASES = {
     ),
     "rates and latencies": Case(one(UNDER), seen={"vision": VISION, "slow": SLOW, "ahead": AHEAD, "tracker": TRACKER}),
     "panel": Case(one(UNDER), seen={"panel": PANEL, "tracker": Seen(sensor(latency=0.05), every(20, 8, 150 * MS))}),
+    "a bias of every scale": Case(
+        seen={
+            str(scale): Seen(sensor(0.3e-3, scale=scale, bias_sd=bias_sd), every(30, 9, 40 * MS))
+            for scale, bias_sd in ((1.0, 0.0), (-1.0, 0.5), (2.5, 1e-3), (-0.2, 0.02))
+        },
+        start={"radial": 0.51},
+    ),
+    "a late first measurement": Case(one(UNDER), seen={"tracker": LATE}, rate=110.0),
+    "a gap in the measurements": Case(
+        one(UNDER), seen={"tracker": replace(LATE, valid=np.r_[every(90, 15), LATE.valid])}
+    ),
+    "a latency that wanders": Case(
+        delay=0.02,
+        seen={"wandering": Seen(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), GRID), "vision": VISION},
+    ),
+    "a panel before the tracker": Case(one(UNDER), seen={"panel": PANEL, "tracker": LATE}, rate=60.0),
     "sparse grid": Case(rate=7.0, seen={"tracker": TRACKER, "vision": VISION}),
     "nanosecond stamps": Case(origin=1_700_000_000_123_456_789, rate=100.0),
     "absolute seconds": Case(one(UNDER), origin=1.7e9),
@@ -232,10 +253,17 @@ CASES = {
 
 @pytest.mark.filterwarnings("ignore:.*sensors.ahead.latency_ms:pumafuse.PumafuseWarning")
 @pytest.mark.filterwarnings("ignore:.*(where the commands lead|whose commands rest):pumafuse.PumafuseWarning")
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+@pytest.mark.parametrize(
+    ("case", "mode"),
+    [
+        pytest.param(case, mode, id=f"{name}-{mode}")
+        for name, case in CASES.items()
+        for mode in MODES
+        if mode != "as_live" or not any(seen.sensor.latency_sd for seen in case.seen.values())
+    ],
+)
 def test_estimates_are_conditional_means(case: Case, mode: str) -> None:
-    """Every estimate, error bar and innovation is that of the joint Gaussian given the measurements it may know."""
+    """Estimates, error bars, biases and innovations are those of the joint Gaussian given what they may know."""
     check(case, mode)
 
 
@@ -257,29 +285,24 @@ DOUBTED = {
 
 
 @pytest.mark.filterwarnings("ignore:.*sensors.ahead.latency_ms:pumafuse.PumafuseWarning")
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("case", DOUBTED.values(), ids=DOUBTED.keys())
-def test_error_bars_count_how_well_the_arm_is_known(case: Case, mode: str) -> None:
+def test_error_bars_count_how_well_the_arm_is_known(case: Case) -> None:
     """Estimates weigh measurements as if lag and gain were right, and bars are those of their error where they are not.
 
     With weights W the error of W z as an estimate of a position is Gaussian, of which the lag's standard deviation
     times (the speed there - W times the speeds at the measurements) is an independent part.
     """
-    check(case, mode)
-    run, config = case.made()
-    known = {axis: replace_(model, lag_ci95=None, gain=Gain(slope=model.gain.slope, intercept=model.gain.intercept))
-             for axis, model in config.arm.axes.items()}  # fmt: skip
-    with warned(run, config):
-        doubted = fuse(run, config, **MODES[mode])
-        certain = fuse(run, replace_(config, arm=replace_(config.arm, axes=known)), **MODES[mode])
-    assert np.array_equal(doubted["radial"].position, certain["radial"].position)
-    assert np.array_equal(doubted.measurements.innovation_sd, certain.measurements.innovation_sd)
-
-
-@pytest.mark.filterwarnings("ignore:.*sensors.ahead.latency_ms:pumafuse.PumafuseWarning")
-@pytest.mark.parametrize("case", DOUBTED.values(), ids=DOUBTED.keys())
-def test_the_reference_counts_it_too(case: Case) -> None:
     check(case, engine="filterpy")
+    run, config = case.made()
+    axes = {axis: replace_(one, lag_ci95=None, gain=replace_(one.gain, intercept_ci95=None)) for axis, one in
+            config.arm.axes.items()}  # fmt: skip
+    known = replace_(config, arm=replace_(config.arm, axes=axes))
+    for mode, how in MODES.items():
+        check(case, mode)
+        with warned(run, config):
+            doubted, certain = (fuse(run, one, **how) for one in (config, known))
+        assert np.array_equal(doubted["radial"].position, certain["radial"].position)
+        assert np.array_equal(doubted.measurements.innovation_sd, certain.measurements.innovation_sd)
 
 
 DISTURBED = replace_(NOISE, disturbance_sd=2e-3, disturbance_time=0.05)
@@ -363,11 +386,25 @@ def cases(draw: st.DrawFn) -> Case:
     )  # fmt: skip
 
 
+def tame(case: Case) -> Case:
+    """Priors and drifts of at most some 30 times a measurement's noise; beyond, rounding can pass 1e-12 m.
+
+    And no disturbance: at the very start of a run it costs the smoother up to 1e-7 of a standard deviation.
+    """
+    seen = {
+        name: replace(each, sensor=replace_(
+            each.sensor, sd=max(each.sensor.sd, 0.3e-3), bias_sd=min(each.sensor.bias_sd, 9e-3)))
+        for name, each in case.seen.items()
+    }  # fmt: skip
+    process = replace_(case.process, maneuver_drift=min(case.process.maneuver_drift, 5e-3), disturbance_sd=0.0)
+    return replace(case, seen=seen, process=process, offset_sd=min(case.offset_sd, 5e-3))
+
+
 @settings(max_examples=80)
-@given(cases(), st.sampled_from(["filtered", "as_live"]))
+@given(cases(), st.sampled_from(list(MODES)))
 def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
-    """Random plants, delays, gains, noise and sensors: nothing deviates from the joint Gaussian."""
-    check(case, mode)
+    """Random plants, delays, gains, gaps, noise and sensors: nothing deviates from the joint Gaussian."""
+    check(tame(case) if mode == "smoothed" else case, mode)
 
 
 # ---- long runs ------------------------------------------------------------------------------------------------------
@@ -379,32 +416,6 @@ def core_of(case: Case) -> tuple[Filter, Model, Events]:
     segment = build(run, config)
     model = model_of(segment, config)
     return Filter(model, segment.origin), model, segment.events(config)[0]
-
-
-@pytest.mark.parametrize("plant", [LAG, UNDER])
-def test_the_covariance_settles_where_riccatis_equation_says(plant: Plant) -> None:
-    """One measurement each period, forever: P after a measurement, from the discrete algebraic Riccati equation."""
-    process = Process(input_noise=0.3e-3, drift=0.8e-3)
-    read = Seen(sensor(0.1e-3), np.arange(400) * T + 5 * MS)
-    case = Case(one(plant), times=np.arange(400) * T, delay=0.0, process=process, seen={"tracker": read})
-    core, _, events = core_of(case)
-    results = Results.room(len(events.time), 1)
-    variance = core.run(events, results, events.time[-1:])[1::2, 0, 0] ** 2
-    A, B, C = companion(plant)
-    n = len(A)
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    F, Q, H = np.eye(n + 1), np.zeros((n + 1, n + 1)), np.append(C, 1.0)[None]
-    F[:n, :n], Q[n, n] = expm(A * 0.028), process.drift**2 * 0.028
-    for node, weight in zip(nodes, weights, strict=True):
-        kick = expm(A * 0.014 * (1.0 + node)) @ B
-        Q[:n, :n] += 0.014 * weight * process.input_noise**2 * np.outer(kick, kick)
-    P = solve_discrete_are(F.T, H.T, Q, [[0.1e-3**2]])
-    S = (H @ P @ H.T).item() + 0.1e-3**2
-    P -= P @ H.T @ H @ P / S
-    ahead = H @ (F - np.eye(n + 1))
-    velocity = (ahead @ P @ ahead.T + H @ Q @ H.T).item() / 0.028**2
-    np.testing.assert_allclose(variance[:3], [(H @ P @ H.T).item(), velocity, P[n, n]], rtol=1e-8)
-    assert results.innovation_sd[-1, 0] ** 2 == pytest.approx(S, rel=1e-8)
 
 
 def test_a_million_steps_leave_the_covariance_as_it_was() -> None:

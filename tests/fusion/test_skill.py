@@ -7,20 +7,20 @@ superposition of closed-form responses.
 from __future__ import annotations
 
 import json
-import math
-import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pumafuse as pf
-from executable import pumafuse
+from executable import printed
 from fusion_oracle import Response, commands
 from pumafuse.fusion import results
 from pumafuse.fusion.skill import PredictionError, Skill, skill
 from pumafuse.fusion.summary import beaten
 
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 PERIOD, SD = 0.028, 0.5e-3
 ARM = pf.ArmModel(
     name="simulated",
@@ -41,12 +41,6 @@ DENSITIES = [10.0**power for power in range(-8, 3)]
 
 def config(**sensors: pf.Sensor) -> pf.FusionConfig:
     return pf.FusionConfig(arm=ARM, sensors=sensors)
-
-
-def fused(run: pf.Run, of: pf.FusionConfig) -> pf.Estimates:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        return pf.fuse(run, of)
 
 
 def found(est: pf.Estimates, sensor: str, axis: str) -> Skill:
@@ -100,8 +94,8 @@ def runs() -> list[pf.Run]:
 
 
 @pytest.fixture(scope="module")
-def est(runs) -> pf.Estimates:
-    return fused(one_after_the_other(*runs), config(**SENSORS))
+def est(runs: list[pf.Run]) -> pf.Estimates:
+    return pf.fuse(one_after_the_other(*runs), config(**SENSORS))
 
 
 def segments_of(est: pf.Estimates, sensor: str, axis: str) -> list[pf.Measurements]:
@@ -113,17 +107,9 @@ def segments_of(est: pf.Estimates, sensor: str, axis: str) -> list[pf.Measuremen
     return [mine.where(early), mine.where(~early)]
 
 
-def errors(values: list[float]) -> PredictionError:
-    ordered = sorted(abs(value) for value in values)
-    half = len(ordered) // 2
-    median = ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2.0
-    mean_square = sum(value * value for value in values) / len(values)
-    return PredictionError(rms=math.sqrt(mean_square), median=median)
-
-
 def check(got: PredictionError, values: list[float], rel: float = 1e-9) -> None:
-    wanted = errors(values)
-    assert (got.rms, got.median) == (pytest.approx(wanted.rms, rel), pytest.approx(wanted.median, rel))
+    sizes = np.abs(values)
+    assert (got.rms, got.median) == pytest.approx((np.sqrt(np.mean(sizes**2)), np.median(sizes)), rel)
 
 
 @pytest.mark.parametrize(("sensor", "axis"), PAIRS)
@@ -185,15 +171,11 @@ def test_nothing_to_predict():
     sight, camera = run.sensors["camera"], SENSORS["camera"]
 
     def first(count: int, stamp: float = 0.0) -> pf.Run:
-        source = replace(
-            sight,
-            stamp=sight.stamp[:count] + round(stamp * 1e9),
-            values={axis: value[:count] for axis, value in sight.values.items()},
-        )
-        return replace(run, sensors={"camera": source})
+        some = sight.rows(np.arange(count))
+        return replace(run, sensors={"camera": replace(some, stamp=some.stamp + round(stamp * 1e9))})
 
     def skill_of(run: pf.Run, of: pf.FusionConfig) -> Skill | None:
-        est = fused(run, of)
+        est = pf.fuse(run, of)
         summary = pf.summarise(est).axes["radial"].sensors["camera"]
         assert summary.skill == skill(est, est.measurements.of("camera", "radial"))
         return summary.skill
@@ -210,72 +192,24 @@ def test_values_that_do_not_change():
     time = 10.0 + PERIOD * np.arange(50)
     still = {axis: np.full(50, 0.3) for axis in ARM.axes}
     run = pf.Run.from_arrays(time, still, {"camera": (time + 0.03, still)})
-    got = found(fused(run, config(camera=SENSORS["camera"])), "camera", "radial")
+    got = found(pf.fuse(run, config(camera=SENSORS["camera"])), "camera", "radial")
     assert got.last_held == PredictionError(rms=0.0, median=0.0)
     assert got.of_best_other is None
 
 
-def test_a_constant_velocity_filter_is_nested():
-    """With gain 0 and a disturbance of 4 λ³ σ² = q, long and large, fusion predicts as the best of the others does."""
-    rng, count, interval = np.random.default_rng(5), 3000, 0.02
-    density = SD**2 / interval**3
-    kick = np.linalg.cholesky(density * np.array([[interval**3 / 3, interval**2 / 2], [interval**2 / 2, interval]]))
-    path, state = np.empty(count), np.zeros(2)
-    for n in range(count):
-        state = np.array([[1.0, interval], [0.0, 1.0]]) @ state + kick @ rng.standard_normal(2)
-        path[n] = state[0]
-    time = 10.0 + interval * np.arange(count)
-    run = pf.Run.from_arrays(
-        time[::10],
-        {"vertical": 0.1 * rng.standard_normal(count // 10)},
-        {"camera": (time, {"vertical": path + SD * rng.standard_normal(count)})},
-        start={"vertical": 0.0},
-    )
-    sd = 1e8 * SD
-    of = pf.FusionConfig(
-        arm=pf.ArmModel(
-            name="none",
-            update_period=10 * interval,
-            delay=0.0,
-            axes={"vertical": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.01), gain=pf.Gain(intercept=0.0))},
-        ),
-        start=pf.Start(offset_sd=0.0),
-        process={
-            "vertical": pf.Process(
-                input_noise=0.0,
-                drift=0.0,
-                disturbance_sd=sd,
-                disturbance_time=math.sqrt(3.0) / (density / (4.0 * sd**2)) ** (1.0 / 3.0),
-            )
-        },
-        sensors={"camera": pf.Sensor(sd=SD, gate=0.0)},
-    )
-    got = found(fused(run, of), "camera", "vertical")
-    assert got.filter.rms == pytest.approx(got.constant_velocity.rms, 1e-3)
-    assert got.filter.median == pytest.approx(got.constant_velocity.median, 1e-3)
-    assert got.of_best_other == pytest.approx(1.0, abs=1e-3)
-    assert got.last_held.rms > 1.5 * got.filter.rms
-    assert got.command_alone.rms > 1.5 * got.filter.rms
-
-
-def test_files_and_screens_have_it(tmp_path):
-    """`summary.json` read back is the summary; measurements have segments; `fuse` and `compare` print."""
-    runs = moving_run(1), moving_run(2, begin=3.0, count=70)
-    est = fused(one_after_the_other(*runs), config(**SENSORS))
+def test_files_and_screens_have_it(est: pf.Estimates, tmp_path: Path) -> None:
+    """`summary.json` read back is the summary; measurements have segments; `compare` prints."""
     results.write(est, tmp_path / "set-back", force=False)
     read = results.read(tmp_path / "set-back").summary
     assert read.axes["radial"].sensors["range"].skill == found(est, "range", "radial")
     table = results.tables.read(tmp_path / "set-back" / "measurements.parquet")
     assert table.columns["segment"].to_pylist() == est.measurements.segment.tolist()
 
-    scan = pf.__path__[0] + "/data"
-    printed = pumafuse("fuse", f"{scan}/scan1", "-c", f"{scan}/fusion.toml", "-o", str(tmp_path / "out")).stdout
-    compared = pumafuse("compare", str(tmp_path / "out")).stdout
-    one = json.loads(pumafuse("compare", str(tmp_path / "out"), "--json").stdout)[0]["skill"]["radial"]["range"]
-    for text in (printed, compared):
-        row = next(line for line in text.splitlines() if " range " in line and " / " in line)
-        cells = [f"{one[key]['rms_mm']:.3f} / {one[key]['median_mm']:.3f}" for key in list(one)[1:]]
-        assert row.split(maxsplit=5)[0] and all(cell in row for cell in cells)
+    text, found_again = (printed("compare", tmp_path / "set-back", *more) for more in ((), ("--json",)))
+    one = json.loads(found_again)[0]["skill"]["radial"]["range"]
+    row = next(line for line in text.splitlines() if " range " in line and " / " in line)
+    cells = [f"{one[key]['rms_mm']:.3f} / {one[key]['median_mm']:.3f}" for key in list(one)[1:]]
+    assert row.split(maxsplit=5)[0] and all(cell in row for cell in cells)
 
 
 def test_a_simpler_way_that_predicts_better_is_said() -> None:
@@ -291,7 +225,7 @@ def test_a_simpler_way_that_predicts_better_is_said() -> None:
         sensor = pf.Sensor(sd=1e-4, gate=0.0)
         process = {"x": pf.Process(input_noise=1e-5, drift=1e-4)}
         return beaten(
-            pf.summarise(fused(run, pf.FusionConfig(arm=arm, process=process, sensors={"rule": sensor}))).axes
+            pf.summarise(pf.fuse(run, pf.FusionConfig(arm=arm, process=process, sensors={"rule": sensor}))).axes
         )
 
     assert not said(0.29)

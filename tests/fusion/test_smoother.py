@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import replace
-from pathlib import Path
-
 import msgspec
 import numpy as np
 import pytest
@@ -13,23 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from fusion.test_oracle import (
-    GRID,
-    MODES,
-    MS,
-    PANEL,
-    TRACKER,
-    UNDER,
-    VISION,
-    Case,
-    Seen,
-    T,
-    cases,
-    check,
-    every,
-    one,
-    sensor,
-)
+from executable import FUSION, SCAN
+from fusion.test_oracle import MODES, MS, UNDER, Case, Seen, T, cases, every, one, sensor, tame
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.outcome import Outcome
@@ -38,52 +19,7 @@ from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.logs.run import Run, Source
 
-LATE = Seen(TRACKER.sensor, every(90, 20, 240 * MS))
-EARLY = Seen(TRACKER.sensor, every(90, 15))
-# ---- against the oracle ---------------------------------------------------------------------------------------------
-
-MORE = {
-    "a late first measurement": Case(one(UNDER), seen={"tracker": LATE}, rate=110.0),
-    "a gap in the measurements": Case(
-        one(UNDER), seen={"tracker": Seen(TRACKER.sensor, np.r_[EARLY.valid, LATE.valid])}
-    ),
-    "a latency that wanders": Case(
-        delay=0.02,
-        seen={"wandering": Seen(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), GRID), "vision": VISION},
-    ),
-    "a panel before the tracker": Case(one(UNDER), seen={"panel": PANEL, "tracker": LATE}, rate=60.0),
-}
-
-
-@pytest.mark.parametrize("case", MORE.values(), ids=MORE.keys())
-def test_smoothed_estimates_know_every_measurement(case: Case) -> None:
-    """Mean and error bar are those of the joint Gaussian given the whole run; innovations stay one step ahead."""
-    check(case, "smoothed")
-
-
-def tame(case: Case) -> Case:
-    """Priors and drifts of at most some 30 times a measurement's noise; beyond, rounding can pass 1e-12 m.
-
-    And no disturbance: at the very start of a run it costs the smoother up to 1e-7 of a standard deviation.
-    """
-    seen = {
-        name: replace(each, sensor=msgspec.structs.replace(
-            each.sensor, sd=max(each.sensor.sd, 0.3e-3), bias_sd=min(each.sensor.bias_sd, 9e-3)))
-        for name, each in case.seen.items()
-    }  # fmt: skip
-    drift = min(case.process.maneuver_drift, 5e-3)
-    process = msgspec.structs.replace(case.process, maneuver_drift=drift, disturbance_sd=0.0)
-    return replace(case, seen=seen, process=process, offset_sd=min(case.offset_sd, 5e-3))
-
-
-@settings(max_examples=50)
-@given(cases())
-def test_any_run_is_smoothed_like_the_conditional_gaussian(case: Case) -> None:
-    """Random plants, delays, gains, gaps, noise and sensors: nothing deviates from the joint Gaussian."""
-    check(tame(case), "smoothed")
-
-
-# ---- without the oracle ------------------------------------------------------------------------
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 
 
 def test_an_unknown_mode_is_refused() -> None:
@@ -161,7 +97,7 @@ def test_a_reacquired_gate_is_a_jump_of_the_offset(mode: str) -> None:
     assert rows[Outcome.REACQUIRED] == {("tracker", 26), ("tracker", 36)}
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(cases(), st.sampled_from(["filtered", "smoothed"]))
 def test_any_gated_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
     """Gates narrow enough to reject and to re-acquire."""
@@ -169,25 +105,19 @@ def test_any_gated_run_is_fused_like_the_conditional_gaussian(case: Case, mode: 
     config = msgspec.structs.replace(
         config, sensors={name: msgspec.structs.replace(each, gate=1.0) for name, each in config.sensors.items()}
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PumafuseWarning)
-        check_gated(run, config, fuse(run, config, rate=case.rate, **MODES[mode]), mode)
+    check_gated(run, config, fuse(run, config, rate=case.rate, **MODES[mode]), mode)
 
 
 # ---- the shipped scan -----------------------------------------------------------------------------------------------
 
-DATA = Path(pf.__file__).parent / "data"
 LIMITS = {"tangential": 0.050e-3, "radial": 0.034e-3, "vertical": 0.040e-3}
 
 
 def test_the_scan_is_smoothed_as_well_as_promised() -> None:
     """With tracker and vision: errors within 0.050 / 0.034 / 0.040 mm of the truth, and error bars that hold."""
-    run, config = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PumafuseWarning)  # of the scan's own faults
-        est = pf.fuse(run, config, sensors=["tracker", "vision"], rate=200.0, mode="smoothed")
+    run, config = pf.Run.read(SCAN), pf.FusionConfig.load(FUSION)
+    summary = pf.summarise(pf.fuse(run, config, sensors=["tracker", "vision"], rate=200.0, mode="smoothed"))
     for axis, limit in LIMITS.items():
-        found = pf.score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)
-        assert found.rows > 11_000
-        assert found.rmse <= limit
-        assert 0.90 <= found.coverage <= 0.99
+        found = summary.axes[axis].score
+        assert found is not None and found.rows > 11_000
+        assert found.rmse <= limit and 0.90 <= found.coverage <= 0.99

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 import sys
-import warnings
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import pumafuse as pf
 from pumafuse.fusion import results
 
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 COMMANDS = 1.0 + 0.02 * np.arange(100)
 ARM = {
     "name": "arm",
@@ -36,15 +35,14 @@ def run() -> pf.Run:
     return pf.Run.from_arrays(COMMANDS, {"x": x, "yaw": yaw}, {"camera": (COMMANDS + 0.07, seen)}, name="a run")
 
 
-def fused(run: pf.Run, **how: Any) -> pf.Estimates:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        return pf.fuse(run, pf.FusionConfig.parse(CONFIG), **how)
+@pytest.fixture(scope="module")
+def est(run: pf.Run) -> pf.Estimates:
+    return pf.fuse(run, pf.FusionConfig.parse(CONFIG))
 
 
 def test_tables_are_in_si_with_the_units_in_their_names(run: pf.Run) -> None:
     """In m and rad; the files have mm and degrees; what there is not is null, not NaN."""
-    est = fused(run, mode="smoothed")
+    est = pf.fuse(run, pf.FusionConfig.parse(CONFIG), mode="smoothed")
     table = est.to_arrow()
     assert table.column_names[:3] == ["time_s", "x.position_m", "x.position_sd_m"]
     for axis, unit in (("x", "m"), ("yaw", "rad")):
@@ -56,17 +54,11 @@ def test_tables_are_in_si_with_the_units_in_their_names(run: pf.Run) -> None:
     np.testing.assert_allclose(files["yaw.position_deg"], np.degrees(est["yaw"].position))
 
 
-def test_data_frames_have_the_table(run: pf.Run) -> None:
-    """What pandas makes of the table."""
-    est = fused(run)
-    frame = est.to_pandas()
+def test_data_frames_have_the_table(est: pf.Estimates, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What pandas makes of it; polars has a function of its own, and without it Python says what is missing."""
+    frame, polars = est.to_pandas(), ModuleType("polars")
     assert list(frame) == est.to_arrow().column_names
     np.testing.assert_array_equal(frame["yaw.velocity_rad_s"], est["yaw"].velocity)
-
-
-def test_polars_gets_the_table_where_it_is_installed(run: pf.Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its own function for Arrow tables makes the data frame; without it, Python says what is missing."""
-    est, polars = fused(run), ModuleType("polars")
     polars.from_arrow = lambda table: ("a frame", table)  # pyright: ignore
     monkeypatch.setitem(sys.modules, "polars", polars)
     assert est.to_polars() == ("a frame", est.to_arrow())
@@ -75,9 +67,8 @@ def test_polars_gets_the_table_where_it_is_installed(run: pf.Run, monkeypatch: p
         est.to_polars()
 
 
-def test_a_saved_folder_is_read_again(run: pf.Run, tmp_path: Path) -> None:
+def test_a_saved_folder_is_read_again(est: pf.Estimates, tmp_path: Path) -> None:
     """What the command line writes; not over something else, and over an earlier result only by force."""
-    est = fused(run)
     est.save(tmp_path / "out")
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"estimates.parquet", "summary.json", "arm.toml"}
     np.testing.assert_allclose(results.read(tmp_path / "out").axes["x"].position, est["x"].position, rtol=1e-12)
@@ -86,17 +77,8 @@ def test_a_saved_folder_is_read_again(run: pf.Run, tmp_path: Path) -> None:
     est.save(str(tmp_path / "out"), force=True)
 
 
-def test_a_plot_is_the_figure_of_the_run(run: pf.Run) -> None:
-    """Four panels an axis; a notebook shows what it gets."""
-    drawn = pf.fused_figure(fused(run))
-    assert isinstance(drawn, Figure)
-    assert len(drawn.axes) == 8
-    assert isinstance(pf.validation_figure(fused(run)), Figure)
-
-
-def test_everything_says_in_a_line_what_it_is(run: pf.Run) -> None:
+def test_everything_says_in_a_line_what_it_is(run: pf.Run, est: pf.Estimates) -> None:
     """No array, no page of defaults."""
-    est = fused(run)
     arm = est.config.arm
     things = [est, est["x"], est.measurements, run, run.command, est.config, arm, pf.summarise(est)]
     things += [pf.discretize(arm.axes["x"], 0.02, 0.03), pf.LiveEstimator(est.config)]
@@ -145,6 +127,7 @@ def test_numbers_of_numpy_are_numbers(number: Any) -> None:
 
 def test_one_sensor_needs_no_list(run: pf.Run) -> None:
     """A name is a name, not its letters."""
-    assert fused(run, sensors="camera").measurements.sensors == ("camera",)
+    config = pf.FusionConfig.parse(CONFIG)
+    assert pf.fuse(run, config, sensors="camera").measurements.sensors == ("camera",)
     with pytest.raises(pf.UnknownNameError, match="'cam'"):
-        fused(run, sensors="cam")
+        pf.fuse(run, config, sensors="cam")

@@ -10,27 +10,26 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from executable import pumafuse, refused
+from executable import printed, refused
 from pumafuse.errors import RunError
 from pumafuse.fusion import results
 from refusals import one_line
 
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 START_NS = 1_700_000_000_123_456_789
 
 
-def _configured(folder: Path, axes: str, more: str = "") -> pf.FusionConfig:
-    plants = "".join(f'[axes.{axis}]\nplant = "first-order"\ntime_constant_ms = 40.0\n' for axis in axes.split())
-    (folder / "arm.toml").write_text(f'name = "cell"\nupdate_period_ms = 20.0\ndelay_ms = 30.0\n{plants}')
-    process = "[start]\noffset_sd_mm = 1.0\n[process]\ninput_noise_mm_rtHz = 0.05\ndrift_mm_rts = 0.1\n"
-    (folder / "fusion.toml").write_text(f'arm = "arm.toml"\n{process}[sensors.camera]\nsd_mm = 1.0\n{more}')
-    return pf.FusionConfig.load(folder / "fusion.toml")
+def _configured(axes: str, **more: object) -> pf.FusionConfig:
+    plant = {"plant": "first-order", "time_constant_ms": 40.0}
+    arm = {"name": "cell", "update_period_ms": 20.0, "delay_ms": 30.0, "axes": dict.fromkeys(axes.split(), plant)}
+    return pf.FusionConfig.parse({"arm": arm, "sensors": {"camera": {"sd_mm": 1.0}}, **more})
 
 
-def _recorded(axes: str = "x y z", **more: object) -> pf.Run:
+def _recorded(axes: str = "x y z") -> pf.Run:
     time = START_NS + 20_000_000 * np.arange(100)
     turn = 1.0 - np.cos(np.arange(100) / 20)
     paths = {axis: 0.3 + 0.1 * k * turn for k, axis in enumerate(axes.split(), 1)}
-    return pf.Run.from_arrays(time, paths, {"camera": (time + 1, paths)}, (time + 7, paths), **more)
+    return pf.Run.from_arrays(time, paths, {"camera": (time + 1, paths)}, (time + 7, paths))
 
 
 def _read(path: Path) -> tuple[list[int], np.ndarray]:
@@ -39,10 +38,9 @@ def _read(path: Path) -> tuple[list[int], np.ndarray]:
     return [int(Decimal(line[0]) * 10**9) for line in lines], np.array([list(map(float, line[1:])) for line in lines])
 
 
-@pytest.mark.filterwarnings("ignore::pumafuse.errors.PumafuseWarning")
 def test_a_trajectory_has_every_digit_of_stamps_and_positions(tmp_path: Path) -> None:
     """Stamps are the log's own to the ns, positions are the estimates bit for bit in m, and nothing is turned."""
-    est = pf.fuse(_recorded(), _configured(tmp_path, "x y z"))
+    est = pf.fuse(_recorded(), _configured("x y z"))
     est.to_tum(tmp_path / "fused.tum")
     stamps, numbers = _read(tmp_path / "fused.tum")
     assert stamps == [START_NS + round(time * 1e9) for time in est.time]
@@ -50,15 +48,12 @@ def test_a_trajectory_has_every_digit_of_stamps_and_positions(tmp_path: Path) ->
     assert np.array_equal(numbers[:, 3:], np.tile([0.0, 0.0, 0.0, 1.0], (len(est.time), 1)))
 
 
-@pytest.mark.filterwarnings("ignore::pumafuse.errors.PumafuseWarning")
 def test_with_a_frame_the_trajectories_are_in_the_coordinates_of_the_log(tmp_path: Path) -> None:
     """The reference, which is scored in the arm's axes, comes back to within rounding, also from a result folder."""
-    frame = '[frame]\nkind = "rotated"\nazimuth_deg = 30.0\n'
-    config = _configured(tmp_path, "tangential radial vertical", frame)
+    config = _configured("tangential radial vertical", frame={"kind": "rotated", "azimuth_deg": 30.0})
     run = _recorded()
     results.write(pf.fuse(run, config), tmp_path / "fused", force=False)
-    printed = pumafuse("compare", tmp_path / "fused", "--tum", tmp_path / "out").stdout
-    assert "trajectories written to " in printed
+    assert "trajectories written to " in printed("compare", tmp_path / "fused", "--tum", tmp_path / "out")
     stamps, numbers = _read(tmp_path / "out" / "fused.reference.tum")
     assert stamps == [START_NS + 7 + 20_000_000 * k for k in range(100)]
     truth = np.column_stack([run.reference.values[axis] for axis in "xyz"])
@@ -67,18 +62,16 @@ def test_with_a_frame_the_trajectories_are_in_the_coordinates_of_the_log(tmp_pat
     assert np.abs(estimated[:, :3] - truth).max() < 0.1
 
 
-@pytest.mark.filterwarnings("ignore::pumafuse.errors.PumafuseWarning")
 def test_runs_without_a_trajectory_say_what_they_have_instead(tmp_path: Path) -> None:
     """Axes that are no x, y, z, and clocks that were set back, are one line and no file."""
-    est = pf.fuse(_recorded("x lift"), _configured(tmp_path, "x lift"))
+    est = pf.fuse(_recorded("x lift"), _configured("x lift"))
     said = one_line(RunError, lambda: est.to_tum(tmp_path / "fused.tum"))
     assert said == (
         "run 'run': a trajectory needs x, y and z, as axes of the arm or by a [frame]; there are only x, lift"
     )
     results.write(est, tmp_path / "fused", force=False)
-    printed = refused("compare", tmp_path / "fused", "--tum", tmp_path / "out")
-    assert "a trajectory needs x, y and z" in printed
-    est = pf.fuse(_recorded(), _configured(tmp_path, "x y z"))
+    assert "a trajectory needs x, y and z" in refused("compare", tmp_path / "fused", "--tum", tmp_path / "out")
+    est = pf.fuse(_recorded(), _configured("x y z"))
     twice = replace(est, segment=np.arange(len(est.time)) // 50)
     assert "the log's clock was set back" in one_line(RunError, lambda: twice.to_tum(tmp_path / "fused.tum"))
     assert not (tmp_path / "fused.tum").exists()

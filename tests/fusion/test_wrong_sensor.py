@@ -6,7 +6,6 @@ Errors are against the true motion, which the simulation here follows by the fil
 from __future__ import annotations
 
 import re
-import warnings
 from functools import cache
 from typing import Any
 
@@ -18,6 +17,7 @@ import pumafuse as pf
 from pumafuse.arrays import FloatArray
 from pumafuse.filter.response import response
 
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 MS = 1_000_000  # ns
 SECONDS = 25
 SLIP = 0.05  # m
@@ -68,17 +68,8 @@ def fused(
 ) -> tuple[pf.Estimates, FloatArray]:
     """A run with a fault, fused, and the true position at every millisecond [m].
 
-    Args:
-        order: Of the sensors in fusion.toml.
-        tracker: By how much it is off [m].
-        camera: By how much it is off [m], at each millisecond or throughout.
-        tracker_since: From when on it is off [s].
-        camera_since: From when on it is off [s].
-        clock: By how much the camera's stamps are off from then on [s].
-        frozen: Whether the camera says the same from then on for 5 s.
-        slip: Whether at 5 s the arm itself slips.
-        silent: Whether the tracker has no rows from 9 to 15 s.
-        kwargs: Of `fuse`.
+    Tracker or camera are off [m] from some second on, the camera's stamps by ``clock`` [s], or it says the same for
+    5 s; the arm itself slips at 5 s; the tracker is silent from 9 to 15 s.
     """
     true, tracked, seen = simulated()
     second = np.arange(len(true)) / 1000
@@ -98,9 +89,7 @@ def fused(
         "camera": (theirs * MS + 40 * MS + late, {"radial": seen[theirs]}),
     }
     config = pf.FusionConfig(arm=ARM, process={"radial": PROCESS}, sensors={name: SENSORS[name] for name in order})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        est = pf.fuse(pf.Run.from_arrays(COMMANDS, {"radial": U}, streams), config, rate=100.0, **kwargs)
+    est = pf.fuse(pf.Run.from_arrays(COMMANDS, {"radial": U}, streams), config, rate=100.0, **kwargs)
     return est, true + slipped
 
 
@@ -121,7 +110,10 @@ FAULTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("order", ORDERS, ids="+".join)
+in_any_order = pytest.mark.parametrize("order", ORDERS, ids="+".join)
+
+
+@in_any_order
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_wrong_camera_beside_a_good_tracker_does_no_harm(fault: str, order: tuple[str, ...]) -> None:
     """At most 1.2 times the error without the fault, as live, too."""
@@ -129,7 +121,7 @@ def test_a_wrong_camera_beside_a_good_tracker_does_no_harm(fault: str, order: tu
         assert rms(error_of(order, **FAULTS[fault], **mode)) < 1.2 * rms(error_of(**mode))
 
 
-@pytest.mark.parametrize("order", ORDERS, ids="+".join)
+@in_any_order
 def test_who_contradicts_whom_is_said_with_the_time(order: tuple[str, ...]) -> None:
     """One note each, nothing without a fault; a drift shows when it is 5 sd, 2.5 s later. What is frozen is held."""
     assert not [note for note in fused(order)[0].notes if "contradicts" in note]
@@ -141,14 +133,14 @@ def test_who_contradicts_whom_is_said_with_the_time(order: tuple[str, ...]) -> N
         assert any(5.0 <= float(number) < 8.5 for number in re.findall(r"(\d+\.\d+) s", note)), note
 
 
-@pytest.mark.parametrize("order", ORDERS, ids="+".join)
+@in_any_order
 def test_a_wrong_tracker_leaves_what_the_camera_knows(order: tuple[str, ...]) -> None:
     """50 mm off from 5 s on: at most 1.2 times the error of the camera alone."""
     alone = error_of(sensors=["camera"])
     assert rms(error_of(order, tracker=50e-3)) < min(1.2 * rms(alone), 0.3)
 
 
-@pytest.mark.parametrize("order", ORDERS, ids="+".join)
+@in_any_order
 def test_a_slip_that_both_see_is_followed(order: tuple[str, ...]) -> None:
     """Within 0.6 s, and then as if nothing had been."""
     error = error_of(order, slip=True)
@@ -163,7 +155,7 @@ def test_a_sensor_alone_follows_a_slip_at_once() -> None:
     assert np.abs(error[504:]).max() < 0.5
 
 
-@pytest.mark.parametrize("order", ORDERS, ids="+".join)
+@in_any_order
 def test_the_harm_of_an_outage_ends_with_it(order: tuple[str, ...]) -> None:
     """A tracker silent from 9 to 15 s beside a wrong camera: the camera alone is believed meanwhile."""
     error = error_of(order, camera=50e-3, silent=True)
@@ -172,7 +164,7 @@ def test_the_harm_of_an_outage_ends_with_it(order: tuple[str, ...]) -> None:
     assert rms(error, 15.2) < 1.05 * rms(error_of(), 15.2)
 
 
-@pytest.mark.parametrize("order", ORDERS, ids="+".join)
+@in_any_order
 def test_a_slip_long_ago_does_not_decide_for_a_wrong_sensor(order: tuple[str, ...]) -> None:
     """A slip that both saw and, 10 s later, a wrong camera: as if there had been no slip."""
     error = error_of(order, slip=True, camera=50e-3, camera_since=15.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -81,12 +82,12 @@ def sources() -> dict[str, tuple[Rows, np.ndarray]]:
     t = np.sort(np.concatenate([t, t[::50], t[::70] + 0.002]))
     commands = {"t": t, "x": moved("x", np.floor(t / 0.028) * 0.028), "y": moved("y", np.floor(t / 0.028) * 0.028)}
     arrival = t + np.where(np.arange(len(t)) % 97 == 5, 0.4, 0.0)
-    exact = np.arange(0.0, SPAN, 0.01)
+    exact = np.arange(0.0, SPAN, 0.02)
     truth = {"t": exact, "x": moved("x", exact - LAG["x"]), "y": moved("y", exact - LAG["y"])}
     return {
         "command": (commands, arrival),
         "camera": rows(30.0, 1.4, 5e-4, 1),
-        "tracker": rows(200.0, 0.8, 1e-4, 2, "x"),
+        "tracker": rows(100.0, 0.8, 1e-4, 2, "x"),
         "reference": (truth, exact),
     }
 
@@ -130,30 +131,44 @@ def written(folder: Path, *, single: bool, damage: Any = None) -> Path:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pieces of few rows."""
     monkeypatch.setattr(tables, "_BATCH", 300)
-    monkeypatch.setattr(fusing, "PIECE", 1200)
+    monkeypatch.setattr(fusing, "PIECE", 1000)
     monkeypatch.setattr(reading, "WAIT_NS", 2000 * MS)
 
 
-def in_memory(path: Path, folder: Path, part: tuple[float | None, float | None] = (None, None), **how: Any) -> Summary:
-    return results.write(pf.fuse(pf.Run.read(path).between(*part), CONFIG, **how), folder, False)
+@pytest.fixture(scope="module", params=["one table", "a table for each source"])
+def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(tmp_path_factory.mktemp("logs") / "log", single=request.param == "one table")
+
+
+TABLES = results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE
+
+
+def both_ways(
+    path: Path,
+    folder: Path,
+    part: tuple[float | None, float | None] = (None, None),
+    same: Sequence[str] = TABLES,
+    **how: Any,
+) -> tuple[Summary, Summary]:
+    """Summaries of the run as a whole and in pieces, of which tables must be the same to the last bit."""
+    whole = results.write(pf.fuse(pf.Run.read(path).between(*part), CONFIG, **how), folder / "whole", False)
+    pieces = fusing.fuse_to(path, folder / "pieces", CONFIG, part=part, **how)
+    assert names(folder / "whole") | {"log.json"} == names(folder / "pieces")
+    for name in same:
+        assert pq.read_table(folder / "pieces" / name) == pq.read_table(folder / "whole" / name), name
+    return whole, pieces
 
 
 def close(found: Any, expected: Any, relative: float) -> bool:
     return found == expected or abs(found - expected) <= relative * abs(expected)
 
 
-@pytest.mark.parametrize("single", [True, False])
 @pytest.mark.parametrize(
     "how", [{}, {"rate": 100.0}, {"sensors": ["camera"]}, {"part": (5.0, 50.0), "rate": 90.0}, {"part": (30.0, None)}]
 )
-def test_pieces_are_the_whole(tmp_path: Path, single: bool, how: dict[str, Any]) -> None:
+def test_pieces_are_the_whole(log: Path, tmp_path: Path, how: dict[str, Any]) -> None:
     """Estimates, outcomes and the reference to the last bit; counts equal; scores and NIS to rounding."""
-    path = written(tmp_path / "log", single=single)
-    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
-    expected, found = in_memory(path, whole, **how), fusing.fuse_to(path, pieces, CONFIG, **how)
-    assert names(whole) | {"log.json"} == names(pieces)
-    for name in (results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE):
-        assert pq.read_table(pieces / name) == pq.read_table(whole / name), name
+    expected, found = both_ways(log, tmp_path, **how)
     assert found.estimates == expected.estimates and found.duration_s == expected.duration_s
     if how.get("part", (None, None))[1] is None:  # what comes behind the part is not read
         assert (found.commands, found.rows) == (expected.commands, expected.rows)
@@ -178,24 +193,17 @@ def test_pieces_are_the_whole(tmp_path: Path, single: bool, how: dict[str, Any])
             assert close(other.skill.command_alone.rms, its.skill.command_alone.rms, 0.5)
 
 
-def test_there_are_many_pieces(tmp_path: Path) -> None:
+def test_there_are_many_pieces(log: Path, tmp_path: Path) -> None:
     """The comparison above is one of a dozen pieces, in some of which no command is."""
-    path = written(tmp_path / "log", single=True)
     shares = list[float]()
-    found = fusing.fuse_to(path, tmp_path / "out", CONFIG, progress=shares.append)
+    found = fusing.fuse_to(log, tmp_path / "out", CONFIG, progress=shares.append)
     assert len(shares) > 10 and shares == sorted(shares) and shares[-1] == 1.0
     assert any(f"fused in {len(shares)} pieces" in note for note in found.notes)
-    assert rows_of(path) == pq.read_metadata(path).num_rows
+    files = [log] if log.is_file() else log.glob("*.parquet")
+    assert rows_of(log) == sum(pq.read_metadata(file).num_rows for file in files)
 
 
-def refused(path: Path, out: Path, what: str, **how: Any) -> None:
-    with pytest.raises(PumafuseError, match=what) as error:
-        fusing.fuse_to(path, out, CONFIG, **how)
-    assert "\n" not in str(error.value) and set(out.parent.iterdir()) == {path.parent if path.is_file() else path}
-
-
-@pytest.mark.parametrize("statistics", [True, False])
-@pytest.mark.parametrize("none", [9999.0, -32768.0])
+@pytest.mark.parametrize(("none", "statistics"), [(9999.0, True), (-32768.0, False)])
 def test_what_stands_for_none_is_told_by_the_whole_file(tmp_path: Path, none: float, statistics: bool) -> None:
     """Of ten seconds in which a tracker is lost some pieces have nothing else, and the first rows none of it."""
 
@@ -207,10 +215,8 @@ def test_what_stands_for_none_is_told_by_the_whole_file(tmp_path: Path, none: fl
     if not statistics:
         for file in path.glob("*.parquet"):
             pq.write_table(pq.read_table(file), file, write_statistics=False)
-    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
-    expected, found = in_memory(path, whole), fusing.fuse_to(path, pieces, CONFIG)
-    estimates = pq.read_table(pieces / results.ESTIMATES)
-    assert estimates == pq.read_table(whole / results.ESTIMATES)
+    expected, found = both_ways(path, tmp_path)
+    estimates = pq.read_table(tmp_path / "pieces" / results.ESTIMATES)
     assert np.abs(estimates["x.position_mm"].to_numpy()).max() < 1e3
     assert found.rows["tracker"] == expected.rows["tracker"]
 
@@ -225,10 +231,7 @@ def test_what_stands_for_none_in_a_piece_may_be_a_position_in_the_file(tmp_path:
         camera["y"][1600] = 150.0
 
     path = written(tmp_path / "log", single=single, damage=is_far)
-    whole, pieces = tmp_path / "whole", tmp_path / "pieces"
-    expected, found = in_memory(path, whole), fusing.fuse_to(path, pieces, CONFIG)
-    for name in (results.ESTIMATES, results.MEASUREMENTS):
-        assert pq.read_table(pieces / name) == pq.read_table(whole / name), name
+    expected, found = both_ways(path, tmp_path)
     assert found.rows["camera"] == expected.rows["camera"]
     assert not [note for note in found.notes if "ten times as far" in note]
 
@@ -247,15 +250,15 @@ def test_rows_that_come_too_late(tmp_path: Path, single: bool) -> None:
     assert sum(found.rows["camera"].values()) == sum(whole.counts["camera"].values()) - 1
     assert found.rows["tracker"] == whole.counts["tracker"]
 
-    for name in ("camera", "command"):
+    def back(given: dict[str, tuple[Rows, np.ndarray]]) -> None:
+        late, arrival = given["camera" if single else "command"]
+        late["t"] = np.where(arrival > 50.0, late["t"] - 30.0, late["t"])
 
-        def back(given: dict[str, tuple[Rows, np.ndarray]], name: str = name) -> None:
-            rows, arrival = given[name]
-            rows["t"] = np.where(arrival > 50.0, rows["t"] - 30.0, rows["t"])
-
-        folder = tmp_path / f"back-{name}"
-        folder.mkdir()
-        refused(written(folder / "log", single=single, damage=back), folder / "out", "behind an earlier one|set back")
+    path = written(tmp_path / "back", single=single, damage=back)
+    before = set(tmp_path.iterdir())
+    with pytest.raises(PumafuseError, match=r"behind an earlier one|set back") as error:
+        fusing.fuse_to(path, tmp_path / "refused", CONFIG)
+    assert "\n" not in str(error.value) and set(tmp_path.iterdir()) == before
 
 
 def test_stray_and_missing_stamps(tmp_path: Path) -> None:
@@ -270,16 +273,13 @@ def test_stray_and_missing_stamps(tmp_path: Path) -> None:
     stamps = table["time_ns"].to_pylist()
     stamps[3000:3010] = [None] * 10
     pq.write_table(table.set_column(0, "time_ns", pa.array(stamps, pa.int64())), path / "tracker.parquet")
-    expected, found = in_memory(path, tmp_path / "whole"), fusing.fuse_to(path, tmp_path / "out", CONFIG)
-    assert pq.read_table(tmp_path / "out" / "estimates.parquet") == pq.read_table(tmp_path / "whole/estimates.parquet")
+    expected, found = both_ways(path, tmp_path, same=[results.ESTIMATES])
     assert (found.rows, found.commands) == (expected.rows, expected.commands)
     assert found.rows["tracker"]["no_stamp"] == 10 and found.rows["tracker"]["stray"] == 1
 
 
-def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_leaves_nothing(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A full disk, Ctrl-C in the middle, and a run of which nothing is fused."""
-    path = written(tmp_path / "log", single=False)
-    out = tmp_path / "out"
     digest = fusing.digest
     for error in (OSError(28, "No space left on device"), KeyboardInterrupt()):
         pieces = iter([None, None, error])
@@ -292,12 +292,11 @@ def test_what_cannot_be_written_leaves_nothing(tmp_path: Path, monkeypatch: pyte
         with monkeypatch.context() as context:
             context.setattr(fusing, "digest", interrupted)
             with pytest.raises((FolderError, KeyboardInterrupt)):
-                fusing.fuse_to(path, out, CONFIG)
-        assert set(tmp_path.iterdir()) == {path}
-    none = msgspec.structs.replace(CONFIG, sensors={})
+                fusing.fuse_to(log, tmp_path / "out", CONFIG)
+        assert not list(tmp_path.iterdir())
     with pytest.raises(RunError, match="nothing was fused"):
-        fusing.fuse_to(path, out, none)
-    assert set(tmp_path.iterdir()) == {path}
+        fusing.fuse_to(log, tmp_path / "out", msgspec.structs.replace(CONFIG, sensors={}))
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_takes_the_way_by_the_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

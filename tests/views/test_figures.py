@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 import pumafuse as pf
 from pumafuse.fusion.consistency import consistency
+from pumafuse.fusion.verdicts import sentence
 from pumafuse.logs.frames import Cylindrical
 from pumafuse.views.figures import error_figure, fused_figure, path_figure, validation_figure
 
@@ -187,7 +188,7 @@ def test_the_validation_figure_draws_what_it_judges() -> None:
         mine = mine.where(mine.outcome == pf.Outcome.FUSED)
         np.testing.assert_allclose(dots.get_ydata(), mine.innovation / mine.innovation_sd)
         assert len(mine.value) == len(run.sensors["camera"].stamp) - 1
-        assert series.get_title(loc="left") == f"{name}, camera. {found.verdict}"
+        assert series.get_title(loc="left") == f"{name}, camera. {sentence(found)}"
         np.testing.assert_allclose([bar.get_height() for bar in correlation.patches[:20]], found.correlation)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import typer
 
+from ..arrays import SD_OF_MEDIAN
 from ..discovery.drafts import drafts
 from ..discovery.guesses import guess
 from ..discovery.roles import UndecidedError
@@ -32,7 +33,6 @@ from .register import taken
 from .screen import say
 from .tune import WORSE, end, fitting, show_lags
 
-_SD = 1.4826  # of normal errors, over the median of their sizes
 _STRAYS_FAR = 2.0  # times as far off as the path through the commands: no arm was found
 _NOTHING = 1e-3  # of the range that is measured, by which it is off at least
 _STRAYS = 1.5  # times its sd, by which a sensor errs from what is predicted where the arm strays, too
@@ -115,7 +115,7 @@ def _off_the_path(found: Survey, summary: Summary) -> list[str]:
         skill = part.sensors[name].skill if part is not None and name in part.sensors else None
         if part is None or skill is None or abs(one.correlation) < FOLLOWS:
             continue
-        screen, off = SCREEN[part.kind], _SD * skill.filter.median
+        screen, off = SCREEN[part.kind], SD_OF_MEDIAN * skill.filter.median
         least = _NOTHING * float(np.ptp(found.run.sensors[name].values[axis]))
         if off < max(_STRAYS_FAR * one.misfit, least):
             follows.add(axis)

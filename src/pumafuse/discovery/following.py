@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, TimeArray
+from ..arrays import NO_STAMP, SD_OF_MEDIAN, BoolArray, FloatArray, TimeArray
 
 _EARLIEST, LATEST = -1.0, 2.0  # s, of a lag
 _BEYOND = 1e9  # m or rad, where no robot goes
@@ -141,7 +141,7 @@ def scatter(value: FloatArray) -> float:
     against outliers.
     """
     third = np.abs(np.diff(value, 3))
-    return 1.4826 * float(np.median(third)) / math.sqrt(20.0) if len(third) else 0.0
+    return SD_OF_MEDIAN * float(np.median(third)) / math.sqrt(20.0) if len(third) else 0.0
 
 
 def _resolution(value: FloatArray) -> float:
@@ -187,4 +187,4 @@ def isolated(value: FloatArray) -> BoolArray:
 
 def robust_sd(rest: FloatArray) -> float:
     """Standard deviation by the median distance from the median."""
-    return 1.4826 * float(np.median(np.abs(rest - np.median(rest))))
+    return SD_OF_MEDIAN * float(np.median(np.abs(rest - np.median(rest))))

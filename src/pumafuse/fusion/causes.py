@@ -90,19 +90,12 @@ _OF_ONE_SIGN = Cause.PLAY, Cause.LIMIT
 
 
 class Suspect(NamedTuple):
-    """A cause that explains the innovations.
-
-    Attributes:
-        cause: Which.
-        sensor: Whose; "" of the arm.
-        size: As :class:`Cause` says; 0 where it has none, infinite or 0 of a factor beyond those tried.
-        gain: Log-likelihood that it gains.
-    """
+    """A cause that explains the innovations."""
 
     cause: Cause
-    sensor: str
-    size: float
-    gain: float
+    sensor: str  # whose; "" of the arm
+    size: float  # as :class:`Cause` says; 0 where it has none, infinite or 0 of a factor beyond those tried
+    gain: float  # log-likelihood that it gains
 
 
 class Tried(NamedTuple):
@@ -114,23 +107,14 @@ class Tried(NamedTuple):
 
 
 class Weight(NamedTuple):
-    """What an alternative would change.
+    """What an alternative would change: a gain and a colour of another noise, the others of a shape."""
 
-    Attributes:
-        gain: Log-likelihood that another noise gains.
-        score: Of a shape: by its size, at 0.
-        information: Of a shape.
-        number: Of innovations, beside a shape.
-        squares: Sum of their ν²/S, likewise.
-        colour: Of another noise: Box-Pierce statistic of what it leaves, over its expectation for white innovations.
-    """
-
-    gain: float = 0.0
-    score: float = 0.0
+    gain: float = 0.0  # log-likelihood
+    score: float = 0.0  # by the size of a shape, at 0
     information: float = 0.0
-    number: float = 0.0
-    squares: float = 0.0
-    colour: float = 0.0
+    number: float = 0.0  # of innovations
+    squares: float = 0.0  # sum of their ν²/S
+    colour: float = 0.0  # Box-Pierce statistic of what is left, over its expectation for white innovations
 
 
 Evidence: TypeAlias = Mapping[Tried, Weight]
@@ -260,31 +244,18 @@ def _highest(tried: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
 
 class _Part(NamedTuple):
-    """Components of one axis that follow each other, and the commands meanwhile.
-
-    Attributes:
-        config: As used.
-        segment: Its commands.
-        axis: The axis.
-        measured: The components, (m,).
-        time: When they are valid, int64 ns, (m,).
-        scale: Of their sensors, (m,).
-        led: Where all commands lead the axis [m or rad], (m,).
-        start: Where it rests before the commands that the filter is given.
-        given: When these are given, int64 ns, (k,).
-        command: These [m or rad], (k,).
-    """
+    """Components of one axis that follow each other, and the commands meanwhile."""
 
     config: FusionConfig
-    segment: Segment
+    segment: Segment  # its commands
     axis: str
-    measured: Measurements
-    time: TimeArray
-    scale: FloatArray
-    led: FloatArray
-    start: float
-    given: TimeArray
-    command: FloatArray
+    measured: Measurements  # the components, (m,)
+    time: TimeArray  # when they are valid, int64 ns, (m,)
+    scale: FloatArray  # of their sensors, (m,)
+    led: FloatArray  # where all commands lead the axis [m or rad], (m,)
+    start: float  # where it rests before the commands that the filter is given
+    given: TimeArray  # when these are given, int64 ns, (k,)
+    command: FloatArray  # these [m or rad], (k,)
 
     @property
     def sensors(self) -> list[int]:
@@ -293,10 +264,7 @@ class _Part(NamedTuple):
 
     def position(self, model: AxisModel, time: TimeArray) -> FloatArray:
         """Where all commands lead an axis like this, (n,)."""
-        arm, start = self.config.arm, self.segment.start[self.axis]
-        return start + response(
-            model, arm.update_period, arm.delay_of(self.axis), *self.segment.given(self.axis), start, time
-        )
+        return self.segment.start[self.axis] + self.segment.led(self.config.arm, self.axis, time, model)
 
 
 def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -> _Part:

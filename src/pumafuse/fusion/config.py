@@ -345,11 +345,7 @@ def _check(path: str, part: msgspec.Struct, kind: Kind) -> None:
 
 
 def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
-    """The arm that the tables ``tree`` of the file ``path`` name: a file beside it, or a preset.
-
-    Raises:
-        ConfigError: It names none, or the arm is not as declared.
-    """
+    """The arm that the tables ``tree`` of the file ``path`` name: a file beside it, or a preset."""
     name = tree.get("arm")
     if not isinstance(name, str):
         raise ConfigError(f"{path}: 'arm' is missing; give a file beside this one, or a preset, as in arm = 'arm.toml'")
@@ -364,17 +360,7 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
 
 
 def with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str, path: str = "") -> dict[str, Any]:
-    """The tables of a ``fusion.toml`` (SI numbers) with the key names for lengths, where those of angles are.
-
-    Args:
-        tree: All of them, or some.
-        arm: Says of which kind its axes are.
-        where: The file, for errors.
-        path: The place of the tables in the file, with a point behind it.
-
-    Raises:
-        ConfigError: A key is of a kind that no axis has, or its value is out of range.
-    """
+    """The tables of a ``fusion.toml`` (SI numbers) with the key names for lengths, where those of angles are."""
     found = dict(tree)
     if isinstance(found.get("process"), dict):
         found["process"] = by_axis(found["process"], Process, arm, where, f"{path}process")
@@ -395,16 +381,6 @@ def by_axis(
     """A table for each axis of the arm: ``[process]`` is for all axes, ``[process.x]`` overrides it for one.
 
     They have the key names for lengths.
-
-    Args:
-        table: The table with the tables in it, in SI.
-        kind: The struct that declares the keys of both.
-        arm: Its axes are the accepted names.
-        where: The file, for errors.
-        path: The table's place in the file.
-
-    Raises:
-        ConfigError: A table names no axis, or a key is not declared.
     """
     names = {of: {of_kind(field.encode_name, of) for field in msgspec.structs.fields(kind)} for of in KINDS}
     keys = names["length"] | names["angle"]
@@ -431,19 +407,7 @@ def by_axis(
 def of_all_axes(
     table: Any, kind: type[msgspec.Struct], arm: ArmModel, where: str, path: str, per_axis: Sequence[str]
 ) -> Any:
-    """A table for all axes of the arm as one of lengths; where axes are of both kinds, with a number for each axis.
-
-    Args:
-        table: The table, in SI: ``sd_mm`` holds for the axes that are lengths, ``sd_deg`` for those that are angles.
-        kind: The struct that declares its keys, as those of lengths.
-        arm: Its axes are of one kind or of both.
-        where: The file, for errors.
-        path: The table's place in the file.
-        per_axis: The keys that may have a number for each axis.
-
-    Raises:
-        ConfigError: A key is of a kind that no axis has, or its value is out of range.
-    """
+    """A table for all axes of the arm as one of lengths; where axes are of both kinds, with a number for each axis."""
     if not isinstance(table, dict):
         return table
     found, types = (

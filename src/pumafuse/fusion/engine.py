@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import NO_STAMP, CodeArray, FloatArray, TimeArray
-from ..filter.core import Filter, Model, Record, linearise
+from ..filter.core import Filter, Model, linearise
 from ..filter.events import Events, Results
 from ..filter.outcome import Outcome
 from .config import FusionConfig
@@ -23,19 +23,12 @@ _NO_TIMES = np.zeros(0, dtype=np.int64)
 
 @dataclass(frozen=True)
 class Filtered:
-    """What the filter makes of one segment.
+    """What the filter makes of one segment."""
 
-    Attributes:
-        axes: Estimates by axis.
-        events: What it was given.
-        results: What became of them.
-        biases: By sensor and axis, as all measurements together know them.
-    """
-
-    axes: dict[str, AxisEstimate]
-    events: Events
-    results: Results
-    biases: dict[str, dict[str, Bias]]
+    axes: dict[str, AxisEstimate]  # estimates by axis
+    events: Events  # what it was given
+    results: Results  # what became of them
+    biases: dict[str, dict[str, Bias]]  # by sensor and axis, as all measurements together know them
 
 
 def filter_segment(
@@ -46,16 +39,7 @@ def filter_segment(
     engine: Engine = "compiled",
     progress: Callable[[float], None] | None = None,
 ) -> Filtered:
-    """Filter or smooth one segment.
-
-    Args:
-        segment: The events.
-        config: Arm, noise and sensors.
-        times: Of the estimates, int64 ns, ascending, none before the origin.
-        mode: Which measurements an estimate knows.
-        engine: Which filter; ``filterpy`` only filters.
-        progress: Called now and then by the filterpy engine with the share done, 0 to 1.
-    """
+    """Filter or smooth one segment; ``times`` of the estimates ascend, int64 ns, none before the origin."""
     events = segment.events_once(config)
     model, results = model_of(segment, config), _undecided(events)
     if engine == "filterpy":
@@ -72,17 +56,9 @@ def filter_segment(
 def filter_piece(
     segment: Segment, core: Filter, config: FusionConfig, times: TimeArray, own: tuple[int, int]
 ) -> Filtered:
-    """Filter a piece of a segment as the whole of it would be.
+    """Filter a piece of a segment as the whole of it would be, with the filter as the pieces before have left it.
 
-    Args:
-        segment: Its events and those around them.
-        core: The filter, after the pieces before; after this one in the end.
-        config: Arm, noise and sensors.
-        times: Of the estimates, int64 ns, ascending.
-        own: After which time, and until which, events are the piece's own [int ns].
-
-    Returns:
-        The estimates and what became of its own events; those without a stamp come first.
+    Events after and until the instants ``own`` [int ns] are the piece's own; those without a stamp come first.
     """
     events = segment.events_once(config)
     begin, end = np.searchsorted(events.time, own, side="right").tolist()
@@ -95,17 +71,13 @@ def filter_piece(
 def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | None = None) -> Results:
     """Innovations and outcomes of a segment, without any estimate; by its ``measurement_rows``.
 
-    Args:
-        segment: The events.
-        config: Arm, noise and sensors.
-        outcome: What became of each measurement in an earlier fusion, (m, A), to be repeated whatever the gates would
-            say; None: they say.
+    With outcomes of an earlier fusion, (m, A), these are repeated whatever the gates would say.
     """
     events, place = segment.events(config)
     results = _undecided(events)
     if outcome is not None:
         results.outcome[place] = outcome
-    core = Filter(_certain_model(segment, config), segment.origin)
+    core = Filter(_certain(model_of(segment, config)), segment.origin)
     core.run(events, results, _NO_TIMES, "filtered" if outcome is None else "repeated")
     return results.rows(place)
 
@@ -116,21 +88,14 @@ def linearised(
     outcome: CodeArray,
     beside: Sequence[tuple[FusionConfig, FusionConfig, float]],
 ) -> tuple[Results, FloatArray, FloatArray]:
-    """The same, with derivatives by k parameters; by ``measurement_rows``.
+    """The same, with derivatives of ν and of S by k parameters, (k, m, A) each.
 
-    Args:
-        segment: The events.
-        config: Arm, noise and sensors.
-        outcome: What became of each measurement, (m, A), to be repeated.
-        beside: For each parameter the configuration a little below and above, and how far these are apart.
-
-    Returns:
-        Innovations; derivatives of ν and of S, (k, m, A) each.
+    ``beside`` has, for each, the configuration a little below and above, and how far these are apart.
     """
     events, place = segment.events(config)
     results = _undecided(events)
     results.outcome[place] = outcome
-    model = _certain_model(segment, config)
+    model = _certain(model_of(segment, config))
     tangents = [_slope(segment, config, model, *each) for each in beside]
     d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
     return results.rows(place), d_nu[:, place], d_s[:, place]
@@ -156,7 +121,7 @@ def _model_beside(segment: Segment, config: FusionConfig, model: Model, other: F
         model = Model(model.axis, *sensors_of(other, segment.axes, segment.sensors, biased))
     if other.arm is config.arm and other.process is config.process and other.start is config.start:
         return model
-    return model._replace(axis=_certain(axes_of(other, segment.axes, segment.start)))
+    return _certain(model._replace(axis=axes_of(other, segment.axes, segment.start)))
 
 
 def model_of(segment: Segment, config: FusionConfig) -> Model:
@@ -164,15 +129,10 @@ def model_of(segment: Segment, config: FusionConfig) -> Model:
     return filter_model(config, segment.axes, segment.sensors, segment.start, biased_sensors(segment, config))
 
 
-def _certain_model(segment: Segment, config: FusionConfig) -> Model:
+def _certain(model: Model) -> Model:
     """The same without error bars of lag and gain, which depend on the numbers that are fitted and change no ν."""
-    model = model_of(segment, config)
-    return model._replace(axis=_certain(model.axis))
-
-
-def _certain(axis: Record) -> Record:
-    axis["lag_sd"] = axis["gain_sd"] = 0.0
-    return axis
+    model.axis["lag_sd"] = model.axis["gain_sd"] = 0.0
+    return model
 
 
 def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:

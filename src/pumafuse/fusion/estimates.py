@@ -328,18 +328,7 @@ class Estimates:
 def points(
     position: Mapping[str, FloatArray], cartesian: Mapping[str, FloatArray] | None, arm: ArmModel, where: str, what: str
 ) -> FloatArray:
-    """Positions in space [m], (n, 3).
-
-    Args:
-        position: Of each axis [m or rad], (n,).
-        cartesian: With a frame, the log's x, y and z [m].
-        arm: Its axes say whether x, y, z are positions in space.
-        where: Whose they are, for errors.
-        what: What needs them, likewise.
-
-    Raises:
-        RunError: There is no x, y and z.
-    """
+    """Positions in space [m], (n, 3), of axes x, y, z or of a frame's x, y and z; errors say ``where`` and ``what``."""
     found = position if cartesian is None and in_space(arm) == CARTESIAN else cartesian or {}
     if not all(name in found for name in CARTESIAN):
         raise RunError(
@@ -350,19 +339,7 @@ def points(
 
 
 def write_tum(track: ReferenceTrack, config: FusionConfig, origin: int, where: str, path: Path) -> None:
-    """Write positions in time as a trajectory in the TUM format, see :meth:`Estimates.to_tum`.
-
-    Args:
-        track: What to write; rows that are not whole are left out, and those of a stamp after the first.
-        config: Its arm says whether x, y, z are positions in space.
-        origin: Stamp of time 0, int ns.
-        where: Whose they are, for errors.
-        path: The file.
-
-    Raises:
-        RunError: See :meth:`Estimates.to_tum`.
-        FolderError: The file cannot be written.
-    """
+    """Write whole rows as a trajectory in the TUM format, see :meth:`Estimates.to_tum`; of a stamp the first."""
     row = points(track.position, track.cartesian, config.arm, where, "a trajectory")
     if track.segment.any():
         raise RunError(f"{where}: the log's clock was set back, so that it is no one trajectory; use --from and --to")

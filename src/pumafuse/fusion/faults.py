@@ -81,11 +81,7 @@ class Fault:
 
 
 def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
-    """A sentence on each fault of a configured sensor, or of the commands.
-
-    Raises:
-        RunError: A sensor, or the commands, are in another unit than their name says.
-    """
+    """A sentence on each fault of a configured sensor, or of the commands."""
     faults = faults_of(segment, config)
     if refused := [one.sentence for one in faults if one.refused]:
         raise RunError(refused[0])
@@ -211,7 +207,7 @@ def _led_at(
         return {}
     every = np.concatenate([part for one in valid.values() for part in (one, one - round(SMALL_SHIFT * 1e9))])
     order, position = np.argsort(every, kind="stable"), np.empty(len(every))  # which merges what is in order
-    position[order] = _led(segment, config, axis, every[order])
+    position[order] = segment.led(config.arm, axis, every[order])
     parts = iter(np.split(position, np.cumsum([len(one) for one in valid.values() for _ in range(2)])[:-1]))
     return {name: (next(parts), next(parts)) for name in valid}
 
@@ -234,12 +230,6 @@ def _tracking(
     if turn:
         measured -= turn * round(median(measured - led) / turn)
     return Tracking((valid - valid[0]) / 1e9, measured, led, before, noise, zero_sd, process.drift)
-
-
-def _led(segment: Segment, config: FusionConfig, axis: str, time: TimeArray) -> FloatArray:
-    """Where the commands lead an axis [m or rad], relative to its start, (n,)."""
-    model, period, delay = config.arm.axes[axis], config.arm.update_period, config.arm.delay_of(axis)
-    return response(model, period, delay, *segment.given(axis), segment.start[axis], time)
 
 
 def _off(segment: Segment, config: FusionConfig, trackings: _Trackings) -> list[Fault]:
@@ -353,7 +343,7 @@ def _matches(
 ) -> dict[str, Match]:
     """What explains the motion that a sensor measures on each axis, without single outliers."""
     sensor = config.sensors[name]
-    led = {axis: _led(segment, config, axis, grid.time) for axis in segment.axes}
+    led = {axis: segment.led(config.arm, axis, grid.time) for axis in segment.axes}
     measured: dict[str, FloatArray] = {}
     for axis, (stamp, value) in given.items():
         alike = without_spikes(value)
@@ -537,7 +527,7 @@ def _turned_frame(
     every = np.concatenate([valid, valid - round(SMALL_SHIFT * 1e9)])
     order, led = np.argsort(every, kind="stable"), np.empty((len(every), len(axes)))
     for column, axis in enumerate(axes):
-        led[order, column] = _led(segment, config, axis, every[order])
+        led[order, column] = segment.led(config.arm, axis, every[order])
     led, before = np.split(led, 2)
     over = round(_MOVE / max(float(np.median(np.diff(valid))), 1.0))
     if not 1 <= over < len(valid) // _PARTS:

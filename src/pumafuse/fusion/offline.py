@@ -20,13 +20,13 @@ from ..logs.run import Run, Source
 from ..model.arm import ArmModel
 from ..units import Kind, seconds
 from .config import FusionConfig
-from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .faults import latency_questions, sensor_faults, starts_in_motion
 from .placing import in_base
 from .score import ReferenceTrack, late_rows, reference_track
 from .segments import NO_STAMP_WORD, Segment, added, best_of, build, counted, on_any_axis, output_times
+from .verdicts import sensor_problems
 
 S = TypeVar("S", bound=np.generic)
 UNCOVERED = "the reference covers no estimate: are both stamped by one clock?"
@@ -118,17 +118,7 @@ def estimates_of(
     mode: Mode = "filtered",
     engine: Engine = "compiled",
 ) -> Estimates:
-    """What the segments of a run give together, without notes.
-
-    Args:
-        run: As logged.
-        in_place: In the arm's axes, without stray stamps.
-        placed: The frame, if there is one.
-        config: As used.
-        parts: The segments.
-        mode: What an estimate knows.
-        engine: Which one computed it.
-    """
+    """What the segments of a run give together, without notes."""
     _, cut, times, filtered = zip(*parts, strict=True)
     origin = cut[0].origin
     references = _references(parts, origin)

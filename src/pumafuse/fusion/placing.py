@@ -33,20 +33,8 @@ _QUIET = np.errstate(over="ignore", invalid="ignore")  # a sensor without a targ
 def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run, Placed | None, FusionConfig]:
     """The run in the arm's axes, with what sensors in frames of their own tell of the tool.
 
-    Args:
-        run: As logged.
-        config: Says where sensors stand, what they see, and how the tool turns.
-        whole: Whether the run begins with its first command; a piece of one does not.
-
-    Returns:
-        The run (see :func:`pumafuse.logs.axes.in_axes`), its placed frame, and the configuration with the reference
-        orientation of the run where it had none.
-
-    Raises:
-        UnknownNameError: The arm has a joint that the commands have not.
-        RunError: See :func:`pumafuse.logs.axes.in_axes`; or a sensor in a frame of its own does not give x, y and z, or
-            no orientation in a row of a piece.
-        ConfigError: The tool's orientation is needed and nothing tells it.
+    Beside it the frame as it is placed, and the configuration with the reference orientation of the run where it had
+    none. A piece of a run is not ``whole``: it does not begin with the first command.
     """
     run = without_strays(run).delayed(config.arm)
     config = with_tool(config, run)
@@ -109,9 +97,6 @@ class Placing:
         """How much larger the noise of the tool point is than that of what it sees, as its orientation is noisy, too.
 
         The same along all axes, as the filters of the axes know no correlation: a third of the trace.
-
-        Args:
-            lever: [m], (n, 3); NaN where the sensor tells no orientation.
         """
         x, y, z = np.square(lever).T
         more = np.nan_to_num(2.0 / 3.0 * (x + y + z)) * self._variance
@@ -146,11 +131,7 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
 
 
 def _check_turned(name: str, source: Source, oriented: FloatArray, run: Run) -> None:
-    """Whether a sensor tells the tool to be turned about as it is commanded to be.
-
-    Raises:
-        RunError: It is far from that for most of the run, as no arm is: its marker is turned otherwise.
-    """
+    """Whether a sensor tells the tool to be turned about as it is commanded to be."""
     command, given = run.command.orientation, run.command.stamp
     assert command is not None
     known = np.flatnonzero(np.isfinite(command).all(axis=1) & (given != NO_STAMP))
@@ -174,12 +155,7 @@ def _can_be_commanded(run: Run, config: FusionConfig) -> bool:
 
 
 def _commanded(name: str, stamp: TimeArray, run: Run, config: FusionConfig) -> FloatArray:
-    """Where the commands have turned the tool by the instants of a sensor's measurements, as quaternions, (rows, 4).
-
-    Raises:
-        ConfigError: The arm or the commands have no orientation.
-        RunError: The commands' clock was set back.
-    """
+    """Where the commands have turned the tool by the instants of a sensor's measurements, as quaternions, (rows, 4)."""
     commanded, arm, where = run.command.orientation, config.arm, f"sensors.{name}.marker"
     if commanded is None or config.tool is None or np.isnan(commanded).all():
         raise ConfigError(f"{where}: nothing tells how the tool is turned: neither the sensor nor the commands")

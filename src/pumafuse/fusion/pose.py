@@ -35,12 +35,7 @@ class Pose:
 
 
 def orientation(position: Mapping[str, FloatArray], config: FusionConfig) -> FloatArray | None:
-    """Quaternions x, y, z, w of the axes rx, ry, rz, (n, 4); None where they are not all there.
-
-    Args:
-        position: Of each axis [m or rad], (n,).
-        config: Has the orientation at which they are 0.
-    """
+    """Quaternions x, y, z, w of the axes rx, ry, rz, (n, 4); None where they are not all there."""
     if config.tool is None or not set(TURNING) <= position.keys():
         return None
     return rotations.quaternions(_columns(position), np.array(config.tool.reference))
@@ -58,10 +53,6 @@ def turning_covariance(position: Mapping[str, FloatArray], sd: Mapping[str, Floa
     """J P Jᵀ [rad²], (n, 3, 3), of P = diag(sd²) of the rotation vector θ, and J of Exp(θ + δ) ≈ Exp(J δ) Exp(θ).
 
     Across θ, standard deviations are those of the axes times sin(θ/2)/(θ/2).
-
-    Args:
-        position: θ by axis rx, ry, rz [rad], (n,).
-        sd: Its standard deviation, likewise.
     """
     scaled = rotations.left_jacobian(_columns(position)) * _columns(sd)[:, None]
     return scaled @ scaled.transpose(0, 2, 1)
@@ -70,13 +61,7 @@ def turning_covariance(position: Mapping[str, FloatArray], sd: Mapping[str, Floa
 def covariance_in_log(
     placed: Placed | None, position: Mapping[str, FloatArray], sd: Mapping[str, FloatArray]
 ) -> FloatArray:
-    """The covariance of the log's x, y and z [m²], (n, 3, 3).
-
-    Args:
-        placed: The frame of cylindrical or rotated axes; None where x, y and z are axes.
-        position: By axis [m], (n,).
-        sd: Its standard deviation, likewise.
-    """
+    """The covariance of the log's x, y and z [m²], (n, 3, 3)."""
     axes = CARTESIAN if placed is None else CANONICAL_AXES
     scaled = np.eye(3) * np.column_stack([sd[axis] for axis in axes])[:, None]
     if placed is not None:

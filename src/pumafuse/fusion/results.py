@@ -48,25 +48,15 @@ _QUATERNION = ("qx", "qy", "qz", "qw")
 
 @dataclass(frozen=True)
 class Result:
-    """The parts of a result folder that a comparison needs.
+    """The parts of a result folder that a comparison needs."""
 
-    Attributes:
-        summary: Its ``summary.json``.
-        config: Its ``fusion.toml`` and ``arm.toml``.
-        time: [s since the first command], (n,).
-        segment: (n,).
-        axes: Estimates by axis.
-        cartesian: With a frame, the estimates in the log's ``x``, ``y`` and ``z`` [m].
-        reference: Its ``reference.parquet``, if there is one.
-    """
-
-    summary: Summary
-    config: FusionConfig
-    time: FloatArray
-    segment: IntArray
+    summary: Summary  # its ``summary.json``
+    config: FusionConfig  # its ``fusion.toml`` and ``arm.toml``
+    time: FloatArray  # [s since the first command], (n,)
+    segment: IntArray  # (n,)
     axes: Mapping[str, AxisEstimate]
-    cartesian: Mapping[str, FloatArray] | None
-    reference: ReferenceTrack | None
+    cartesian: Mapping[str, FloatArray] | None  # with a frame, the estimates in the log's ``x``, ``y`` and ``z`` [m]
+    reference: ReferenceTrack | None  # its ``reference.parquet``, if there is one
 
     def positions(self, config: FusionConfig) -> dict[str, FloatArray]:
         """Of each axis [m or rad], (n,); rx, ry, rz relative to the orientation at which they are 0 by ``config``."""
@@ -95,15 +85,9 @@ class Result:
 
 
 def check_writable(folder: Path, force: bool, with_run: bool = False) -> None:
-    """Refuse a folder that :func:`write` must not replace, before any work is done.
+    """Refuse a folder that :func:`write` must not replace, before any work is done: FolderError.
 
-    Args:
-        folder: The folder.
-        force: Replace an earlier result.
-        with_run: Whether one with a ``run.toml``, which is then written anew, is such a result.
-
-    Raises:
-        FolderError: The folder exists and is not to be replaced, or holds something else than results.
+    One with a ``run.toml``, which is then written anew, is a result only ``with_run``.
     """
     ours = _FILES | {_RUN} if with_run else _FILES
     folders.check_writable(folder, force, [SUMMARY], ours.__contains__)
@@ -111,32 +95,18 @@ def check_writable(folder: Path, force: bool, with_run: bool = False) -> None:
 
 @dataclass(frozen=True)
 class Making:
-    """How results are made: all that makes them differ, but for the log.
-
-    Attributes:
-        config: Arm, noise and sensors.
-        sensors: Those that are asked for; None: all.
-        rate: Of the even grid of estimates [Hz]; None: one for each command.
-        mode: What an estimate knows.
-        engine: Which one computes it.
-        part: Where the part of the run to use begins and ends [s].
-        extras: Files that are made beside the usual ones.
-    """
+    """How results are made: all that makes them differ, but for the log."""
 
     config: FusionConfig
-    sensors: Sequence[str] | None
-    rate: float | None
+    sensors: Sequence[str] | None  # those that are asked for; None: all
+    rate: float | None  # of the even grid of estimates [Hz]; None: one for each command
     mode: Mode
     engine: str
-    part: tuple[float | None, float | None]
-    extras: Sequence[str]
+    part: tuple[float | None, float | None]  # where the part of the run to use begins and ends [s]
+    extras: Sequence[str]  # files that are made beside the usual ones
 
     def made(self, folder: Path, log: Path) -> Summary | None:
-        """The summary of a result that is there and was made so from the log as it is; None where nothing is.
-
-        Raises:
-            FolderError: It was made otherwise, or something else is there.
-        """
+        """The summary of a result that is there and was made so from the log as it is; None where nothing is."""
         if not folder.is_dir() or not any(folder.iterdir()):
             return None
         check_writable(folder, force=True)
@@ -174,11 +144,7 @@ def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def check_fused(counts: Mapping[str, Mapping[str, int]], config: FusionConfig) -> None:
-    """Refuse a fusion of nothing.
-
-    Raises:
-        RunError: No row was fused; says what became of all, and which configured sensors the run lacks.
-    """
+    """Refuse a fusion of nothing, with what became of all rows."""
     if any(mine.get(one.word) for mine in counts.values() for one in (Outcome.FUSED, Outcome.REACQUIRED)):
         return
     rows = [
@@ -197,18 +163,7 @@ def write(
     extras: Callable[[Path], None] | None = None,
     run_toml: str | None = None,
 ) -> Summary:
-    """Write a result folder: complete, or not at all.
-
-    Args:
-        est: What to write.
-        folder: Where to; its parents are made.
-        force: Replace an earlier result.
-        extras: Writes more files into the folder before it takes its place.
-        run_toml: The text of the ``run.toml`` that says where the log is, for a folder that is a run, too.
-
-    Raises:
-        FolderError: See :func:`check_writable`, or the disk refuses.
-    """
+    """Write a result folder: complete, or not at all; with what ``extras`` write, and the ``run.toml`` of a run."""
     check_writable(folder, force, run_toml is not None)
     summary = summarise(est)
     with folders.replacing(folder) as new:
@@ -226,11 +181,7 @@ def write(
 
 
 def read(folder: Path) -> Result:
-    """Read a result folder.
-
-    Raises:
-        PumafuseError: It is none, or one of its files is damaged.
-    """
+    """Read a result folder."""
     summary = _summary(folder)
     config, table = FusionConfig.load(folder / "fusion.toml"), tables.read(folder / ESTIMATES)
     axes = {
@@ -267,14 +218,8 @@ def _check_read(path: Path, time: FloatArray, segment: IntArray, axes: Mapping[s
 def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTrack:
     """A reference from elsewhere, in the time of a result.
 
-    Args:
-        path: A recorded run with a reference; or a table with ``time_s`` (the log's clock) and ``reference.<axis>_mm``;
-            or one with ``time_s`` (since the first command) and ``<axis>.position_mm``, as in a result folder.
-        origin: Stamp of the result's first command, int ns.
-        config: Of the result: its arm says of which kind each axis is; its frame is for a run that brings none.
-
-    Raises:
-        PumafuseError: It is none of these.
+    That is a recorded run with a reference; or a table with ``time_s`` (the log's clock) and ``reference.<axis>_mm``;
+    or one with ``time_s`` (since the first command) and ``<axis>.position_mm``, as in a result folder.
     """
     if path.is_dir() or path.suffix == ".toml":
         run = in_base(Run.read(path), config)[0]

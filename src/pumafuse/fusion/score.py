@@ -129,19 +129,8 @@ def score_velocity(
     """Score the mean velocities over the coming ``period`` T of one axis against (p_ref(t + T) − p_ref(t)) / T.
 
     The reference is interpolated at t and t + T; an estimate is left out where it has no value at one of the two within
-    the estimate's segment. The variance of both values' own noise, over T², is added to that of the estimates.
-
-    Args:
-        time: t of the estimates [s], (n,).
-        segment: Of the estimates, (n,).
-        velocity: (p(t + T) − p(t)) / T [m/s], (n,); NaN where there is none, as in smoothed estimates.
-        sd: Its standard deviation [m/s], (n,).
-        reference: What is taken for the true positions.
-        axis: The axis of the reference.
-        period: T [s].
-
-    Returns:
-        The score; None where no velocity of this axis has a reference.
+    the estimate's segment. The variance of both values' own noise, over T², is added to that of the estimates. None
+    where no velocity of this axis has a reference.
     """
     if axis not in reference.position:
         return None
@@ -172,18 +161,7 @@ def score_orientation(
     sd: Mapping[str, FloatArray],
     reference: ReferenceTrack,
 ) -> OrientationScore | None:
-    """Score the axes rx, ry, rz together, which are relative to one orientation in both.
-
-    Args:
-        time: Of the estimates [s], (n,).
-        segment: Of the estimates, (n,).
-        position: Of each axis [m or rad], (n,).
-        sd: Its standard deviation, likewise.
-        reference: What is taken for the true orientations.
-
-    Returns:
-        The score; None where no estimate has a reference for all three.
-    """
+    """Score the axes rx, ry, rz together, which are relative to one orientation in both."""
     if not (set(TURNING) <= position.keys() and set(TURNING) <= reference.position.keys()):
         return None
     true = {axis: _true(time, segment, reference, axis) for axis in TURNING}

@@ -21,12 +21,13 @@ from ..errors import RunError, UnknownNameError
 from ..filter.core import Model, classify
 from ..filter.events import COMMAND, Events, joined
 from ..filter.outcome import ABSENT, Outcome
+from ..filter.response import response
 from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind, in_order
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
 from ..logs.screening import held
-from ..model.arm import ArmModel
+from ..model.arm import ArmModel, AxisModel
 from ..units import AN, of_kind, seconds
 from .config import FusionConfig
 from .setup import filter_model
@@ -141,6 +142,18 @@ class Segment:
         chosen = np.flatnonzero(rows.known[:, number] == _FUSED)
         return rows.stamp.take(chosen), rows.value[:, number].take(chosen)
 
+    def led(self, arm: ArmModel, axis: str, time: TimeArray, model: AxisModel | None = None) -> FloatArray:
+        """Where the commands lead an axis [m or rad], beyond its start, at ``time`` [int64 ns], (n,).
+
+        Args:
+            arm: Says how the axis answers.
+            axis: Which.
+            time: Ascending, (n,).
+            model: How it answers instead, but for its delay.
+        """
+        model, delay = model or arm.axes[axis], arm.delay_of(axis)
+        return response(model, arm.update_period, delay, *self.given(axis), self.start[axis], time)
+
     def rows_by_sensor(self) -> dict[str, Events]:
         """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
         rows = self.measurement_rows._replace(value=self.unwrapped())  # one sensor after the other
@@ -203,17 +216,8 @@ def build(
 ) -> Segment:
     """Put a segment of a recorded run into a table of events.
 
-    Args:
-        run: One segment of a recorded run, or a piece of it.
-        config: Arm and sensors.
-        sensors: Which of the configured sensors to use; all for None.
-        begun: Of a piece, the segment of the first one, which has the origin and the start levels of all.
-        own: Of a piece, after which time, and until which, rows are counted [int ns]: the others are those of the
-            pieces before and after, with which its own are compared.
-
-    Raises:
-        PumafuseError: The run commands an axis that the arm has not, a chosen sensor is not configured, or the part of
-            the run to use has no measurement.
+    A piece of a run has the origin and the start levels of the one that has ``begun`` it; of its rows those after and
+    until the instants ``own`` [int ns] are counted, the others are there to be compared with them.
     """
     _check_axes(run, config.arm)
     label, notes = run.command.label, list(run.notes)
@@ -264,17 +268,7 @@ def build(
 
 
 def output_times(segment: Segment, config: FusionConfig, rate: float | None, own: tuple[int, int] = WHOLE) -> TimeArray:
-    """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on.
-
-    Args:
-        segment: The segment, or a piece of it.
-        config: Arm and sensors.
-        rate: Of the grid [Hz]; None: at each command.
-        own: Of a piece, after which time, and until which [int ns].
-
-    Raises:
-        RunError: There are too many, or, but for a piece, none in the part of the run to use.
-    """
+    """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on."""
     since, until = max(segment.ends[0], own[0] + 1), min(segment.ends[1], own[1])
     if rate is None:
         times = segment.commands[(segment.commands >= since) & (segment.commands <= until)]
@@ -306,11 +300,7 @@ def _grid(origin: int, first: int, last: int, rate: float) -> TimeArray:
 
 
 def as_commanded(run: Run, config: FusionConfig) -> Source:
-    """The rows of a run's commands as they are believed: as logged, or where the run says so on the grid of T.
-
-    Raises:
-        RunError: The stamps do not follow ticks of T.
-    """
+    """The rows of a run's commands as they are believed: as logged, or where the run says so on the grid of T."""
     if run.clock == "stamps":
         return run.command
     rows = _on_ticks(run, config, _command_rows(run, _policy(config, run.axes, ()), []), [])
@@ -319,12 +309,7 @@ def as_commanded(run: Run, config: FusionConfig) -> Source:
 
 
 def _check_axes(run: Run, arm: ArmModel) -> None:
-    """Whether the arm has the axes of the run, of its kinds and in its frame.
-
-    Raises:
-        RunError: Axes are of another kind, or x, y, z on one side only.
-        UnknownNameError: The arm has no such axis.
-    """
+    """Whether the arm has the axes of the run, of its kinds and in its frame."""
     label = run.command.label
     for axis in run.axes:
         if axis in CARTESIAN and axis not in arm.axes:
@@ -363,16 +348,7 @@ def _unmatched(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:
 
 
 def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
-    """The stamped command rows of a segment in order, with time = stamp, each value classified.
-
-    Args:
-        run: One segment of a recorded run.
-        policy: What classifies the values.
-        notes: Gets a sentence on everything that is wrong with the rows.
-
-    Raises:
-        RunError: No command of an axis is possible.
-    """
+    """The stamped command rows of a segment in order, with time = stamp, each value classified; ``notes`` are added."""
     source = run.command
     missing, label = source.stamp == NO_STAMP, source.label
     note_rows(notes, label, missing, "no stamp: not used")
@@ -415,11 +391,7 @@ def counted(counts: Mapping[str, int]) -> dict[str, int]:
 
 
 def _on_ticks(run: Run, config: FusionConfig, rows: Events, notes: list[str]) -> Events:
-    """The command rows; where the run's clock is regular those that are used, on a grid of T.
-
-    Raises:
-        RunError: The stamps do not follow ticks of T.
-    """
+    """The command rows; where the run's clock is regular those that are used, on a grid of T."""
     if run.clock == "stamps":
         return rows
     label = run.command.label

@@ -24,14 +24,10 @@ def filter_model(
     start: Mapping[str, float] | None = None,
     biased: Sequence[Sequence[str]] | None = None,
 ) -> Model:
-    """What the filter knows of axes and sensors.
+    """What the filter knows of axes and sensors, in order; sensors that are not configured have no sd.
 
-    Args:
-        config: Arm, noise and sensors.
-        axes: Their names, in order.
-        names: The sensors, in order; those that are not configured have no sd.
-        start: The level u₀ [m] of each axis where it is known.
-        biased: For each axis the sensors whose bias is in its state; None: of no sensor.
+    ``start`` has the level u₀ [m] of each axis where it is known, ``biased`` for each the sensors whose bias is in its
+    state; None: of no sensor.
     """
     return Model(axes_of(config, axes, start or {}), *sensors_of(config, axes, names, biased))
 

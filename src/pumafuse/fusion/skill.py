@@ -24,7 +24,6 @@ from .. import toml
 from ..arrays import FloatArray, median
 from ..filter.core import constant_velocity
 from ..filter.outcome import Outcome
-from ..filter.response import response
 from .estimates import Estimates, Measurements
 from .setup import turn_of
 
@@ -73,12 +72,7 @@ class Skill(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def skill(est: Estimates, measured: Measurements) -> Skill | None:
-    """Errors of predicting the next measurement of a sensor on an axis; None with fewer than two in every segment.
-
-    Args:
-        est: The estimates.
-        measured: Their components of one sensor on one axis.
-    """
+    """Errors of predicting the next measurement of a sensor on an axis; None with fewer than two in every segment."""
     predicted = np.isfinite(measured.innovation)
     parts = [measured.where(predicted & (measured.segment == number)) for number in range(len(est.segments))]
     if turn := _turn(est, measured):
@@ -109,11 +103,9 @@ def _summed_up(error: FloatArray) -> PredictionError:
 def _by_command(est: Estimates, measured: Measurements) -> FloatArray:
     """Measurements of one segment less what the commands say of them [m or rad], without the first, (n - 1,)."""
     sensor, axis = measured.sensors[int(measured.sensor[0])], measured.axes[int(measured.axis[0])]
-    arm, known, segment = est.config.arm, est.config.sensors[sensor], est.segments[int(measured.segment[0])]
-    time, start = est.origin + np.rint(measured.time * 1e9).astype(np.int64), segment.start[axis]
-    stamp, command = segment.given(axis)
-    moved = response(arm.axes[axis], arm.update_period, arm.delay_of(axis), stamp, command, start, time)
-    left = measured.value - known.scale * (start + moved)
+    known, segment = est.config.sensors[sensor], est.segments[int(measured.segment[0])]
+    time = est.origin + np.rint(measured.time * 1e9).astype(np.int64)
+    left = measured.value - known.scale * (segment.start[axis] + segment.led(est.config.arm, axis, time))
     if turn := _turn(est, measured):
         left = left - turn * round(float(left[0]) / turn)
     if known.bias_sd_of(axis) == 0.0:

@@ -19,10 +19,11 @@ from ..arrays import FloatArray, IntArray
 from ..filter.outcome import Outcome
 from ..units import SCREEN, Kind, to_si
 from .causes import Cause, Evidence, Suspect, evidence_of
-from .consistency import Consistency, chi_square_band, consistency, in_words, log_likelihood
+from .consistency import Consistency, chi_square_band, consistency, log_likelihood
 from .estimates import AxisEstimate, Bias, Estimates
 from .score import OrientationScore, ReferenceTrack, score, score_orientation, score_velocity
 from .skill import Skill, skill
+from .verdicts import in_words, sentence
 
 _BEATEN = 1.25  # times the RMS error of a simpler way, from which that is said: a bit less may be chance, or outliers
 
@@ -224,11 +225,7 @@ def encode(summary: Summary) -> bytes:
 
 
 def decode(text: bytes) -> Summary:
-    """The summary of the text of ``summary.json``.
-
-    Raises:
-        MsgspecError: The text is none.
-    """
+    """The summary of the text of ``summary.json``."""
     tree = msgspec.json.decode(text, type=dict[str, Any])
     parts = msgspec.convert(tree, _InUnits)
     axes = {axis: toml.as_lengths(to_si(one)) for axis, one in parts.axes.items()}
@@ -312,16 +309,7 @@ def beaten(axes: Mapping[str, AxisSummary]) -> list[str]:
 def score_axis(
     time: FloatArray, segment: IntArray, estimate: AxisEstimate, reference: ReferenceTrack, axis: str, period: float
 ) -> ScoreSummary | None:
-    """Scores of position and velocity of one axis; None where no estimate has a reference.
-
-    Args:
-        time: Of the estimates [s], (n,).
-        segment: Of the estimates, (n,).
-        estimate: The axis.
-        reference: What is taken for the true positions.
-        axis: The axis of the reference.
-        period: Update period T [s] over which the velocity is a mean.
-    """
+    """Scores of position and velocity of one axis; None where no estimate has a reference."""
     position = score(time, segment, estimate.position, estimate.position_sd, reference, axis)
     if position is None:
         return None
@@ -387,7 +375,7 @@ def sensor_summary(
         correlation=found.correlation.tolist(),
         correlation_band=found.correlation_band,
         whiteness_p=found.whiteness,
-        verdict=found.verdict,
+        verdict=sentence(found),
         causes=[_found_cause(axis, one, found) for one in found.causes],
         bias=None if bias is None else bias.value,
         bias_sd=None if bias is None else bias.sd,

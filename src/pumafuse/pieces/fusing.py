@@ -22,7 +22,6 @@ from ..errors import PumafuseWarning, RunError
 from ..filter.core import Filter
 from ..fusion import results
 from ..fusion.config import FusionConfig
-from ..fusion.consistency import sensor_problems
 from ..fusion.engine import filter_piece
 from ..fusion.estimates import Estimates
 from ..fusion.faults import latency_questions, sensor_faults, starts_in_motion
@@ -31,6 +30,7 @@ from ..fusion.placing import in_base
 from ..fusion.segments import Segment, build, no_estimates, output_times
 from ..fusion.setup import filter_model
 from ..fusion.summary import Summary, encode
+from ..fusion.verdicts import sensor_problems
 from ..logs import tables
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, clock_faults
 from ..logs.manifest import stamps_of
@@ -61,24 +61,7 @@ def fuse_to(
     force: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Summary:
-    """Fuse a long run, filtered, into a result folder that is written as it goes: complete, or not at all.
-
-    Args:
-        path: The run, see :func:`pumafuse.pieces.reading.rows_of`.
-        folder: The result folder.
-        config: Arm, noise and sensors.
-        sensors: Which of the configured sensors to use; all of them for None.
-        rate: Estimates on an even grid [Hz]; one for each command for None.
-        part: Where the part to use begins and ends [s after the first command].
-        force: Whether an earlier result is replaced.
-        progress: Called after each piece with the share done, 0 to 1.
-
-    Warns:
-        PumafuseWarning: For each anomaly, once.
-
-    Raises:
-        PumafuseError: The run cannot be fused, or the folder cannot be written.
-    """
+    """Fuse a long run, filtered, into a result folder that is written as it goes: complete, or not at all."""
     results.check_writable(folder, force)
     stamps = stamps_of(path)
     with folders.replacing(folder) as new:

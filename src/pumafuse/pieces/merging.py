@@ -47,23 +47,14 @@ class Innovations(NamedTuple):
 
 
 class Digest(NamedTuple):
-    """What is left of a piece.
+    """What is left of a piece."""
 
-    Attributes:
-        est: Its counts and notes; of the estimates the first and the last instant, and no measurement.
-        estimates: How many there were.
-        axes: The summary of each axis.
-        innovations: By axis and sensor, where any was fused.
-        scored: Whether the run has a reference.
-        orientation: The score of the axes rx, ry, rz together.
-    """
-
-    est: Estimates
-    estimates: int
-    axes: dict[str, AxisSummary]
-    innovations: dict[tuple[str, str], Innovations]
-    scored: bool
-    orientation: OrientationScore | None
+    est: Estimates  # its counts and notes; of the estimates the first and the last instant, and no measurement
+    estimates: int  # how many there were
+    axes: dict[str, AxisSummary]  # the summary of each axis
+    innovations: dict[tuple[str, str], Innovations]  # by axis and sensor, where any was fused
+    scored: bool  # whether the run has a reference
+    orientation: OrientationScore | None  # the score of the axes rx, ry, rz together
 
 
 def digest(est: Estimates) -> Digest:

@@ -58,15 +58,7 @@ class Log:
         return all(one.ended for one in self._tables.values())
 
     def read_on(self, rows: int) -> int:
-        """Read about as many more ``rows``, from whichever table is behind the others.
-
-        Returns:
-            Before which instant all rows are there, int ns, but for those that come more than 10 s too late; ``NEVER``
-            when everything is read.
-
-        Raises:
-            RunError: A table cannot be read, or is not in the order of time.
-        """
+        """Read about as many more ``rows``, from whichever table is behind the others."""
         until = self.done + rows
         while not self.ended and self.done < until:
             behind = min((one for one in self._tables.values() if not one.ended), key=lambda one: one.frontier)
@@ -76,11 +68,7 @@ class Log:
         return self._cut
 
     def run(self) -> Run | None:
-        """The run of the rows at hand; None as long as these do not command every axis.
-
-        Raises:
-            RunError: They are no recorded run.
-        """
+        """The run of the rows at hand; None as long as these do not command every axis."""
         try:
             if self._listed is None:
                 return of_table(self._tables[()].table())
@@ -100,9 +88,6 @@ def rows_of(path: Path) -> int:
     """How many rows a run has that can be read piece by piece; 0 for one that cannot.
 
     It can if all its tables are Parquet, each with one column of stamps, and no rows are chosen by ``where``.
-
-    Raises:
-        ConfigError: ``run.toml`` is wrong.
     """
     if path.suffix == ".parquet":
         return tables.row_count(path)
@@ -124,29 +109,26 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
     A grid of ticks is fitted to all rows; whole turns about a base, and rows at a rate, are counted from the first
     row on.
     """
-    listed = None if path.suffix == ".parquet" else manifest.load(_manifest(path))
-    if listed is not None and any(entry.clock == "regular" for entry in listed.entries.values()):
-        return "clock = 'regular'"
-    if listed is not None and listed.command.interpolation:
-        return "interpolation_ms"
-    if listed is not None and any(entry.turns for entry in listed.entries.values()):
-        return "turn_deg"
-    if listed is not None and any(entry.time.rate for entry in listed.entries.values()):
-        return "rate_hz"
-    if listed is not None and any(entry.time.counter or entry.time.shift for entry in listed.entries.values()):
-        return "a counter or shift_s"
-    if listed is not None and listed.command.joints and any(config.arm.later.values()):
-        return "joints of which some answer later,"
-    oriented = [] if listed is None else [one for one in listed.entries.values() if one.orientation or one.joints]
-    if listed is not None and oriented:
-        if config.tool is None:
-            return "an orientation, and no [tool] in fusion.toml,"
-        known = [name for name, entry in listed.sensors.items() if entry in oriented]
-        if any(one.marker is not None and name not in known for name, one in config.sensors.items()):
-            return "a marker of a sensor that tells no orientation"
-    frame = config.frame if listed is None or listed.frame is None else listed.frame
-    named = {axis for entry in listed.entries.values() for axis in entry.axes} if listed else set(CARTESIAN)
-    return "a cylindrical [frame]" if isinstance(frame, Cylindrical) and not named.isdisjoint(CARTESIAN) else None
+    if path.suffix == ".parquet":
+        return "a cylindrical [frame]" if isinstance(config.frame, Cylindrical) else None
+    listed = manifest.load(_manifest(path))
+    entries = listed.entries.values()
+    oriented = [one for one in entries if one.orientation or one.joints]
+    told = {name for name, entry in listed.sensors.items() if entry in oriented}
+    untold = any(one.marker is not None and name not in told for name, one in config.sensors.items())
+    framed = isinstance(listed.frame or config.frame, Cylindrical)
+    needs = {
+        "clock = 'regular'": any(entry.clock == "regular" for entry in entries),
+        "interpolation_ms": listed.command.interpolation,
+        "turn_deg": any(entry.turns for entry in entries),
+        "rate_hz": any(entry.time.rate for entry in entries),
+        "a counter or shift_s": any(entry.time.counter or entry.time.shift for entry in entries),
+        "joints of which some answer later,": listed.command.joints and any(config.arm.later.values()),
+        "an orientation, and no [tool] in fusion.toml,": oriented and config.tool is None,
+        "a marker of a sensor that tells no orientation": oriented and untold,
+        "a cylindrical [frame]": framed and any(not set(CARTESIAN).isdisjoint(entry.axes) for entry in entries),
+    }
+    return next((what for what, there in needs.items() if there), None)
 
 
 def _manifest(path: Path) -> Path:
@@ -202,11 +184,7 @@ class _Rows:
         return part.rows
 
     def _leave_out(self, late: BoolArray, stray: BoolArray) -> None:
-        """Leave out rows that come too late, if each is a stray one, and they are few.
-
-        Raises:
-            RunError: They are not.
-        """
+        """Leave out rows that come too late, if each is a stray one, and they are few."""
         self._left_out += int(np.count_nonzero(late))
         rows = np.flatnonzero(late & ~stray if self._left_out <= _MOST_LATE else late)
         if len(rows):

@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from ..arrays import BoolArray, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import SD_OF_MEDIAN, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..discovery.following import resolution, scatter
 from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
@@ -367,7 +367,7 @@ class Likelihood:
         """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis."""
         found: dict[str, list[float]] = {axis: [] for axis in self.axes}
         for (name, axis), (expected, measured) in self.responses(config).items():
-            apart = 1.4826 * float(np.median(np.abs(measured - expected)))
+            apart = SD_OF_MEDIAN * float(np.median(np.abs(measured - expected)))
             found[axis].append(max(apart / abs(config.sensors[name].scale), _SMALLEST))
         return {axis: min(apart, default=_SMALLEST) for axis, apart in found.items()}
 

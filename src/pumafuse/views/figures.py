@@ -19,6 +19,7 @@ from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates, Measurements
 from ..fusion.results import Result
 from ..fusion.score import Z95, ReferenceTrack, interpolated, score
+from ..fusion.verdicts import sentence
 from ..logs.frames import CARTESIAN, in_space
 from ..logs.run import Run
 from ..tuning.latency import Latency
@@ -216,7 +217,7 @@ def validation_figure(est: Estimates) -> Figure | None:
         for number, (sensor, axis, found) in enumerate(rows):
             series, histogram, correlation = canvas.axes[3 * number : 3 * number + 3]
             normalised = innovations(series, est, sensor, axis, by_sensor[sensor])
-            series.set_title(f"{axis}, {sensor}. {found.verdict}", loc="left")
+            series.set_title(f"{axis}, {sensor}. {sentence(found)}", loc="left")
             series.set_ylabel("innovation / sd")
             inside = np.clip(normalised, at[0], at[-1])
             histogram.hist(inside, bins=45, range=(at[0], at[-1]), density=True, color=by_sensor[sensor], alpha=0.6)

@@ -1,0 +1,145 @@
+"""What a sensor's consistency says, in words: the verdict, the likely causes, the keys to change."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..filter.outcome import Outcome
+from ..units import MS, SCREEN, Kind, of_kind
+from .causes import Cause, Suspect
+from .consistency import MANY_REJECTED, Consistency, Finding
+from .estimates import Estimates
+
+_WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps the error bars
+_TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
+
+
+def sensor_problems(est: Estimates) -> list[str]:
+    """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows."""
+    found, given = list[str](), est.measurements
+    order, begin = given.grouped
+    outcome, ends = given.outcome.take(order), begin.tolist()
+    count = np.diff(begin).reshape(len(given.sensors), len(given.axes))
+    alone = np.count_nonzero(count.any(axis=1)) < 2
+    for number, name in enumerate(given.sensors):
+        if not count[number].any():
+            continue
+        mine = slice(ends[number * len(given.axes)], ends[(number + 1) * len(given.axes)])
+        rejected = np.count_nonzero(outcome[mine] == int(Outcome.REJECTED)) / count[number].sum()
+        reacquired = len(set(given.time[order[mine][outcome[mine] == int(Outcome.REACQUIRED)]].tolist()))
+        times = "once" if reacquired == 1 else f"{reacquired} times"
+        width = _width_of_prior(est, name)
+        of_axes = [each for each, some in zip(given.axes, count[number].tolist(), strict=True) if some]
+        kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
+        sd, bias_sd, offset_sd = (
+            "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")
+        )
+        problems = [
+            (
+                width > _WIDEST,
+                f"its prior ({offset_sd}, {bias_sd}) is {width:.1e} times its noise: more than double precision"
+                " resolves; use a narrower prior",
+            ),
+            (
+                reacquired > 0,
+                f"its gate reacquired {times}: it contradicts "
+                + (
+                    f"the model; {sd}, latency_ms or the process noise may be wrong"
+                    if alone
+                    else f"the others or the model; if it is off by a constant, give it {bias_sd}"
+                ),
+            ),
+            (rejected > MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}"),
+        ]
+        found += [f"{name}: {problem}" for holds, problem in problems if holds]
+    return found
+
+
+def _width_of_prior(est: Estimates, name: str) -> float:
+    """How many times the prior is as wide as a sensor's noise: beyond 1e6 double precision blurs the error bars."""
+    sensor, start = est.config.sensors.get(name), est.config.start
+    if sensor is None:
+        return 0.0
+    widths = [
+        max(start.offset_sd_of(axis), sensor.bias_sd_of(axis)) / sd
+        for axis in est.axes
+        if (sd := sensor.sd_of(axis)) is not None
+    ]
+    return max(widths, default=0.0)
+
+
+def sentence(found: Consistency) -> str:
+    """The verdict on a sensor's components on an axis, in words."""
+    if found.finding is Finding.FEW:
+        return f"too few measurements ({found.count}) to tell"
+    low, high = found.nis_band
+    digits = next(n for n in range(2, 17) if _beside([found.nis, low, high]) == _beside([found.nis, low, high], n))
+    nis = f"NIS {found.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
+    sd, lag = of_kind("sd_mm", found.kind), found.strongest_lag if len(found.correlation) else 0
+    causes = ", or ".join(in_words(one, found) for one in found.causes)
+    match found.finding:
+        case Finding.REJECTED:
+            return f"{nis}, but {found.rejected:.0%} were {_TOO_SMALL.format(sd=sd)}"
+        case Finding.NOT_WHITE:
+            white = f"consistent in size, but not white (lag {lag}: {found.correlation[lag - 1]:+.2f})"
+            return f"{nis}: {white}" + (f": {causes}" if causes else "")
+        case Finding.AT_BOUND:
+            return f"{nis}, but {sd} is at a bound of what can be fitted: error bars need not hold; configure it"
+        case Finding.CONSISTENT:
+            return f"{nis}: consistent"
+        case _:
+            return f"{nis}: {causes or 'no one cause stands out'}"
+
+
+def in_words(one: Suspect, found: Consistency) -> str:
+    """A cause as a clause."""
+    sd, drift, bias = (of_kind(key, found.kind) for key in ("sd_mm", "bias_drift_sd_mm", "bias_sd_mm"))
+    maneuvers = of_kind("maneuver_drift_mm_rts_per_m_s", found.kind)
+    mine = f" of {one.sensor}" if one.sensor not in ("", found.sensor) else ""
+    size, small, screen = abs(one.size), "small" if one.size > 0.0 else "large", SCREEN[found.kind]
+    match one.cause:
+        case Cause.NOISE:
+            return f"{sd}{mine} is {_factor(one.size)}"
+        case Cause.PROCESS:
+            return f"the process noise is {_factor(one.size)}"
+        case Cause.MANEUVERS:
+            return f"the arm strays more where its speed changes ({maneuvers})"
+        case Cause.CORRELATED:
+            return f"the noise{mine} is correlated, as of filtered or repeated values ({drift}, bias_time_s)"
+        case Cause.OUTLIERS:
+            return (
+                f"a few innovations{mine} are far larger than the others: outliers of the sensor, or jerks of the arm"
+            )
+        case Cause.LATENCY:
+            return f"latency_ms{mine} is {size * MS:.3g} ms too {small}"
+        case Cause.LAG | Cause.PLANT:
+            whose, keys = ("the", "latency_ms, ") if one.sensor else ("the arm's", "")
+            return f"{whose} lag is {size * MS:.3g} ms too {small} ({keys}delay_ms or plant)"
+        case Cause.DYNAMICS:
+            return "the error follows the acceleration: delay_ms against the plant, or a sensor that smooths its values"
+        case Cause.SCALE:
+            return f"scale{mine} is {size:.2g} of itself too {small}"
+        case Cause.POSITION:
+            share = f" by {one.size:+.1%} of it" if size else ""
+            scale = "scale, " if one.sensor else ""
+            return f"the error follows the position{share}: {scale}gain or a sag"
+        case Cause.BIAS:
+            return f"{one.sensor} is off by a constant of {size * screen.scale:.2g} {screen.unit} ({bias})"
+        case Cause.PLAY:
+            return f"the error turns with the direction: a play of about {size * screen.scale:.2g} {screen.unit}"
+        case Cause.LIMIT:
+            return "the arm falls behind where it is fastest: a limit of its speed"
+
+
+def _factor(size: float) -> str:
+    """By what a noise is to be multiplied."""
+    small, times = ("small", size) if size > 1.0 else ("large", 1.0 / size if size else math.inf)
+    return f"too {small}" + ("" if math.isinf(times) else f" by a factor of {times:.2g}")
+
+
+def _beside(numbers: list[float], digits: int = 16) -> tuple[bool, bool]:
+    """Whether a number, as printed, is below a band and whether it is above."""
+    value, low, high = (round(number, digits) for number in numbers)
+    return value < low, value > high
