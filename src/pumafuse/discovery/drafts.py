@@ -28,26 +28,13 @@ _COMMENT = 48  # column at which comments begin
 
 
 def drafts(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess], folder: Path) -> dict[str, str]:
-    """The three files by name.
-
-    Args:
-        found: What was found in the log.
-        arm: To begin with, from :func:`.guesses.guess`.
-        sensors: Likewise.
-        folder: Where they will be: files of the log are named from there.
-    """
+    """The three files by name, with the files of the log named from the folder where they will be."""
     made = _run_toml(found, arm, folder), _arm_toml(found, arm), _fusion_toml(found, arm, sensors)
     return dict(zip(FILES, made, strict=True))
 
 
 def sketch(name: str, undecided: UndecidedError, folder: Path) -> str:
-    """``run.toml`` of a log that does not say who is who: what is in it, in comments that its owner sorts.
-
-    Args:
-        name: Of the log.
-        undecided: What is in it, and what of it is known.
-        folder: Where the file will be.
-    """
+    """``run.toml`` of a log that does not say who is who: what is in it, in comments that its owner sorts."""
     lines = ["# What is in the log. Lines that begin with # are not used: take the # from those that are meant."]
     if undecided.roles is not None:
         told = _source(["command"], undecided.roles.command, folder)

@@ -28,17 +28,11 @@ _FEWEST = 20  # rows
 
 @dataclass(frozen=True)
 class OwnFrame:
-    """Why a sensor seems to stand in a frame of its own.
+    """Why a sensor seems to stand in a frame of its own."""
 
-    Attributes:
-        speeds: How its speed follows the commanded one.
-        least: The correlation of the axis that follows worst.
-        angle: By how much it is turned [rad]; NaN of a mirrored frame.
-    """
-
-    speeds: Following
-    least: float
-    angle: float
+    speeds: Following  # how its speed follows the commanded one
+    least: float  # the correlation of the axis that follows worst
+    angle: float  # by how much it is turned [rad]; NaN of a mirrored frame
 
     @property
     def words(self) -> str:

@@ -49,23 +49,14 @@ _Group: TypeAlias = tuple[str, str, str, bool]  # words of roles, list, copy, wh
 
 @dataclass(frozen=True)
 class Stream:
-    """A source of the run to be: columns of a part that belong together.
+    """A source of the run to be: columns of a part that belong together."""
 
-    Attributes:
-        name: What it is called.
-        role: What it is; None: its names do not say.
-        why: How that is known.
-        part: Where it is.
-        axes: For each axis its columns, which are added up.
-        attitude: Its orientation, if it tells one.
-    """
-
-    name: str
-    role: Role | None
-    why: str
-    part: Part
-    axes: Mapping[str, Sequence[Signal]]
-    attitude: Attitude | None = None
+    name: str  # what it is called
+    role: Role | None  # what it is; None: its names do not say
+    why: str  # how that is known
+    part: Part  # where it is
+    axes: Mapping[str, Sequence[Signal]]  # for each axis its columns, which are added up
+    attitude: Attitude | None = None  # its orientation, if it tells one
 
     @property
     def source(self) -> Source:
@@ -109,19 +100,12 @@ class UndecidedError(RunError):
 
 @dataclass(frozen=True)
 class Roles:
-    """Who is who.
+    """Who is who."""
 
-    Attributes:
-        command: The commands.
-        sensors: The sensors.
-        reference: The reference, if there is one.
-        left_out: What is none of them, or not for these axes, and why.
-    """
-
-    command: Stream
-    sensors: Sequence[Stream]
-    reference: Stream | None
-    left_out: Sequence[tuple[Stream, str]]
+    command: Stream  # the commands
+    sensors: Sequence[Stream]  # the sensors
+    reference: Stream | None  # the reference, if there is one
+    left_out: Sequence[tuple[Stream, str]]  # what is none of them, or not for these axes, and why
 
     @property
     def measured(self) -> dict[str, Stream]:
@@ -160,12 +144,7 @@ class Roles:
 
 
 def roles_of(parts: Iterable[Part], log: str) -> Roles:
-    """Who is who among the parts of a log.
-
-    Raises:
-        UndecidedError: There are no positions, or none that can be commands.
-        RunError: Nothing has a clock.
-    """
+    """Who is who among the parts of a log."""
     parts = list(parts)
     streams = [stream for part in parts for stream in streams_of(part)]
     if not streams:

@@ -35,29 +35,13 @@ _AROUND = ("request", "goal", "trajectory", "joint_trajectory")  # what goals of
 
 
 def read(path: Path, name: str, fields: Sequence[str] | None = None) -> Table:
-    """A topic or an entity, its rows in the order in which they were recorded.
-
-    Args:
-        path: A file, or the folder of a ROS 2 bag.
-        name: The topic, or the entity of a Rerun recording.
-        fields: Columns, whole or to a field, that are wanted. None: all.
-
-    Raises:
-        RunError: It is no such recording, has no such topic or nothing on it, or is too damaged.
-    """
+    """A topic or an entity, its rows in the order of recording; of all fields, or those that are wanted."""
     with one_line(path, "'pumafuse[bags]'"):
         return (entities.read if path.suffix == ".rrd" else _read_topic)(path, name, fields)
 
 
 def topics(path: Path) -> tuple[Topic, ...]:
-    """What a recording has, by topic or entity.
-
-    Args:
-        path: A file, or the folder of a ROS 2 bag.
-
-    Raises:
-        RunError: It is no such recording, or too damaged.
-    """
+    """What a file, or the folder of a ROS 2 bag, has, by topic or entity."""
     with one_line(path, "'pumafuse[bags]'"):
         return (entities.topics if path.suffix == ".rrd" else _topics)(path)
 

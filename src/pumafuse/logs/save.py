@@ -28,15 +28,7 @@ _TAKEN = ("commands", "truth", "trials", "samples", "path")
 
 
 def save(run: Run, folder: Path) -> None:
-    """Write a run that :meth:`Run.read` reads back: stamps to the ns within 26 days of 0, lengths to the nm.
-
-    Args:
-        run: The run; its notes are not written.
-        folder: An existing folder.
-
-    Raises:
-        RunError: See :func:`check_name` and :func:`check_axis`.
-    """
+    """Write a run that :meth:`Run.read` reads back: stamps to the ns within 26 days of 0, lengths to the nm."""
     for name in run.sensors:
         check_name(name)
     for axis in run.axes:
@@ -58,11 +50,7 @@ def save(run: Run, folder: Path) -> None:
 
 
 def check_name(sensor: str) -> None:
-    """Refuse a sensor whose name cannot be that of its file.
-
-    Raises:
-        RunError: It has characters of a path, or is the name of another table.
-    """
+    """Refuse a sensor whose name cannot be that of its file."""
     plain = sensor.isprintable() and Path(sensor).name == sensor and not sensor.startswith(".")
     if not plain or not sensor or sensor in _TAKEN:
         raise RunError(
@@ -72,11 +60,7 @@ def check_name(sensor: str) -> None:
 
 
 def check_axis(axis: str) -> None:
-    """Refuse an axis whose name is a key of run.toml.
-
-    Raises:
-        RunError: It is.
-    """
+    """Refuse an axis whose name is a key of run.toml."""
     if axis in _KEYS:
         raise RunError(f"axis '{axis}': run.toml uses this word itself; no axis can be called {', '.join(_KEYS)}")
 

@@ -75,18 +75,10 @@ def read(
 ) -> Table:
     """Read a table (CSV, lines of JSON, gzip allowed for both, Parquet, :mod:`.formats`), or a part of a recording.
 
-    Args:
-        path: The file, or the folder of a bag.
-        growing: Whether it may still be growing, or its writer may have been killed. A last line of a CSV without its
-            line break may then be torn within a number: it is left out, and noted.
-        fields: Columns and field paths that will be asked for; of a text that is not wide others are read, too. Of a
-            text also what chooses them among its names. All for None.
-        where: Which rows to read; of Parquet, parts of the file that can have none are skipped.
-        topic: Which part of a recording is the table; which of several tables in a file.
-        entity: The same in a Rerun recording.
-
-    Raises:
-        RunError: The file is absent, empty, or not inside what its ending says; or ``where`` leaves no row.
+    A file may be growing, or its writer may have been killed. A last line of a CSV without its line break may then be
+    torn within a number: it is left out, and noted. ``fields`` are columns and field paths that will be asked for, of a
+    text also what chooses them among its names; None: all. Parts of a Parquet file that have no row for ``where`` are
+    skipped. ``topic`` is also which of several tables in a file.
     """
     where, listed = where or {}, None if callable(fields) else fields
     refuse_endless(path)
@@ -120,11 +112,7 @@ def read(
 
 
 def meets(table: Table, where: Where) -> BoolArray:
-    """Rows in which each of some columns has a value, (rows,).
-
-    Raises:
-        RunError: There is none, or a column is absent or never has such a value.
-    """
+    """Rows in which each of some columns has a value, (rows,)."""
     whole = pa.table(dict(table.columns))
     met = _met(table.path, whole, _conditions(table.path, whole, where))
     found = np.from_dlpack(pc.fill_null(met, False).cast(pa.uint8()).combine_chunks()) > 0
@@ -134,11 +122,7 @@ def meets(table: Table, where: Where) -> BoolArray:
 
 
 def chosen(table: Table, where: Where) -> Table:
-    """The rows of a table in which each of some columns has a value.
-
-    Raises:
-        RunError: There is none, or a column is absent or never has such a value.
-    """
+    """The rows of a table in which each of some columns has a value."""
     if not where:
         return table
     rows = _only(table.path, pa.table(dict(table.columns)), where)
@@ -146,11 +130,7 @@ def chosen(table: Table, where: Where) -> Table:
 
 
 def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
-    """A Parquet table, some rows at a time; see :func:`read`.
-
-    Raises:
-        RunError: The file cannot be read.
-    """
+    """A Parquet table, some rows at a time; see :func:`read`."""
     with one_line(path), _opened(path) as file:
         names = tuple(file.schema.column(place).path for place in range(len(file.schema)))
         wanted, empty = _wanted(path, file, fields, {})
@@ -162,13 +142,6 @@ def sentinel_of(path: Path, name: str) -> float | None:
     """The size of the number that stands for "none" in all of a column of a Parquet table; None without any.
 
     Where the file's own statistics show that there is none, no row is read.
-
-    Args:
-        path: The table.
-        name: The column, or a field path.
-
-    Raises:
-        RunError: The file cannot be read.
     """
     if (most := _largest_by_statistics(path, name)) is not None and most not in SENTINELS:
         return None
@@ -202,11 +175,7 @@ def row_count(path: Path) -> int:
 
 
 def refuse_endless(path: Path) -> None:
-    """Refuse a pipe, a socket or a device, which a reader may wait for for ever and cannot go back in.
-
-    Raises:
-        RunError: It is one.
-    """
+    """Refuse a pipe, a socket or a device, which a reader may wait for for ever and cannot go back in."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):  # what is not there is for others to say
@@ -310,11 +279,7 @@ def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
 
 
 def _refuse_deep_lines(path: Path, text: bytes) -> None:
-    """Refuse lines that would end the process: pyarrow goes into each level with a call of its own.
-
-    Raises:
-        RunError: A line is nested as no log is.
-    """
+    """Refuse lines that would end the process: pyarrow goes into each level with a call of its own."""
     codes = np.frombuffer(text, dtype=np.uint8)
     ends = np.concatenate([[-1], np.flatnonzero(codes == ord("\n")), [len(codes)]])
     for line in np.flatnonzero(np.diff(ends) > _LONG_LINE).tolist():
@@ -323,11 +288,7 @@ def _refuse_deep_lines(path: Path, text: bytes) -> None:
 
 
 def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
-    """Refuse columns in which nobody can look for numbers.
-
-    Raises:
-        RunError: One is nested as none of a log is.
-    """
+    """Refuse columns in which nobody can look for numbers."""
     level = [column.type for column in table.columns]
     for _ in range(_DEEPEST):
         level = [kind.field(place).type for kind in level for place in range(kind.num_fields)]
