@@ -217,7 +217,6 @@ def _files(log: Path) -> list[Path]:
 
 
 def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
-    """A part with its clock and its columns, from its table."""
     signals, left_out, times, paths = list[Signal](), dict[str, str](), list[str](), list(_numeric_paths(table))
     joints, counts = _joints(table, paths), {name for name in table.columns if _counts(table, name) is not None}
     rows = _axes_in_rows(table)
@@ -275,7 +274,6 @@ def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
 
 
 def _likeliest(columns: Sequence[str]) -> list[str]:
-    """Those of many columns that are read."""
     return list(columns) if len(columns) <= _MOST_READ else names.likeliest_first(columns)[:_MOST_READ]
 
 
@@ -565,10 +563,7 @@ def _runs(stamp: TimeArray) -> bool:
 
 
 def _nameless_clock(table: Table, stroke: float) -> Clock | None:
-    """The first column, which is called after no clock, if its numbers rise, but do not count rows.
-
-    Where they are of whole seconds and the second column may be the nanoseconds, both: ``ros2 topic echo --csv``.
-    """
+    """The first column, which is called after no clock, if its numbers rise, but do not count rows."""
     first, *others = table.columns
     try:
         numbers = table.plain(first)[0]
@@ -622,11 +617,7 @@ def _no_clock(table: Table, name: str) -> str:
 
 
 def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str, str]:
-    """The unit of stamps, by what it is known, and a question where that may be wrong.
-
-    By what date they would be, or else by how long another clock says that it all takes, or by the time between rows.
-    Where rows would be as far apart as a robot's hardly are, the motion has to be one of a robot, too.
-    """
+    """The unit of stamps, by what it is known, and a question where that may be wrong."""
     known = values[np.isfinite(values)]
     if len(known) < 2:
         return "s", "default", ""

@@ -101,12 +101,10 @@ def _unused(roles: Roles, folder: Path) -> Iterator[str]:
 
 
 def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
-    """The table of a source."""
     return [*_place(table, stream, folder), *_columns(stream)]
 
 
 def _place(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
-    """Where a source is, and its stamps."""
     part, clock = stream.part, stream.part.clock
     assert clock is not None
     lines = ["", _line(_header(table), printable(stream.why, 200)), _line(_pair("file", _from(folder, part.file)))]
@@ -120,7 +118,6 @@ def _place(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
 
 
 def _columns(stream: Stream) -> list[str]:
-    """The axes of a source, and its orientation."""
     lines = list[str]()
     pose = _pose(stream)
     if pose and stream.attitude:
@@ -232,7 +229,6 @@ def _fusion_toml(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess
 
 
 def _by_kind(key: str, values: Mapping[str, float], arm: ArmGuess, comment: str) -> Iterable[str]:
-    """A key for the axes of each kind, with a number for each axis."""
     for kind, screen in SCREEN.items():
         mine = {axis: _digits(value * screen.scale) for axis, value in values.items() if arm.axes[axis].kind == kind}
         if mine:
@@ -245,7 +241,6 @@ def _digits(value: float, digits: int = 2) -> float:
 
 
 def _from(folder: Path, file: Path) -> str:
-    """A file as it is named in a folder."""
     try:
         return Path(os.path.relpath(file.absolute(), folder.absolute())).as_posix()
     except ValueError:  # on another drive

@@ -154,10 +154,7 @@ def resolution(value: FloatArray) -> float:
 
 
 def isolated(value: FloatArray) -> BoolArray:
-    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,).
-
-    By the sensor alone: what an arm does that nobody commanded is none, nor is a turn of its motion.
-    """
+    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,)."""
     found = np.zeros(len(value), dtype=np.bool_)
     if len(value) < _FEWEST:
         return found

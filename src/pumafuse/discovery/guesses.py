@@ -112,10 +112,7 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
 def _against_each_other(
     run: Run, relations: Mapping[tuple[str, str], Following]
 ) -> tuple[str, dict[str, float], dict[str, Pair]]:
-    """The source that is earliest, the reference if there is one; how much later each is [s]; each beside the densest.
-
-    Without sensors that have no motion in common with the one that has the most rows.
-    """
+    """The earliest source, or the reference; how much later each is [s]; each beside the densest."""
     lags: dict[str, list[float]] = {}
     for (name, _), one in relations.items():
         lags.setdefault(name, []).append(one.lag)

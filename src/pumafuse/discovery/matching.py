@@ -155,10 +155,7 @@ def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple
 
 
 def slope_of_pieces(measured: FloatArray, led: FloatArray) -> tuple[float, float]:
-    """Slope of measured over commanded motion in short pieces of a run, each about its mean, and its standard error.
-
-    They are 0 and infinity where nothing moves. The error is what the pieces scatter, infinite where few move.
-    """
+    """Slope of measured over commanded motion in short pieces of a run, each about its mean, and its standard error."""
     seen = np.isfinite(measured)
     pieces = zip(*(np.array_split(part[seen], _PIECES) for part in (measured, led)), strict=True)
     centred = [(value - value.mean(), motion - motion.mean()) for value, motion in pieces if len(value)]
@@ -172,10 +169,7 @@ def slope_of_pieces(measured: FloatArray, led: FloatArray) -> tuple[float, float
 
 
 def without_spikes(value: FloatArray) -> BoolArray:
-    """Values that are no single or double outliers, far from the median of the five around them, (n,).
-
-    A motion is none, however fast: where it goes on, each value is that median itself.
-    """
+    """Values that are no single or double outliers, far from the median of the five around them, (n,)."""
     if len(value) < 3:
         return np.ones(len(value), dtype=np.bool_)
     padded = np.concatenate((value[2:0:-1], value, value[-2:-4:-1]))  # reflected
@@ -188,10 +182,7 @@ def without_spikes(value: FloatArray) -> BoolArray:
 
 
 def _fits(measured: FloatArray, led: FloatArray, margin: int) -> _Fits:
-    """The regressions of values, NaN where there is none, (n,), on motions about zero, (A, n + 2m), at −m to m bins.
-
-    They are by sums over the bins that have measurements.
-    """
+    """The regressions of values, NaN where there is none, (n,), on motions about zero, (A, n + 2m), at −m to m bins."""
     seen = np.isfinite(measured)
     count, numbers = np.count_nonzero(seen), np.arange(len(measured))
     trend = np.where(seen, numbers - numbers[seen].mean(), 0.0)

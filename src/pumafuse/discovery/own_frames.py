@@ -51,10 +51,7 @@ def own_frames(run: Run) -> dict[str, OwnFrame]:
 
 
 def speeds_follow(command: Source, source: Source) -> Following | None:
-    """How the speed of a sensor follows the commanded one, of its place or of its turning, whichever does so better.
-
-    None where one of them is in other axes, or stands still.
-    """
+    """How the speed of a sensor follows the commanded one, of its place or of its turning, whichever does so better."""
     axes = _axes(command, source)
     if len(axes) < 2:
         return None

@@ -36,10 +36,7 @@ def _placed(knots: FloatArray, coefficients: FloatArray) -> FloatArray:
 
 
 def _responses(t: FloatArray, u: FloatArray, knots: FloatArray) -> Basis:
-    """Responses to held commands that make up that of any linear arm: those to integrated hats.
-
-    They are a function of instants [s], (m,), which gives (m, k) of knots of the impulse response [s], (k + 2,).
-    """
+    """Responses to held commands that make up that of any linear arm: those to integrated hats."""
     from scipy.interpolate import PPoly
 
     held = np.concatenate([u[:1], u]) - u.mean()
@@ -65,10 +62,7 @@ class Shrunk:
 
 
 class Products(NamedTuple):
-    """Products of columns without means, (k, k), of these with what they are to explain, (k,), and its square.
-
-    Of how many rows they are, too.
-    """
+    """Products of columns without means, (k, k), of these with what they are to explain, (k,), and its square."""
 
     square: FloatArray
     score: FloatArray

@@ -86,12 +86,7 @@ class Stream:
 
 
 class UndecidedError(RunError):
-    """A log does not say what is commanded, or what measures.
-
-    Attributes:
-        parts: What is in it.
-        roles: Who is who, as far as it is known; None: nothing tells which numbers are the commands.
-    """
+    """A log with these parts does not say what is commanded, or what measures; roles as far as they are known."""
 
     def __init__(self, log: str, why: str, parts: Sequence[Part], roles: Roles | None = None) -> None:
         super().__init__(f"{log}: {why}")
@@ -211,10 +206,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
 
 
 def _in_order(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
-    """The commands and what follows them, with quaternions in the order in which both turn alike.
-
-    Without a commanded orientation that no rotation vector can follow: the reason is added to ``left_out``.
-    """
+    """The commands and what follows them, with quaternions in the order in which both turn alike."""
     command, *others = streams
     known = next((one for one in others if one.attitude and not one.attitude.is_open), None)
     if command.attitude and command.attitude.is_open and known is not None:
@@ -490,10 +482,7 @@ def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
 
 
 def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]:
-    """How many axes of others run behind a stream, each as far as its motion is the same; and by how much, in all [s].
-
-    Of one in a frame of its own the speed does.
-    """
+    """How many axes of others run behind a stream, each as far as its motion is the same; by how much, in all [s]."""
     count = late = 0.0
     for other in streams:
         if other is not leader and other.role != "command":
@@ -508,12 +497,7 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]
 
 
 def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
-    """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not.
-
-    Positions do on most axes, later, and all with one gain; torques and currents do not. Of those that are called as
-    the commands are without a word of these, ``q`` beside ``q_cmd``, an axis is enough: joints may rest. In a frame of
-    its own its speed does.
-    """
+    """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not."""
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
     found = _relations(command, stream)
@@ -572,7 +556,6 @@ def _relation(leader: Stream, axis: str, follower: Stream, other: str) -> Follow
 
 
 def _relations(leader: Stream, follower: Stream) -> list[Following]:
-    """How the axes of a stream follow those of another of the same names."""
     shared = [axis for axis in follower.axes if axis in leader.axes]
     return [found for axis in shared if (found := _relation(leader, axis, follower, axis)) is not None]
 
@@ -621,10 +604,7 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
 
 
 def _with_units(roles: Roles) -> Roles:
-    """Units that are guesses made to fit, one of a kind for each source, by the axes that somebody measures.
-
-    The commands' to sources whose units are known, else by their range; then all others' to those.
-    """
+    """Units that are guesses made to fit, one of a kind for each source, by the axes that somebody measures."""
     command, reference = _angles_by_name(roles), roles.reference
     others = [one for one in (reference, *reversed(roles.sensors)) if one is not None]
     sure = [one for one in others if not one.guessed]

@@ -159,7 +159,6 @@ class _Design(NamedTuple):
 
 
 def _design(basis: Basis, at: FloatArray) -> _Design:
-    """The responses at instants [s], (n,)."""
     responses = basis(at)
     responses -= responses.mean(axis=0)
     slopes = (basis(at + ASIDE) - basis(at - ASIDE)) / (2.0 * ASIDE)

@@ -115,10 +115,7 @@ def _along_axes(run: Run, aside: Collection[str]) -> Run:
 
 
 def _followed(run: Run, related: _Relations) -> tuple[Run, _Relations]:
-    """A run without orientations that do not follow the commanded one, and how the rest of it follows.
-
-    A marker may be turned on the tool. Where no sensor follows the commanded orientation, nobody measures it.
-    """
+    """A run without orientations that do not follow the commanded one, and how the rest of it follows."""
     turned = set[str]()
     for name in run.measured:  # on its axes together, each as far as the tool is told to turn
         turning = [axis for axis in TURNING if (name, axis) in related]

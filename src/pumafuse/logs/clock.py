@@ -333,7 +333,6 @@ def _apart(stamp: TimeArray, first: int, last: int) -> list[str]:
 
 
 def _duration(time: int) -> str:
-    """A time [ns] for people."""
     units = {"years": 8766 * _HOUR_NS, "days": 24 * _HOUR_NS, "hours": _HOUR_NS, "s": _TAIL_NS}
     unit = next((name for name, size in units.items() if time >= size), "s")
     return f"{time / units[unit]:.4g} {unit}"

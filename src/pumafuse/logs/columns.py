@@ -82,10 +82,7 @@ class Table:
     sentinel_of: Callable[[str], float | None] | None = None
 
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
-        """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels.
-
-        Its unit is ``unit`` (``_mm``), or what its name ends in.
-        """
+        """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels."""
         self._plain_column(name)
         unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
         given, note = self.plain(name)
@@ -142,10 +139,7 @@ class Table:
         return self._of_numbers(name, 10**exponent)
 
     def frames(self, rate: float, name: str = "") -> tuple[TimeArray, str | None]:
-        """Stamps of rows that come at a rate [Hz], in int64 ns since frame 0, and a note on cells that were text.
-
-        The column counts frames; without one each row is the next.
-        """
+        """Stamps of rows that come at a rate [Hz], in int64 ns since frame 0, and a note on cells that were text."""
         number, note = self.plain(name) if name else (np.arange(self.rows, dtype=np.float64), None)
         time = number / rate
         if (np.abs(time) >= REACH_NS / 1e9).any():
@@ -203,7 +197,6 @@ class Table:
         return found, note
 
     def _of_two(self, name: str, nanoseconds: str) -> tuple[TimeArray, str | None]:
-        """Stamps of whole seconds and nanoseconds apart."""
         (seconds, note), (rest, other) = self._whole(name), self._whole(nanoseconds)
         missing = (seconds == NO_STAMP) | (rest == NO_STAMP)
         self._refuse_beyond(name, ~missing & (np.abs(seconds * 1e9) >= REACH_NS))
@@ -289,7 +282,6 @@ class Table:
             raise RunError(f"{self.path}: column '{shortened(name)}': {str(error).splitlines()[0]}") from None
 
     def _ending(self, name: str, accepted: tuple[str, ...], example: str) -> str:
-        """The unit in which a name ends."""
         unit = units.ending(leaf(name))
         if unit is None or unit not in accepted:
             short = shortened(name)
@@ -300,7 +292,6 @@ class Table:
         return unit
 
     def _plain_column(self, name: str) -> pa.ChunkedArray:
-        """A column of numbers or text."""
         column = self.column(name)
         if _is_any(column.type, _NEITHER_NUMBERS_NOR_TEXT):
             raise RunError(f"{self.path}: column '{shortened(name)}' holds {_in_words(column.type)}, not numbers")
@@ -364,10 +355,7 @@ def largest(sizes: FloatArray) -> FloatArray:
 
 
 def sentinel_among(sizes: FloatArray) -> float | None:
-    """The sentinel of a column with these :func:`largest` sizes.
-
-    It is told by its digits, and must be ten times as far as all others, of which there must be some.
-    """
+    """The sentinel of a column with these :func:`largest` sizes."""
     if len(sizes) <= _OTHERS or sizes[-1] not in SENTINELS or sizes[-1] <= _FAR * sizes[-2]:
         return None
     return float(sizes[-1])

@@ -208,7 +208,6 @@ def _read(path: Path, entity: str) -> Generator[_Opened]:
 
 
 def _messages(path: Path, pipe: IO[bytes]) -> Iterator[tuple[dict[str, str], pa.Table]]:
-    """What the process sends: metadata and rows."""
     while True:
         try:
             with pa.ipc.open_stream(pipe) as stream:
@@ -227,7 +226,6 @@ def _messages(path: Path, pipe: IO[bytes]) -> Iterator[tuple[dict[str, str], pa.
 
 
 def _main(path: Path, entity: str) -> None:
-    """Write a recording to standard output."""
     sys.stdout.buffer.write(b"\n")  # it has started: if it is aborted from now on, that is the recording's fault
     sys.stdout.buffer.flush()
     fault = ""

@@ -80,7 +80,6 @@ def _topics(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
 
 
 def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
-    """The tables that arrays, structs and records of a file make."""
     if path.suffix == ".json":
         text = file.read()
         try:

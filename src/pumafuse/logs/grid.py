@@ -90,7 +90,6 @@ def ticks_of(stamp: TimeArray) -> float:
 
 
 def _refusal(fault: str, stamp: TimeArray, period: float, label: str, what: str) -> RunError:
-    """The error with the fault and the fix."""
     advice = "check update_period_ms, or " if what == COMMANDS else ""
     median = float(np.median(np.diff(stamp))) / 1e6
     return RunError(
@@ -132,7 +131,6 @@ def _aside(ticks: IntArray, late: BoolArray, spread: float) -> float:
 
 
 def _longest(flag: BoolArray) -> int:
-    """Length of the longest row of flags."""
     return int(np.diff(np.flatnonzero(np.concatenate(([True], ~flag, [True])))).max()) - 1
 
 

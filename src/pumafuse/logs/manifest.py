@@ -74,10 +74,7 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return [column for column in (self.column, self.nanoseconds, self.counter) if column]
 
     def stamps(self, table: Table) -> tuple[TimeArray, list[str]]:
-        """Stamps of the rows of a table, which go on where its clock begins anew, and notes.
-
-        See :meth:`Table.stamps`, :meth:`Table.frames` and :mod:`.stamps`.
-        """
+        """Stamps of the rows of a table, which go on where its clock begins anew, and notes."""
         stamp, note = self.as_logged(table)
         notes = [] if note is None else [note]
         if not self.rate:
@@ -347,7 +344,6 @@ def _with_pose(keys: dict[str, Any], where: str, path: str) -> dict[str, Any]:
 
 
 def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path: str) -> None:
-    """Refuse columns of an orientation that say too much or too little."""
     one = toml.struct(given, Orientation, where, path)
     forms = [one.quaternion, one.rotation_vector, one.euler]
     if sum(form is not None for form in forms) != 1:
@@ -374,7 +370,6 @@ def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path:
 
 
 def _check_noise(given: Any, kind: type[SourceEntry], axes: dict[str, list[Any]], where: str, path: str) -> None:
-    """Refuse a noise of rows that says too much or too little, or that is of no sensor."""
     one = toml.struct(given, RowNoise, where, path)
     if bool(one.sd) == bool(one.variance):
         raise ConfigError(f"{where}: {path}: expected one of sd = 'error_mm' and variance = 'pose.covariance[0]'")
@@ -385,7 +380,6 @@ def _check_noise(given: Any, kind: type[SourceEntry], axes: dict[str, list[Any]]
 
 
 def _joints(given: Any, beside: Iterable[str], where: str, path: str) -> dict[str, Any]:
-    """The columns of each joint."""
     if not isinstance(given, dict) or not given:
         raise ConfigError(f"{where}: {path}: expected a column for each joint, as in {{ j1 = 'j1_deg' }}")
     if twice := next(iter(beside), None):
@@ -416,7 +410,6 @@ def _columns(given: Any, where: str, path: str) -> list[Any]:
 
 
 def _time(given: Any, where: str, path: str) -> dict[str, Any]:
-    """The column of stamps, or the two of seconds and nanoseconds."""
     match given:
         case str() if given:
             return {"column": given}

@@ -64,7 +64,6 @@ def _read_topic(path: Path, topic: str, fields: Sequence[str] | None) -> Table:
 
 
 def _messages(path: Path, topic: str, faults: Faults, seen: set[Channel]) -> Iterator[tuple[Record, Message]]:
-    """The messages of a topic, recorded and decoded."""
     decoders = dict[Channel, bags.Decoder]()
     for record in bags.records_of(path, topic, faults, seen):
         if record.channel not in decoders:
@@ -242,13 +241,11 @@ def begin_of(trajectory: Mapping[str, Any], received: int) -> int:
 
 
 def _nanoseconds(time: Mapping[str, int]) -> int:
-    """A time, or a duration, of a message."""
     seconds, rest = next(pair for pair in SPLIT_STAMPS if pair[0] in time and pair[1] in time)
     return int(time[seconds]) * 10**9 + int(time[rest])
 
 
 def _numbers(point: Mapping[str, Any], key: str, joints: Sequence[str]) -> FloatArray:
-    """What a point has for each joint, (joints,)."""
     found = np.array(point[key], dtype=np.float64)
     if found.shape != (len(joints),) or not np.isfinite(found).all():
         raise ValueError(f"a point has no {key} for each of its {len(joints)} joints")

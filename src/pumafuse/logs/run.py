@@ -519,7 +519,6 @@ def _number(value: float | None, absent: float) -> float:
 
 
 def _from_arrays(label: str, arrays: Any, notes: list[str]) -> Source:
-    """A source of stamps and values."""
     match arrays:
         case [_, Mapping()]:
             time, values = cast(tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]], arrays)
@@ -648,7 +647,6 @@ def _on_ticks(source: Source, notes: list[str]) -> Source:
 
 
 def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recording | None:
-    """The first of the Rerun recordings that sources are in."""
     found = next((entry for entry in entries if entry.entity), None)
     if found is None:
         return None

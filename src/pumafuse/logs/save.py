@@ -70,7 +70,6 @@ def _screen(run: Run, axis: str) -> Screen:
 
 
 def _entry(run: Run, source: Source, file: str, folder: Path) -> dict[str, Any]:
-    """Write one source and return its table of ``run.toml``."""
     screens = {axis: _screen(run, axis) for axis in source.values}
     columns = {
         f"{axis}_{screen.unit}": pa.array(np.round(source.values[axis] * screen.scale, 6), from_pandas=True)

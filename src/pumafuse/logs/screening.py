@@ -56,11 +56,7 @@ def returns(value: float, before: float, out: Iterable[float]) -> bool:
 
 
 def without_stray_values(command: Source, sensors: Sequence[Source], notes: list[str]) -> Source:
-    """The commands without values that nobody sent: NaN, with a note.
-
-    One or two values that leap away from their neighbours and back by many times the usual step are stray, if no sensor
-    follows them.
-    """
+    """The commands without values that nobody sent: NaN, with a note."""
     if command.joints is not None:  # what nobody sent is among these, and a pose is of all of them
         found = without_stray_values(command.in_joints(), [one.in_joints() for one in sensors], notes)
         if not len(found.stray):

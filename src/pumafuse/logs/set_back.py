@@ -146,8 +146,6 @@ def _shortest(stamp: TimeArray, newest: int, back: float) -> int:
 
 
 def _moved(run: Run, newest: int, back: float) -> Run:
-    """A run whose rows after a step go on."""
-
     def moved(_: str, source: Source) -> Source:
         stamp = source.stamp.copy()
         stamp[_rows_after(source, newest, back)] += round(back)

@@ -139,10 +139,7 @@ def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
 
 
 def sentinel_of(path: Path, name: str) -> float | None:
-    """The size of the number that stands for "none" in all of a column of a Parquet table; None without any.
-
-    Where the file's own statistics show that there is none, no row is read.
-    """
+    """The size of the number that stands for "none" in all of a column of a Parquet table; None without any."""
     if (most := _largest_by_statistics(path, name)) is not None and most not in SENTINELS:
         return None
     sizes = np.empty(0)
@@ -230,7 +227,6 @@ def one_line(path: Path) -> Generator[None]:
 
 
 def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None, where: Where) -> Table:
-    """A topic or entity of a recording."""
     from . import recordings
 
     key, name, wrong, other = "topic", topic, "entity", entity
@@ -288,7 +284,6 @@ def _refuse_deep_lines(path: Path, text: bytes) -> None:
 
 
 def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
-    """Refuse columns in which nobody can look for numbers."""
     level = [column.type for column in table.columns]
     for _ in range(_DEEPEST):
         level = [kind.field(place).type for kind in level for place in range(kind.num_fields)]
@@ -298,7 +293,6 @@ def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
 
 
 def _of_csv(path: Path, text: bytes, choice: Choice | None) -> _Text:
-    """The table in a CSV text; lines with the wrong number of cells are left out and noted."""
     try:
         table, names, more = _parsed(path, text, choice)
     except (UnicodeDecodeError, pa.ArrowInvalid) as error:
@@ -444,7 +438,6 @@ class _Layout(NamedTuple):
 
 
 def _layout(text: bytes) -> _Layout:
-    """How a text is laid out, by its first lines."""
     head = text[: max(_HEAD, text.find(b"\n") + 1)].removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace")
     *lines, last = re.split("\r\n|\r|\n", head)
     lines, broken = _whole_lines([*lines, last] if not lines or (last and len(text) <= _HEAD) else lines)
@@ -552,7 +545,6 @@ def _is_headless(lines: Sequence[str], first: int, separator: str) -> bool:
 
 
 def _column(place: int) -> str:
-    """What a column without a name is called."""
     return FIRST.replace("1", str(place + 1))
 
 
@@ -575,7 +567,6 @@ def _separator(line: str) -> str:
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    """The cells of a line, without quotes."""
     return [one.strip().strip('"').strip().replace("\0", separator) for one in _split(line, separator)]
 
 
@@ -628,7 +619,6 @@ def _wanted(
 
 
 def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] | None) -> Iterator[pa.Table]:
-    """Some columns of a Parquet file, some rows at a time."""
     for batch in file.iter_batches(_BATCH, row_groups=groups, columns=columns, use_threads=False):
         yield _filterable(pa.Table.from_batches([batch]))
 
@@ -640,7 +630,6 @@ def _filterable(table: pa.Table) -> pa.Table:
 
 
 def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
-    """The rows of a table that ``where`` chooses."""
     chosen = whole.filter(_met(path, whole, _conditions(path, whole, where))) if where else whole
     if where and not chosen.num_rows:
         raise _no_row(path, [whole], where)
@@ -701,16 +690,13 @@ def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
 
 
 def _written(value: Any) -> str:
-    """A value as it is written in run.toml."""
     return shortened(repr(value) if isinstance(value, str) else str(value).lower())
 
 
 def _named(table: pa.Table) -> dict[str, pa.ChunkedArray]:
-    """The columns of a table by name, without those that share one."""
     repeated = _repeated(table.column_names)
     return {name: table.column(name) for name in table.column_names if name not in repeated}
 
 
 def _repeated(names: Sequence[str]) -> set[str]:
-    """The names that more than one column has."""
     return {name for name, count in Counter(names).items() if count > 1}
