@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta, timezone
 from functools import partial
@@ -284,28 +282,10 @@ time = "t_s"
 shoulder = "c_deg"
 wrist = "d_deg"
 """
-CONFIG = """
-arm = "arm.toml"
-[sensors.encoder]
-sd_deg = 0.1
-"""
-ARM = """
-name = "two joints"
-update_period_ms = 33.333
-delay_ms = 50.0
-[axes.shoulder]
-kind = "angle"
-plant = "first-order"
-time_constant_ms = 60.0
-[axes.wrist]
-kind = "angle"
-plant = "first-order"
-time_constant_ms = 40.0
-"""
 
 
-def test_an_episode_of_lerobot_fuses_like_the_same_data_in_a_csv(tmp_path: Path) -> None:
-    """The executable writes the same estimates, bit for bit, straight from the data set."""
+def test_an_episode_of_lerobot_reads_like_the_same_data_in_a_csv(tmp_path: Path) -> None:
+    """The same run, bit for bit, straight from the data set."""
     dataset, flat = tmp_path / "dataset", tmp_path / "flat"
     dataset.mkdir()
     flat.mkdir()
@@ -314,14 +294,10 @@ def test_an_episode_of_lerobot_fuses_like_the_same_data_in_a_csv(tmp_path: Path)
     pacsv.write_csv(pa.table(columns), flat / "log.csv")
     for folder, manifest in ((dataset, LEROBOT), (flat, FLAT)):
         (folder / "run.toml").write_text(manifest, encoding="utf-8")
-        (folder / "fusion.toml").write_text(CONFIG, encoding="utf-8")
-        (folder / "arm.toml").write_text(ARM, encoding="utf-8")
-        command = [sys.executable, "-m", "pumafuse", "fuse", str(folder), "-c", str(folder / "fusion.toml")]
-        subprocess.run([*command, "-o", str(folder / "result")], check=True, capture_output=True)
-    one, other = (papq.read_table(folder / "result" / "estimates.parquet") for folder in (dataset, flat))
-    assert one.num_rows == FRAMES
-    assert one.equals(other)
-    assert Run.read(dataset).axes == ("shoulder", "wrist")
+    one, other = Run.read(dataset), Run.read(flat)
+    assert one.axes == ("shoulder", "wrist") and len(one.command.stamp) == FRAMES
+    same(one.command, other.command.stamp, **other.command.values)
+    same(one.sensors["encoder"], other.sensors["encoder"].stamp, **other.sensors["encoder"].values)
 
 
 def test_lerobot_without_its_episode_is_refused_or_told(tmp_path: Path) -> None:
@@ -699,11 +675,11 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "empty bracket": ('time = "t_ns"\nx = { column = "list[]", unit = "m" }', ("'list[]'", "0, 1, 2")),
     "only dots": ('time = "t_ns"\nx = { column = "...", unit = "m" }', ("'...'", "t_ns")),
     "a deep path": (
-        f'time = "t_ns"\nx = {{ column = "pose{".position" * 3000}", unit = "m" }}',
+        f'time = "t_ns"\nx = {{ column = "pose{".position" * 1200}", unit = "m" }}',
         ("unknown field", "accepted: x, y"),
     ),
     "a path of brackets": (
-        f'time = "t_ns"\nx = {{ column = "list{"[0]" * 3000}", unit = "m" }}',
+        f'time = "t_ns"\nx = {{ column = "list{"[0]" * 1200}", unit = "m" }}',
         ("no element '0'", "double"),
     ),
     "an endless name": (f'time = "t_ns"\nx = {{ column = "{"x" * 10_000}", unit = "m" }}', ("unknown column", "…")),

@@ -84,13 +84,6 @@ def test_decimal_stamps_of_a_run_are_exact(tmp_path: Path, unit: str, stamps: li
     assert column(tmp_path, f"t{unit}", [*cells, "0.5"]).stamps(f"t{unit}")[0].tolist()[:-1] == stamps
 
 
-@pytest.mark.parametrize("zone", ["", "Z"])
-def test_calendar_stamps_are_exact(tmp_path: Path, zone: str) -> None:
-    """Dates with a time are ns since 1970 in UTC, to the last digit."""
-    cells = [f"2023-11-14T22:13:20.123456789{zone}", "", f"1969-12-31T23:59:59.999999999{zone}"]
-    assert column(tmp_path, "t_s", cells).stamps("t_s")[0].tolist() == [EPOCH_NS, NO_STAMP, -1]
-
-
 BLANKS = ("", "NaN", "nan", "NA", "N/A", "NULL", "null", "None", '""')
 WORDS = ("bad", "1_000", "0x10", "1.5.2", "--1", "1e", "+", "−1.5", "1 5", "٣", '"1,5"')
 CELLS = {
@@ -144,17 +137,25 @@ def test_a_cell_beyond_the_first_block_may_be_of_another_kind(
     np.testing.assert_array_equal(table.stamps("t_ns")[0], EPOCH_NS + np.arange(rows + 1))
 
 
+HEADER = "t_s,x_mm,y_mm\n"
+
+
 @pytest.mark.parametrize(
-    ("body", "kept", "said"),
+    ("text", "kept", "said"),
     [
-        ("0,1,2\n1,2,3\n2,3", [0, 1], "1 line left out: 2 cells where the first has 3, first in line 4"),
-        ("0,1,2\n1\n2,3,4\n3\n", [0, 2], "2 lines left out: 1 cells where the first has 3, first in line 3"),
-        ("0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], "1 line left out: 4 cells where the first has 3, first in line 3"),
+        (f"{HEADER}0,1,2\n1,2,3\n2,3", [0, 1], "1 line left out: 2 cells where the first has 3, first in line 4"),
+        (f"{HEADER}0,1,2\n1\n2,3,4\n3\n", [0, 2], "2 lines left out: 1 cells where the first has 3, first in line 3"),
+        (f"{HEADER}0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], "1 line left out: 4 cells where the first has 3, first in line 3"),
+        (
+            f"# by hand\n{HEADER}0,1,2\n1\n2,3,4\n",
+            [0, 2],
+            "1 line left out: 1 cells where the first has 3, first in line 4",
+        ),
     ],
 )
-def test_a_torn_line_is_left_out_and_noted(tmp_path: Path, body: str, kept: list[int], said: str) -> None:
+def test_a_torn_line_is_left_out_and_noted(tmp_path: Path, text: str, kept: list[int], said: str) -> None:
     """A line of another length than the header is left out; one note has how many and where the first is."""
-    table = csv(tmp_path, f"t_s,x_mm,y_mm\n{body}")
+    table = csv(tmp_path, text)
     assert table.stamps("t_s")[0].tolist() == [10**9 * second for second in kept]
     assert table.notes == (f"log.csv: {said}",)
 
@@ -349,12 +350,6 @@ def test_of_a_wide_text_what_is_asked_for_is_read(tmp_path: Path, ending: str) -
         assert all(some.columns[name].equals(whole.columns[name]) for name in some.columns)
     with pytest.raises(UnknownNameError, match="did you mean 'c17'"):
         tables.read(file, fields=["c17_"])
-
-
-def test_lines_are_counted_from_the_top_of_the_file(tmp_path: Path) -> None:
-    """Also where a comment stands above the header."""
-    table = csv(tmp_path, "# by hand\nt_s,x_mm\n0,1\n1\n2,3\n")
-    assert table.notes == ("log.csv: 1 line left out: 1 cells where the first has 2, first in line 4",)
 
 
 @pytest.mark.parametrize("body", ["0,1,2\n1,2,3\n", "0,1,2\n1,h\xf6\n2,3,4\n"])
