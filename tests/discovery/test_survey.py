@@ -573,7 +573,7 @@ def test_a_data_set_of_lerobot_is_read_by_its_layout(tmp_path: Path) -> None:
         assert np.sqrt(np.mean((est[axis].position[50:] - truth[50:, number]) ** 2)) < np.radians(0.1)
 
 
-@pytest.mark.parametrize("kind", ["mcap", "json", "protobuf", "bag", "db3", "rrd"])
+@pytest.mark.parametrize("kind", ["mcap", "json", "bag", "db3", "rrd"])
 def test_recordings_of_all_kinds(kind: str, tmp_path: Path) -> None:
     """The topic called command is that, cameras follow it, poses are in metres by their type."""
     log = tmp_path / KINDS[kind].name

@@ -131,7 +131,7 @@ wild = st.builds(
 )
 
 
-@settings(max_examples=1000)
+@settings(max_examples=300)
 @given(wild)
 def test_any_stamps_are_stray_as_a_walk_from_row_to_row_finds_them(stamp: list[int]) -> None:
     """Only rows near a step back are looked at; that misses none and finds no other."""

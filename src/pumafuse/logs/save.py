@@ -14,16 +14,7 @@ from ..units import SCREEN, Screen, seconds
 from . import tables
 from .run import NOISE, Run, Source
 
-_KEYS = (
-    "file",
-    "topic",
-    "entity",
-    "where",
-    "time",
-    "start",
-    "clock",
-    NOISE,
-)  # of a source in run.toml; others are axes
+_KEYS = ("file", "topic", "entity", "where", "time", "start", "clock", NOISE)  # of a source in run.toml
 _TAKEN = ("commands", "truth", "trials", "samples", "path")
 
 
