@@ -17,9 +17,8 @@ from openpyxl import Workbook
 from scipy.io import savemat
 
 import pumafuse as pf
+from discovery.test_survey import written
 from pumafuse.arrays import FloatArray
-from pumafuse.discovery.drafts import drafts
-from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.survey import survey
 from pumafuse.errors import PumafuseError, RunError
 from pumafuse.logs import formats, tables
@@ -110,9 +109,7 @@ def test_a_log_of_several_tables_is_found_and_read_again(write: Callable[[Path],
         assert one.slope == pytest.approx(1.0, abs=0.02)
     (said,), (seen,) = {len(found.run.command.stamp)}, {len(one.stamp) for one in found.run.sensors.values()}
     assert (said, seen) == (len(TIME), len(LATER))
-    for name, text in drafts(found, *guess(found), tmp_path).items():
-        (tmp_path / name).write_text(text)
-    read = pf.Run.read(tmp_path)
+    read, _ = written(found, tmp_path)
     for axis, told in zip(found.run.axes, TOLD.T, strict=True):
         assert np.array_equal(read.command.values[axis], found.run.command.values[axis])
         assert np.allclose(read.command.values[axis], told, atol=1e-6)
