@@ -96,9 +96,9 @@ _STREAM_NS = 250_000_000  # between trajectories of one point, up to which they 
 class Clock:
     """The stamps of a part."""
 
-    time: Time  # where they are
+    time: Time
     basis: str  # how the unit is known, in words
-    stamp: TimeArray  # Int64 ns, (rows,)
+    stamp: TimeArray  # int64 ns, (rows,)
     notes: tuple[str, ...] = ()  # what was wrong with them, a sentence each
     doubt: str = ""  # what may be wrong with them, as a question; empty: nothing
 
@@ -138,12 +138,12 @@ class Signal:
 class Part:
     """A table of a log: a file, a topic or an entity."""
 
-    file: Path  # where it is
+    file: Path
     topic: str = ""  # which topic of it
     entity: str = ""  # which entity of it
     where: Mapping[str, Any] = field(default_factory=dict[str, Any])  # which of its rows
     type: str = ""  # of its messages; empty of a table
-    rows: int = 0  # how many
+    rows: int = 0
     clock: Clock | None = None  # its stamps; None: none was found
     signals: tuple[Signal, ...] = ()  # its columns of positions
     # its other columns of numbers, and why they are none

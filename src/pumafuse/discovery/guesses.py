@@ -42,7 +42,7 @@ class AxisGuess:
     gain: float  # how far it moves when the command moves by 1
     misfit: float  # what the delayed command leaves
     start: float | None  # where it starts, if that is not at its first command; None: it is, or nothing tells
-    offset_sd: float  # for '[start]'
+    offset_sd: float  # of [start] in fusion.toml
     input_noise: float  # its density [m/√Hz]
     drift: float  # its density [m/√s]
 

@@ -92,7 +92,7 @@ def shrunk(products: Products, penalty: float | None = None) -> Shrunk:
 class Residue:
     """What the commands leave of a path: a spline whose knots are as far apart as cross-validation says, or nothing."""
 
-    spline: Callable[[FloatArray], FloatArray] | None = None  # the spline; None: 0
+    spline: Callable[[FloatArray], FloatArray] | None = None  # None: 0
     begin: float = 0.0  # where it begins [s]
     end: float = 0.0  # where it ends [s]
     freedom: float = 0.0  # its degrees of freedom

@@ -51,10 +51,10 @@ _Group: TypeAlias = tuple[str, str, str, bool]  # words of roles, list, copy, wh
 class Stream:
     """A source of the run to be: columns of a part that belong together."""
 
-    name: str  # what it is called
+    name: str
     role: Role | None  # what it is; None: its names do not say
     why: str  # how that is known
-    part: Part  # where it is
+    part: Part
     axes: Mapping[str, Sequence[Signal]]  # for each axis its columns, which are added up
     attitude: Attitude | None = None  # its orientation, if it tells one
 
@@ -97,9 +97,9 @@ class UndecidedError(RunError):
 class Roles:
     """Who is who."""
 
-    command: Stream  # the commands
-    sensors: Sequence[Stream]  # the sensors
-    reference: Stream | None  # the reference, if there is one
+    command: Stream
+    sensors: Sequence[Stream]
+    reference: Stream | None
     left_out: Sequence[tuple[Stream, str]]  # what is none of them, or not for these axes, and why
 
     @property

@@ -37,7 +37,7 @@ _STEPS, _FINEST = 10, 1e-3  # of an update period; s
 class Survey:
     """What was found in a log."""
 
-    log: Path  # the file or folder
+    log: Path
     # the run in it, in the arm's axes, without sensors in frames of their own. Axes rx, ry, rz are in it where a sensor
     # follows how the tool is turned
     run: Run

@@ -72,9 +72,9 @@ _MOST_BYTES = 1 << 30  # of a table
 class Table:
     """One table: a file, or a topic of one."""
 
-    path: Path  # where it was read from
-    columns: Columns  # its columns by name; they may be nested
-    rows: int  # number of rows
+    path: Path
+    columns: Columns  # by name; they may be nested
+    rows: int
     notes: tuple[str, ...]  # what was wrong with the file as a whole, a sentence each
     # names and field paths of all that the file has, also where 'columns' are only some of it
     names: tuple[str, ...] = ()

@@ -40,8 +40,8 @@ _NO_ROWS = pa.record_batch({})
 class Recording:
     """The Rerun recording that a run was read from."""
 
-    application: str  # its application id
-    id: str  # its recording id
+    application: str
+    id: str
     timeline: str  # the timeline of the run's stamps; empty: they are on none
     kind: str  # what it holds: 'timestamp[ns]', 'duration[ns]', or whole numbers ('int64')
     unit: int  # what one of these is [ns]

@@ -96,7 +96,7 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Columns of an orientation in one of three forms, see :mod:`pumafuse.space.rotations`."""
 
-    quaternion: tuple[str, str, str, str] | None = None  # four columns
+    quaternion: tuple[str, str, str, str] | None = None
     order: rotations.Order = "xyzw"  # where w is among them
     rotation_vector: tuple[str, str, str] | None = None  # three columns of angles along the base's axes
     euler: tuple[str, str, str] | None = None  # three columns of angles, in the order of the convention's letters
@@ -178,11 +178,11 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     entity: str = ""  # which part of a Rerun recording
     # which of the rows: those in which each of these columns has this value
     where: dict[str, bool | int | float | str] = {}
-    time: Time  # their stamps
+    time: Time
     # whether these are used as they are ('stamps'), or even ticks fitted to them ('regular')
     clock: Literal["stamps", "regular"] = "stamps"
     axes: dict[str, list[Column]]  # for each axis its columns, which are added up
-    orientation: Orientation | None = None  # the columns of its orientation
+    orientation: Orientation | None = None
     joints: dict[str, list[Column]] = {}  # the columns of the joints of the '[robot]', which are a pose
     noise: RowNoise | None = None  # the column of how noisy each row is; only sensors have one
 

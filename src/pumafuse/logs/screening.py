@@ -119,9 +119,9 @@ def _follows(stamp: TimeArray, value: FloatArray, leap: int) -> bool:
 class Habit(NamedTuple):
     """How the values of a sensor on an axis change from one to another."""
 
-    smallest: float  # its steps: the smallest [m or rad],
-    typical: float  # the median,
-    usual: float  # and the one than which few are larger
+    smallest: float  # of its steps [m or rad]
+    typical: float  # their median
+    usual: float  # the one than which few are larger
     times: int  # how often each value comes in a row, typically, if it holds its samples; else 1
 
     @staticmethod
