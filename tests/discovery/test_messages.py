@@ -27,13 +27,11 @@ TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
 
 def split(time: float) -> dict[str, int]:
-    """Seconds and nanoseconds of a time [s]."""
     ns = round(time * 1e9)
     return {"sec": ns // 10**9, "nanosec": ns % 10**9}
 
 
 def smooth(share: FloatArray) -> FloatArray:
-    """From 0 to 1 without a jerk."""
     share = np.clip(share, 0.0, 1.0)
     return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
 
@@ -51,7 +49,6 @@ def trajectory(
 
 
 def states(joints: Sequence[str], where: FloatArray, time: FloatArray) -> list[tuple[str, str, float, Any]]:
-    """Messages of /joint_states."""
     kind = "sensor_msgs/msg/JointState"
     return [
         ("/joint_states", kind, START + t, {"header": {"stamp": split(START + t)}, "name": joints, "position": list(x)})

@@ -61,7 +61,6 @@ def log(folder: Path, told: dict[str, Any] | None, seen: dict[str, Any] | None, 
 
 
 def both() -> tuple[Rotation, Rotation]:
-    """Commanded and measured orientations."""
     return poses()[1], poses(late=LATE)[1]
 
 

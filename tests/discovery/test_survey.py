@@ -45,7 +45,6 @@ def path(t: FloatArray) -> FloatArray:
 
 
 def write(file: Path, columns: dict[str, Any]) -> None:
-    """A CSV file."""
     with file.open("w", newline="") as text:
         writer = csv.writer(text)
         writer.writerow(columns)
@@ -53,7 +52,6 @@ def write(file: Path, columns: dict[str, Any]) -> None:
 
 
 def xyz(values: FloatArray, name: str = "{}_m") -> dict[str, Any]:
-    """Columns of three axes."""
     return {name.format(axis): values[:, place] for place, axis in enumerate("xyz")}
 
 
@@ -78,12 +76,10 @@ def recorded_at_once() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def asked(found: Survey) -> list[str]:
-    """What the user has to decide."""
     return list(questions(found, guess(found)[1]))
 
 
 def written(found: Survey, folder: Path) -> tuple[pf.Run, pf.FusionConfig]:
-    """The three files, as the loaders take them."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in drafts(found, *guess(found), folder).items():
         (folder / name).write_text(text)
@@ -111,7 +107,6 @@ def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 def test_among_thousands_of_columns_names_tell_who_is_who(tmp_path: Path, kind: str) -> None:
-    """What is found is what is found in a file of the three columns that are called so."""
     t, u, z = (one[:300] for one in recorded_at_once())
     told = {"cmd_x": u[:, 0], "meas_x": z[:, 0], "time": t}
     others = {f"c{n}": np.full(len(t), n % 7) + t for n in range(2_100)}
@@ -301,7 +296,6 @@ def test_axes_and_sources_in_rows_of_their_own(kind: str, header: str, axes: Seq
 
 
 def test_a_status_that_changes_all_the_time_tells_nothing_apart(tmp_path: Path) -> None:
-    """It is of the row, not of an axis."""
     t, u, z = recorded_at_once()
     words = np.where(np.random.default_rng(1).random(len(t)) < 0.5, "good", "poor")
     columns = {**xyz(u, "goal.{}_m"), **xyz(z, "camera.{}_m")}
@@ -391,7 +385,6 @@ def test_units_without_a_name_are_those_in_which_both_move_alike(unit: str, log:
 
 
 def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
-    """What runs ahead is the command, what follows is the sensor."""
     t, u, _, z = recorded()
     log = tmp_path / "both"
     log.mkdir()
@@ -496,7 +489,6 @@ def test_a_clock_that_nothing_tells_from_the_lag_is_said_to_be_a_guess(log: Path
 
 
 def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:
-    """Numbers tell devices apart, but axes of a goal."""
     t, u, _, _ = recorded()
     z = path(t - LAG) + np.random.default_rng(4).normal(0.0, 1e-4, u.shape)
     columns = {f"camera{n}_{axis}_m": z[:, place] for n in (1, 2) for place, axis in enumerate("xy")}
@@ -719,7 +711,6 @@ def test_roles_of_columns_by_name(column: str, role: str | None) -> None:
     ],
 )
 def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
-    """A name is the axis and the unit, without the words that say anything else."""
     assert (names.axis_of(column, []), names.unit_of(column)) == (axis, unit)
 
 
@@ -732,7 +723,6 @@ def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
     ],
 )
 def test_what_is_no_position_is_left_out(column: str) -> None:
-    """By a word in the name, or by a unit of something else."""
     assert names.no_position(column)
 
 
@@ -744,7 +734,6 @@ def test_what_is_no_position_is_left_out(column: str) -> None:
     ],
 )
 def test_what_may_be_a_position_is_not(column: str) -> None:
-    """A desired joint, where the tool is at present, and whatever has a unit of positions."""
     assert not names.no_position(column)
 
 
@@ -755,7 +744,6 @@ def test_a_unit_of_positions_is_of_no_clock(column: str, is_time: bool) -> None:
 
 
 def of_roles(found: Survey) -> list[list[str]]:
-    """The columns of the commands and of each sensor."""
     assert found.roles is not None
     streams = (found.roles.command, *found.roles.sensors)
     return [[one.column for (one,) in stream.axes.values()] for stream in streams]
@@ -882,7 +870,6 @@ def test_doubts_are_said_with_their_numbers(log: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_log_is_refused_in_a_line(files: dict[str, str], said: str, tmp_path: Path) -> None:
-    """With what is missing."""
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     assert said in one_line(RunError, lambda: survey(tmp_path))
@@ -924,7 +911,6 @@ def test_a_damaged_table_is_surveyed_or_refused_in_a_line(seed: int, tmp_path_fa
 
 
 def test_a_log_without_commands_says_how_they_are_known(tmp_path: Path) -> None:
-    """Two sensors that move at once: none runs ahead."""
     _, _, s, z = recorded()
     noise = np.random.default_rng(1).normal(scale=5e-4, size=len(s))
     write(tmp_path / "camera.csv", {"t_s": s, "x_m": z[:, 0]})
@@ -934,7 +920,6 @@ def test_a_log_without_commands_says_how_they_are_known(tmp_path: Path) -> None:
 
 
 def test_a_folder_with_many_topics_lists_what_it_does_not_use(tmp_path: Path) -> None:
-    """Columns that are no positions are listed with the reason."""
     t, u, s, z = recorded(100)
     write(tmp_path / "goal.csv", {"time_s": t, "x_m": u[:, 0], "z_m": np.zeros(100)})
     write(tmp_path / "camera.csv", {"time_s": s, "x_m": z[:, 0], "quality": np.ones(100), "t_sent_s": s})
@@ -972,7 +957,6 @@ def test_a_gain_that_is_not_about_1_is_a_question(gain: float, expected: bool, t
 
 
 def test_where_nothing_follows_no_columns_are_exchanged(tmp_path: Path) -> None:
-    """One sensor that does something else: there is nothing that it could be exchanged with."""
     t, u, s, _ = recorded()
     write(tmp_path / "goal.csv", {"t_s": t, "x_mm": 1e3 * u[:, 0]})
     write(tmp_path / "camera.csv", {"t_s": s, "x_mm": np.random.default_rng(3).normal(size=len(s))})
@@ -1160,7 +1144,6 @@ def test_stamps_of_a_headerless_table_may_repeat(tick: float, every: float, tmp_
 
 @pytest.mark.parametrize("restart", ["within a turn until then", "a turn less in motion", "a turn more at rest"])
 def test_an_angle_goes_on_over_a_restart_of_what_counts_its_turns(restart: str, tmp_path: Path) -> None:
-    """Over several turns in all; what was decided says it."""
     t = np.arange(0.0, 50.0, 0.02)
     rests = restart == "a turn more at rest"
     u = 900.0 * np.sin(0.11 * np.clip(t, 0.0, 25.0)) if rests else 25.0 * t + 70.0 * np.sin(0.8 * t)
@@ -1324,7 +1307,6 @@ def test_of_steps_how_far_an_axis_goes_tells_its_gain(tmp_path: Path) -> None:
 
 
 def test_where_no_column_leads_they_are_named(tmp_path: Path) -> None:
-    """Whoever is to write run.toml sees what there is."""
     rng, t = np.random.default_rng(4), 0.02 * np.arange(500)
     noise = {name: np.cumsum(rng.normal(size=500)) for name in ("r", "y", "w1", "w2")}
     write(tmp_path / "log.csv", {"t_s": t, **noise})

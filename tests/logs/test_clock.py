@@ -41,7 +41,6 @@ def recorded(
 
 
 def rows(piece: Source | None) -> list[int]:
-    """Which rows of the original a piece holds."""
     assert piece is not None
     assert len(piece.stamp) == len(piece.values["radial"])
     return piece.values["radial"].astype(int).tolist()
@@ -222,6 +221,5 @@ def test_stamps_as_far_apart_as_they_may_be_are_a_jump() -> None:
 
 
 def test_stamps_that_are_no_clock_are_refused() -> None:
-    """Nonsense stamps would be a thousand segments: refused by the file's name instead."""
     nonsense = np.random.default_rng(0).integers(0, 1000 * SECOND, 1000).tolist()
     assert "host.csv" in refusal(lambda: segments(recorded(nonsense, {"tracker": nonsense})))

@@ -137,7 +137,6 @@ WHOLE = Table(Path("log"), dict(zip(NESTED.column_names, NESTED.columns, strict=
     )
 )
 def test_whatever_a_path_is_it_is_a_column_or_one_line(path: str) -> None:
-    """Nothing else comes out, whoever asks for it."""
     for ask in (WHOLE.column, WHOLE.numbers, WHOLE.stamps, WHOLE.zoned, lambda name: WHOLE.numbers(name, "_m")):
         try:
             ask(path)
@@ -298,7 +297,6 @@ def test_dates_that_are_none_are_refused(cell: str) -> None:
 @properties
 @given(st.lists(st.decimals(-(10**9), 10**9, places=9), min_size=1, max_size=5))
 def test_decimal_seconds_are_exact(stamps: list[Any]) -> None:
-    """A Parquet column of decimals has every nanosecond of today, which float64 has not."""
     table = one_column(stamps, pa.decimal128(20, 9))
     assert table.stamps("t", unit="_s")[0].tolist() == [int(stamp * GIGA) for stamp in stamps]
     np.testing.assert_allclose(table.numbers("t", "_m")[0], [float(stamp) for stamp in stamps], rtol=1e-15)

@@ -40,7 +40,6 @@ TOLD, SEEN = path(TIME), path(LATER - LAG)
 
 
 def npz(folder: Path) -> Path:
-    """Flat arrays of two lengths."""
     arrays = {"command_t": TIME, "command_rad": TOLD, "encoder_t": LATER, "encoder_rad": SEEN}
     np.savez(folder / "log.npz", **arrays)
     return folder / "log.npz"
@@ -55,7 +54,6 @@ def mat(folder: Path) -> Path:
 
 
 def records(folder: Path) -> Path:
-    """Records of JSON by source."""
     whole = {
         name: [{"t": t, "joint": {"a_rad": a, "b_rad": b}} for t, (a, b) in zip(time, values.tolist(), strict=True)]
         for name, time, values in (("command", TIME, TOLD), ("encoder", LATER, SEEN))
@@ -65,8 +63,6 @@ def records(folder: Path) -> Path:
 
 
 def columns(folder: Path) -> Path:
-    """Columns of JSON, as pandas writes them, by their rows."""
-
     def of(values: FloatArray) -> dict[str, float]:
         return {str(n): float(value) for n, value in enumerate(values)}
 
@@ -92,7 +88,6 @@ def xlsx(folder: Path) -> Path:
 
 
 def ulg(folder: Path) -> Path:
-    """A log of PX4."""
     topics = {"position_setpoint": ("float[2] joint", TIME, TOLD), "position_measured": ("float[2] joint", LATER, SEEN)}
     return write_ulg(folder / "log.ulg", topics)
 
@@ -198,7 +193,6 @@ def test_what_cannot_be_read_says_how_to_convert_it(tmp_path: Path, monkeypatch:
 
 
 def test_a_file_is_read_again_when_it_was_written_again(tmp_path: Path) -> None:
-    """What was read last is kept, but not beyond a change of the file."""
     assert len(formats.names(npz(tmp_path))) == 2
     np.savez(tmp_path / "log.npz", time_s=TIME)
     assert formats.names(tmp_path / "log.npz") == [""]

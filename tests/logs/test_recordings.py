@@ -106,7 +106,6 @@ def test_rows_are_in_the_order_of_recording(tmp_path: Path) -> None:
 
 
 def test_rows_can_be_chosen_in_a_recording(tmp_path: Path) -> None:
-    """`where` works on field paths of messages."""
     path = written(tmp_path, KINDS["mcap"], motion(5))
     number = motion(5)[-1].numbers[0]
     table = tables.read(path, topic="/level", fields=["data"], where={"data": number})
@@ -259,7 +258,6 @@ def test_a_file_that_aborts_the_reader_of_rerun_is_a_line(tmp_path: Path) -> Non
 
 @pytest.fixture
 def readers(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
-    """The processes that are started."""
     found, start = [], subprocess.Popen
 
     def noted(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
@@ -431,7 +429,6 @@ DEFINITIONS = {
 
 @pytest.mark.parametrize("definition", DEFINITIONS)
 def test_a_definition_that_is_of_no_use_is_a_line(definition: str, tmp_path: Path) -> None:
-    """Types that are missing, endless or no definitions at all are named, before any message is decoded."""
     path = _mcap(tmp_path / "odd.mcap", _message(1.0), definition=definition)
     assert DEFINITIONS[definition] in one_line(RunError, lambda: recordings.read(path, "/level"))
 
@@ -478,14 +475,12 @@ def test_paths_that_are_no_recordings_say_why(tmp_path: Path) -> None:
 def test_a_library_that_is_missing_is_named_by_what_installs_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Without the extra, one line says how to get it."""
     path = written(tmp_path, KINDS["mcap"], motion(5))
     monkeypatch.setitem(sys.modules, "mcap.stream_reader", None)
     assert "pip install 'pumafuse[bags]'" in one_line(RunError, lambda: recordings.read(path, "/level"))
 
 
 def test_tables_cost_no_library_of_recordings(tmp_path: Path) -> None:
-    """Who reads CSV imports nothing that reads recordings."""
     (tmp_path / "run.toml").write_text(bag_files.csv(tmp_path, motion(5)))
     others = "{'mcap', 'rosbags', 'rerun', 'zstandard', 'lz4', 'google', 'sqlite3', 'pumafuse.logs.recordings'}"
     code = f"import sys, pumafuse as pf; pf.Run.read({str(tmp_path)!r}); print({others} & set(sys.modules))"

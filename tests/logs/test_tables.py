@@ -56,7 +56,6 @@ def written(folder: Path, **columns: object) -> Table:
 @properties
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20))
 def test_lengths_are_the_exact_quotient_by_their_unit(tmp_path: Path, unit: str, values: list[float]) -> None:
-    """A length is the number in the cell over the power of ten in the column's name, rounded once."""
     got, note = column(tmp_path, f"x{unit}", [repr(value) for value in values]).numbers(f"x{unit}")
     assert got.tolist() == [float(Fraction(value) / 10 ** LENGTHS[unit]) for value in values]
     assert note is None
@@ -256,7 +255,6 @@ def test_a_header_of_several_lines_tells_columns_of_one_name_apart(tmp_path: Pat
 
 @pytest.mark.parametrize("text", ["\ufeff", "\n", "\ufeff\n", "# only\n", '"', "#", " \n \n", "a\n\n\n1 2\n3 4"])
 def test_what_has_no_header_is_a_table_or_one_line(tmp_path: Path, text: str) -> None:
-    """Whatever its first lines are."""
     try:
         csv(tmp_path, text)
     except RunError as error:
@@ -311,7 +309,6 @@ def test_lists_over_lines_may_fill_a_large_file(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["0,[" + "1," * 30_000, '0,"' + "\n" * 60_000 + '"', ',"[' * 20_000])
 def test_a_text_of_brackets_and_quotes_is_a_table_or_one_line(tmp_path: Path, text: str) -> None:
-    """What looks like a list, or a cell that goes on, need not be one."""
     try:
         table = csv(tmp_path, f"t_s,q\n{text}\n1,[2,3]\n")
     except PumafuseError as error:
@@ -328,7 +325,6 @@ def test_a_mark_of_inches_opens_no_cell(tmp_path: Path) -> None:
 
 
 def test_a_header_may_be_longer_than_what_is_looked_at(tmp_path: Path) -> None:
-    """Ten thousand columns, separated by semicolons."""
     names = [f"sensor{n}.position_mm" for n in range(10_000)]
     text = f"{';'.join(names)}\n" + f"{';'.join(['0,5'] * len(names))}\n" * 3
     assert list(csv(tmp_path, text).columns) == names
@@ -374,7 +370,6 @@ def test_lines_of_json_are_a_table_of_nested_columns(tmp_path: Path, name: str) 
 
 
 def test_gzip_and_parquet_say_what_the_csv_says(tmp_path: Path) -> None:
-    """The same log as CSV, gzipped CSV and Parquet gives the same columns."""
     text = f"t_ns,x_mm,word_mm\n{EPOCH_NS},1.1,1\n,2.2,\n{EPOCH_NS + 1},,bad\n"
     plain = csv(tmp_path, text)
     zipped = csv(tmp_path, gzip.compress(text.encode()), "log.csv.gz")
@@ -513,7 +508,6 @@ def test_a_column_without_its_unit_is_refused_with_the_accepted_ones(tmp_path: P
 
 @pytest.mark.parametrize("cell", ["true", "2024-01-01", "10:00:00"])
 def test_a_column_of_another_kind_is_refused(tmp_path: Path, cell: str) -> None:
-    """Yes or no, days and times of day are no lengths and no stamps."""
     assert "not numbers" in refusal(lambda: column(tmp_path, "x_mm", [cell, cell]).numbers("x_mm"))
     assert "not numbers" in refusal(lambda: column(tmp_path, "t_s", [cell, cell]).stamps("t_s"))
 
