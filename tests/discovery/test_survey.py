@@ -761,10 +761,10 @@ def of_roles(found: Survey) -> list[list[str]]:
     ],
 )
 def test_desired_values_are_the_commands_of_those_beside_them(desired: str, measured: str, tmp_path: Path) -> None:
-    """Elements of lists and numbered names, with rates and a constant between them."""
+    """Elements of lists and numbered names; rates run ahead, too, but not as alike, and a constant is between them."""
     t, u, _, _ = recorded()
     z = path(t - LAG) + np.random.default_rng(2).normal(0.0, 1e-4, u.shape)
-    columns = {"t_s": t, "success_rate": np.ones(len(t))}
+    columns = {"t_s": t, "success_rate": np.ones(len(t)), **{f"w_{n}": np.gradient(z[:, n], t) for n in range(3)}}
     columns |= {measured.format(n): z[:, n] for n in range(3)} | {f"dq[{n}]": np.gradient(u[:, n], t) for n in range(3)}
     write(tmp_path / "log.csv", columns | {desired.format(n): u[:, n] for n in range(3)})
     found = survey(tmp_path / "log.csv")
@@ -934,12 +934,14 @@ def test_an_axis_that_does_not_follow_is_left_out_and_the_others_are_fused(log: 
     own = np.random.default_rng(6).normal(size=len(s)).cumsum()
     write(log / "goal.csv", {"t_s": t, "a_mm": 1e3 * u[:, 0], "b_mm": 1e3 * u[:, 1], "c_mm": 1e3 * u[:, 2]})
     write(log / "encoder.csv", {"t_s": s, "a_mm": 1e3 * z[:, 0], "b_mm": own})
+    write(log / "laser.csv", {"t_s": s, "q_mm": np.roll(own, 300)})
     found = survey(log)
     run, config = written(found, tmp_path / "out")
     assert run.axes == ("a",) == tuple(config.arm.axes)
     said = "\n".join(asked(found))
     assert "encoder is not used on b: it does not follow the commands (correlation" in said
     assert "goal is not used on b, c: nothing measures where these commands lead" in said
+    assert "laser is not used on q: its axes are called otherwise than the commands', and follow none" in said
 
 
 @pytest.mark.parametrize(("gain", "expected"), [(2.002, True), (0.45, True), (1.0, False), (0.93, False)])
