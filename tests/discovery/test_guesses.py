@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pumafuse as pf
+from discovery.test_survey import write, written
 from executable import pumafuse
 from pumafuse.arrays import FloatArray
-from pumafuse.discovery.drafts import drafts
 from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.survey import survey
 
@@ -22,10 +23,17 @@ LATE = 0.12  # s
 
 def log(folder: Path, position: FloatArray, command: FloatArray) -> Path:
     """A table of an axis in mm."""
-    file = folder / "gantry.csv"
-    table = np.column_stack((T * np.arange(len(command)), command, position))
-    np.savetxt(file, table, delimiter=",", header="time_s,target.z_mm,actual.z_mm", comments="", fmt="%.6f")
-    return file
+    time = T * np.arange(len(command))
+    write(folder / "gantry.csv", {"time_s": time, "target.z_mm": command, "actual.z_mm": position.round(6)})
+    return folder / "gantry.csv"
+
+
+def mount(folder: Path, t: FloatArray, **tables: tuple[FloatArray, int]) -> Path:
+    """A folder of tables of an axis [mm], each of every n-th row."""
+    folder.mkdir()
+    for name, (value, every) in tables.items():
+        write(folder / f"{name}.csv", {"time_s": t[::every], "z_mm": value[::every].round(6)})
+    return folder
 
 
 def swings(count: int = 900) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -43,12 +51,7 @@ def test_an_arm_that_starts_elsewhere_starts_where_its_sensor_says(away: float, 
     """35 mm below its first command, or 80 above: run.toml has the level; less than the noise and lag explain: not."""
     t, u, z = swings()
     z = z + away * np.exp(-t / LATE) + np.random.default_rng(1).normal(0.0, 0.02, len(t))
-    found = survey(log(tmp_path, z, u))
-    folder = tmp_path / "out"
-    folder.mkdir()
-    for name, text in drafts(found, *guess(found), folder).items():
-        (folder / name).write_text(text)
-    run = pf.Run.read(folder)
+    run, _ = written(survey(log(tmp_path, z, u)), tmp_path / "out")
     if abs(away) < 1.0:
         assert run.start == {}
         return
@@ -102,37 +105,31 @@ def test_a_camera_whose_latency_steps_tells_nothing_of_the_arms_lag(tmp_path: Pa
 
     In parts, as it advises, the latency is that of each.
     """
-    rng, folder = np.random.default_rng(4), tmp_path / "mount"
-    folder.mkdir()
+    rng = np.random.default_rng(4)
     t, u, z = swings(1800)
     late = np.where(t < 18.0, 0.04, 0.09)
     seen = np.interp(t - late, t, z) + rng.normal(0.0, 0.3, len(t))
-    tables = {"command": u, "encoder": z + rng.normal(0.0, 0.05, len(t)), "camera": seen}
-    for name, value in tables.items():
-        rows = slice(None, None, 3 if name == "camera" else 1)
-        table = np.column_stack((t, value))[rows]
-        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="time_s,z_mm", comments="", fmt="%.6f")
-    _, sensors = guess(survey(folder))
+    encoder = z + rng.normal(0.0, 0.05, len(t))
+    folder = mount(tmp_path / "mount", t, command=(u, 1), encoder=(encoder, 1), camera=(seen, 3))
+    found = survey(folder)
+    _, sensors = guess(found)
     (doubt,) = sensors["camera"].doubts
     assert doubt.startswith("the latency of camera steps from ")
     assert [float(one) for one in re.findall(r"[\d.]+", doubt)][:3] == pytest.approx([40.0, 90.0, 18.0], abs=2.0)
     assert sensors["camera"].latency_sd == pytest.approx(0.035, abs=0.002)  # RMS of 0 and 50 ms
     pumafuse("fuse", folder, "-o", tmp_path / "out")
     assert pf.ArmModel.load(tmp_path / "out" / "arm.toml").lag_of("z") == pytest.approx(LATE, abs=2e-3)
-    for option, latency in (("--to", 0.04), ("--from", 0.09)):
-        pumafuse("fuse", folder, "-o", tmp_path / option, option, "18")
-        part = pf.FusionConfig.load(tmp_path / option / "fusion.toml")
-        assert part.sensors["camera"].latency == pytest.approx(latency, abs=2e-3)
+    for part, latency in (((None, 18.0), 0.04), ((18.0, None), 0.09)):
+        _, sensors = guess(replace(found, run=found.run.between(*part)))
+        assert sensors["camera"].latency == pytest.approx(latency, abs=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_chance_makes_no_sensor_the_earliest(seed: int, tmp_path: Path) -> None:
     """A camera of a sixth of the rows and ten times the noise: the time of all is the encoder's, not the camera's."""
-    rng, folder = np.random.default_rng(seed), tmp_path / "mount"
-    folder.mkdir()
+    rng = np.random.default_rng(seed)
     t, u, z = swings(1800)
-    for name, value, every, sd in (("command", u, 1, 0.0), ("encoder", z, 1, 0.05), ("camera", z, 6, 0.5)):
-        table = np.column_stack((t, value + rng.normal(0.0, sd, len(t))))[::every]
-        np.savetxt(folder / f"{name}.csv", table, delimiter=",", header="time_s,z_mm", comments="", fmt="%.6f")
+    encoder, camera = (z + rng.normal(0.0, sd, len(t)) for sd in (0.05, 0.5))
+    folder = mount(tmp_path / "mount", t, command=(u, 1), encoder=(encoder, 1), camera=(camera, 6))
     _, sensors = guess(survey(folder))
     assert sensors["encoder"].latency == 0.0

@@ -19,7 +19,6 @@ LATER = 0.15  # s, between where the commands lead and where they had led
 
 
 def smooth(rng: np.random.Generator, count: int) -> FloatArray:
-    """A motion that repeats nowhere."""
     return np.convolve(rng.standard_normal(count + 40), np.hanning(41), mode="valid")
 
 

@@ -12,11 +12,9 @@ import pytest
 from mcap.writer import Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 
-import pumafuse as pf
 from bag_files import definition_of
+from discovery.test_survey import written
 from pumafuse.arrays import FloatArray
-from pumafuse.discovery.drafts import drafts
-from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.survey import survey
 from pumafuse.errors import RunError
 from pumafuse.logs import tables
@@ -29,13 +27,11 @@ TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 
 
 def split(time: float) -> dict[str, int]:
-    """Seconds and nanoseconds of a time [s]."""
     ns = round(time * 1e9)
     return {"sec": ns // 10**9, "nanosec": ns % 10**9}
 
 
 def smooth(share: FloatArray) -> FloatArray:
-    """From 0 to 1 without a jerk."""
     share = np.clip(share, 0.0, 1.0)
     return share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
 
@@ -53,7 +49,6 @@ def trajectory(
 
 
 def states(joints: Sequence[str], where: FloatArray, time: FloatArray) -> list[tuple[str, str, float, Any]]:
-    """Messages of /joint_states."""
     kind = "sensor_msgs/msg/JointState"
     return [
         ("/joint_states", kind, START + t, {"header": {"stamp": split(START + t)}, "name": joints, "position": list(x)})
@@ -106,9 +101,7 @@ def test_the_path_of_trajectories_is_the_commands(kind: str, tmp_path: Path) -> 
     for axis in found.run.axes:
         assert found.relations["joint_states", axis].lag == pytest.approx(LAG, abs=0.003)
         assert found.relations["joint_states", axis].slope == pytest.approx(1.0, abs=0.02)
-    for name, text in drafts(found, *guess(found), tmp_path).items():
-        (tmp_path / name).write_text(text)
-    read = pf.Run.read(tmp_path)
+    read, _ = written(found, tmp_path)
     assert np.array_equal(read.command.values["boom"], found.run.command.values["boom"])
     assert np.array_equal(read.command.stamp, found.run.command.stamp)
 
@@ -197,9 +190,7 @@ def test_of_transforms_the_tools_of_each_robot_are_found(tmp_path: Path) -> None
     assert set(found.run.sensors) == {"tf_right_tool0"}
     assert found.relations["tf_right_tool0", "x"].lag == pytest.approx(LAG, abs=0.003)
     assert any("left/base_link → left/link_1" in note for part in found.parts for note in part.notes)
-    for name, text in drafts(found, *guess(found), tmp_path).items():
-        (tmp_path / name).write_text(text)
-    assert np.array_equal(pf.Run.read(tmp_path).command.values["x"], found.run.command.values["x"])
+    assert np.array_equal(written(found, tmp_path)[0].command.values["x"], found.run.command.values["x"])
 
 
 def test_transforms_as_rostopic_writes_them(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import bag_files
 import pumafuse as pf
-from discovery.test_survey import asked, write, written
+from discovery.test_survey import asked, write, written, xyz
 from pumafuse.arrays import FloatArray
 from pumafuse.discovery.survey import Survey, survey
 from pumafuse.logs.axes import in_axes
@@ -41,9 +41,7 @@ def poses(*, late: float = 0.0, seed: int = 0, frame: Rotation | None = None) ->
     rng, frame = np.random.default_rng(seed), frame or Rotation.identity()
     at = frame.inv().apply(places(t - late) + rng.normal(scale=2e-4 * bool(late), size=(len(t), 3)))
     shaken = Rotation.from_rotvec(rng.normal(scale=1e-3 * bool(late), size=(len(t), 3)))
-    return {"t_s": t, **{f"{axis}_m": at[:, k] for k, axis in enumerate("xyz")}}, frame.inv() * shaken * turned(
-        t - late
-    )
+    return {"t_s": t, **xyz(at)}, frame.inv() * shaken * turned(t - late)
 
 
 def quaternion(rotation: Rotation, names: Sequence[str] = NAMES, order: str = "xyzw") -> dict[str, FloatArray]:
@@ -63,7 +61,6 @@ def log(folder: Path, told: dict[str, Any] | None, seen: dict[str, Any] | None, 
 
 
 def both() -> tuple[Rotation, Rotation]:
-    """Commanded and measured orientations."""
     return poses()[1], poses(late=LATE)[1]
 
 
@@ -102,8 +99,7 @@ def test_quaternions_are_known_by_their_names(names: Sequence[str], order: str, 
     check_follows(found, tmp_path / "out")
 
 
-@pytest.mark.parametrize("numbers", ["0123", "1234"])
-@pytest.mark.parametrize("order", ["wxyz", "xyzw"])
+@pytest.mark.parametrize(("numbers", "order"), [("0123", "wxyz"), ("1234", "xyzw")])
 @pytest.mark.parametrize("leads", [True, False])
 def test_motion_tells_the_order_that_no_name_tells(numbers: str, order: str, leads: bool, tmp_path: Path) -> None:
     """Of the commands or of a sensor, where the other one is known."""

@@ -152,7 +152,6 @@ def test_only_the_part_of_the_run_counts_and_runs_are_averaged() -> None:
 
 
 def test_sensors_without_common_motion_have_no_latency() -> None:
-    """Another axis, another name, too few rows, noise alone."""
     run = recorded()
     assert aligned([run], "encoder", "laser") is None
     camera = run.sensors["camera"]

@@ -21,6 +21,7 @@ from pumafuse.logs.run import Source
 from tuning_runs import scenario, with_sensors
 
 REPOSITORY = Path(__file__).parents[2]
+SCENARIOS = sorted((Path(__file__).parents[2] / "scenarios").glob("*.toml"))
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 DATA = Path(pf.__file__).parent / "data"
 LOGS = {
@@ -350,6 +351,20 @@ def test_simulated_logs_give_no_alarm(name: str, seed: int) -> None:
     """Short ones, with outliers, outages, an arm and a latency that are wrong."""
     sim = pf.simulate(scenario(name, 0.1, 0.02), seed)
     assert alarms(sim.run, sim.config) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "scenarios").glob("*.toml")), ids=lambda path: path.stem
+)
+def test_no_scenario_gives_an_alarm(path: Path) -> None:
+    """As they are shipped, with three seeds."""
+    if "[trajectory]" not in path.read_text(encoding="utf-8"):
+        pytest.skip("an arm")
+    for seed in (1, 2, 3):
+        sim = pf.simulate(scenario(name), seed)
+        found = pf.fuse(sim.run, sim.config).notes
+        assert not [one for one in found if one.startswith("sensor '") and "contradicts" not in one]
 
 
 COMMANDS: dict[str, Callable[[FloatArray], FloatArray]] = {

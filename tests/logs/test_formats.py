@@ -17,9 +17,8 @@ from openpyxl import Workbook
 from scipy.io import savemat
 
 import pumafuse as pf
+from discovery.test_survey import written
 from pumafuse.arrays import FloatArray
-from pumafuse.discovery.drafts import drafts
-from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.survey import survey
 from pumafuse.errors import PumafuseError, RunError
 from pumafuse.logs import formats, tables
@@ -41,7 +40,6 @@ TOLD, SEEN = path(TIME), path(LATER - LAG)
 
 
 def npz(folder: Path) -> Path:
-    """Flat arrays of two lengths."""
     arrays = {"command_t": TIME, "command_rad": TOLD, "encoder_t": LATER, "encoder_rad": SEEN}
     np.savez(folder / "log.npz", **arrays)
     return folder / "log.npz"
@@ -56,7 +54,6 @@ def mat(folder: Path) -> Path:
 
 
 def records(folder: Path) -> Path:
-    """Records of JSON by source."""
     whole = {
         name: [{"t": t, "joint": {"a_rad": a, "b_rad": b}} for t, (a, b) in zip(time, values.tolist(), strict=True)]
         for name, time, values in (("command", TIME, TOLD), ("encoder", LATER, SEEN))
@@ -66,8 +63,6 @@ def records(folder: Path) -> Path:
 
 
 def columns(folder: Path) -> Path:
-    """Columns of JSON, as pandas writes them, by their rows."""
-
     def of(values: FloatArray) -> dict[str, float]:
         return {str(n): float(value) for n, value in enumerate(values)}
 
@@ -93,7 +88,6 @@ def xlsx(folder: Path) -> Path:
 
 
 def ulg(folder: Path) -> Path:
-    """A log of PX4."""
     topics = {"position_setpoint": ("float[2] joint", TIME, TOLD), "position_measured": ("float[2] joint", LATER, SEEN)}
     return write_ulg(folder / "log.ulg", topics)
 
@@ -110,9 +104,7 @@ def test_a_log_of_several_tables_is_found_and_read_again(write: Callable[[Path],
         assert one.slope == pytest.approx(1.0, abs=0.02)
     (said,), (seen,) = {len(found.run.command.stamp)}, {len(one.stamp) for one in found.run.sensors.values()}
     assert (said, seen) == (len(TIME), len(LATER))
-    for name, text in drafts(found, *guess(found), tmp_path).items():
-        (tmp_path / name).write_text(text)
-    read = pf.Run.read(tmp_path)
+    read, _ = written(found, tmp_path)
     for axis, told in zip(found.run.axes, TOLD.T, strict=True):
         assert np.array_equal(read.command.values[axis], found.run.command.values[axis])
         assert np.allclose(read.command.values[axis], told, atol=1e-6)
@@ -201,7 +193,6 @@ def test_what_cannot_be_read_says_how_to_convert_it(tmp_path: Path, monkeypatch:
 
 
 def test_a_file_is_read_again_when_it_was_written_again(tmp_path: Path) -> None:
-    """What was read last is kept, but not beyond a change of the file."""
     assert len(formats.names(npz(tmp_path))) == 2
     np.savez(tmp_path / "log.npz", time_s=TIME)
     assert formats.names(tmp_path / "log.npz") == [""]

@@ -197,7 +197,6 @@ def test_tangential_and_radial_need_both_x_and_y_vertical_needs_neither() -> Non
 
 
 def test_commands_in_x_y_z_without_a_frame_are_refused_with_what_is_missing() -> None:
-    """One line that names the file and says to give [frame]."""
     run = pf.Run.from_arrays(stamps(2), {"x": X, "y": Y, "z": Z})
     message = refusal(lambda: pf.fuse(run, config()))
     assert message == (

@@ -192,7 +192,6 @@ def test_of_all_rows_of_ticks_the_cheapest_is_found(places: list[float]) -> None
 
 
 def test_more_stamps_than_ticks_about_them_are_no_row() -> None:
-    """13 stamps at one place, which has 12 ticks to choose from."""
     text = refusal(
         lambda: regular_grid(
             np.sort(np.append(grid_of(np.arange(300)), grid_of(np.arange(50, 51)) + np.arange(1, 13))), PERIOD, "host"

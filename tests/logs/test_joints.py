@@ -53,7 +53,6 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_joints_that_are_no_pose_are_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    """The line says which joint, column or link."""
     text, words = BAD[case]
     with pytest.raises(pf.PumafuseError, match=words) as error:
         read(tmp_path, text)

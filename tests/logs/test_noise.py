@@ -56,7 +56,6 @@ def test_rows_of_each_noise_are_a_sensor_of_their_own(engine: str) -> None:
 
 
 def written(folder: Path, noise: str, column: np.ndarray) -> Path:
-    """The run as files, with a column of what the camera says of its noise."""
     (folder / "run.toml").write_text(RUN.format(noise))
     np.savetxt(folder / "command.csv", np.column_stack([GIVEN, 1e3 * COMMAND["x"]]), "%.6f", ",", header="t_s,x_mm")
     rows = ["t_s,x_mm,told"]
@@ -98,13 +97,11 @@ def test_it_is_saved_with_the_run(tmp_path: Path) -> None:
     ],
 )
 def test_what_says_too_much_or_too_little_is_refused(noise: str, words: str, tmp_path: Path) -> None:
-    """In one line, which names the key."""
     with pytest.raises(ConfigError, match=words):
         pf.Run.read(written(tmp_path, noise, FACTOR))
 
 
 def test_commands_and_references_have_none(tmp_path: Path) -> None:
-    """Only rows of sensors are weighed."""
     folder = written(tmp_path, "{ sd = 'told', typical = 1.0 }", FACTOR)
     text = (folder / "run.toml").read_text()
     (folder / "run.toml").write_text(text.replace('x = "x_mm"', 'x = "x_mm"\nnoise = { sd = "t_s", typical = 1 }', 1))
@@ -113,7 +110,6 @@ def test_commands_and_references_have_none(tmp_path: Path) -> None:
 
 
 def test_arrays_of_no_positive_numbers_are_refused() -> None:
-    """As they are by what noise is scaled."""
     with pytest.raises(RunError, match="only rows of sensors"):
         pf.Run.from_arrays(GIVEN, COMMAND | {"noise": np.ones(len(GIVEN))})
     with pytest.raises(RunError, match="noise is by what"):

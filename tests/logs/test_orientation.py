@@ -87,7 +87,6 @@ def test_a_run_is_told_relative_to_the_orientation_that_is_given(tmp_path: Path)
 
 
 def test_a_sensor_that_lost_its_target_has_no_orientation_in_these_rows(tmp_path: Path) -> None:
-    """It writes zeros, which are no quaternion."""
     lost = QUATERNION.copy()
     lost[10:20] = 0.0
     run, _ = in_axes(read(tmp_path, columns("qx qy qz qw", lost), FORMS["xyzw"][1]), None)
@@ -130,7 +129,6 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_an_orientation_that_says_too_much_or_too_little_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    """The line names the key and what is accepted."""
     orientation, words = BAD[case]
     with pytest.raises(pf.PumafuseError, match=words) as error:
         read(tmp_path, FORMS["xyzw"][0], orientation)
@@ -144,7 +142,6 @@ def test_columns_that_are_no_orientation_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_axis_of_its_own_beside_an_orientation_is_refused(tmp_path: Path) -> None:
-    """The axis rx cannot be both a column and a part of the orientation."""
     table = FORMS["xyzw"][0] | {"rx_deg": np.zeros(len(TIME))}
     with pytest.raises(pf.ConfigError, match="the orientation has rx"):
         read(tmp_path, table, FORMS["xyzw"][1], 'rx = "rx_deg"\n')

@@ -129,14 +129,12 @@ MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("case", MANIFEST_REFUSALS)
 def test_a_wrong_manifest_is_refused_in_one_line(folder: Path, case: str) -> None:
-    """Wrong keys, types and names are one line with the file, the key and what would be accepted."""
     manifest, named = MANIFEST_REFUSALS[case]
     text = refusal(lambda: read(folder, manifest))
     assert all(words in text for words in named), text
 
 
 def test_a_path_without_a_run_is_refused(tmp_path: Path) -> None:
-    """Nothing there, and a folder without run.toml."""
     for name in ("absent", "absent.toml", "absent.csv", ""):
         assert "no such file" in refusal(lambda name=name: Run.read(tmp_path / name))
 
@@ -171,14 +169,12 @@ def test_a_single_table_holds_every_source(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_single_table_is_refused_in_one_line(tmp_path: Path, header: str, named: tuple[str, ...]) -> None:
-    """A table without its time, commands or a unit, with an axis twice or not commanded: one line, with names."""
     row = ",".join(["1"] * len(header.split(",")))
     text = refusal(lambda: single(tmp_path, f"{header}\n{row}\n"))
     assert all(words in text for words in named), text
 
 
 def test_arrays_are_copied() -> None:
-    """What the caller does to its arrays afterwards does not reach the run."""
     time, value = np.array([0, 28_000_000]), np.array([1.0, 2.0])
     command, start = {"radial": value}, {"radial": 0.5}
     run = Run.from_arrays(time, command, {"tracker": (time, {"radial": value})}, (time, {"radial": value}), start=start)
@@ -259,7 +255,6 @@ ARRAY_REFUSALS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
 
 @pytest.mark.parametrize("case", ARRAY_REFUSALS)
 def test_arrays_that_do_not_fit_are_refused(case: str) -> None:
-    """Lengths that differ, sources that say nothing and stamps beyond reach: one line that names the source."""
     more, named = ARRAY_REFUSALS[case]
     text = refusal(lambda: Run.from_arrays(**{"time": [0.0, 1.0], "command": {"radial": [0.0, 1.0]}, **more}))
     assert all(words in text for words in named), text

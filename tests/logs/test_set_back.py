@@ -79,7 +79,6 @@ def test_sensors_that_do_not_sample_evenly_go_on_too(seed: int) -> None:
 
 
 def test_several_steps_go_on() -> None:
-    """Each is said."""
     run, right = logged({5.0: 0.4, 9.0: 0.2, 15.0: 0.7}), logged()
     found, notes = going_on(run)
     assert [one.split(" by ")[1][:5] for one in notes] == ["0.400", "0.200", "0.700"]
@@ -88,7 +87,6 @@ def test_several_steps_go_on() -> None:
 
 @pytest.mark.parametrize("back", [0.06, 0.3, 0.9])
 def test_one_sensor_alone_is_named_and_left(back: float) -> None:
-    """Who knows when it was right."""
     run = logged({8.0: back}, only="tracker")
     found, (note,) = going_on(run)
     assert found is run
@@ -96,7 +94,6 @@ def test_one_sensor_alone_is_named_and_left(back: float) -> None:
 
 
 def test_commands_alone_are_not_all() -> None:
-    """The sensors go on: nothing is moved."""
     run = logged({8.0: 0.3}, only="command")
     assert going_on(run)[0] is run
 
@@ -154,7 +151,6 @@ def test_a_long_run_is_to_be_cut_there(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_rows_without_a_stamp_are_skipped() -> None:
-    """They stay without one."""
     run, right = logged({8.0: 0.3}), logged()
     stamp = run.command.stamp.copy()
     stamp[[100, 290, 500]] = np.iinfo(np.int64).min

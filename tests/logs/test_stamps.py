@@ -28,7 +28,6 @@ def test_clocks_that_begin_anew_go_on(unit: int, count: int, words: str, epoch: 
 
 @pytest.mark.parametrize("way", [-1, 1])
 def test_one_step_of_an_hour_goes_on(way: int) -> None:
-    """A clock that is set by an hour goes on; its row is named."""
     hour = 3_600_000_000_000
     found, notes = going_on(EVEN + way * hour * (np.arange(3000) >= 1234), "log: t")
     assert (found == EVEN).all()
@@ -45,7 +44,6 @@ def test_other_steps_stay(step: int) -> None:
 
 
 def test_hourly_pauses_stay() -> None:
-    """Two steps of an hour are no daylight saving."""
     stamp = EVEN + 3_600_000_000_000 * (np.arange(3000) // 1000)
     assert (going_on(stamp, "log: t")[0] == stamp).all()
 

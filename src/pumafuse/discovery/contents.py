@@ -94,53 +94,32 @@ _STREAM_NS = 250_000_000  # between trajectories of one point, up to which they 
 
 @dataclass(frozen=True)
 class Clock:
-    """The stamps of a part.
-
-    Attributes:
-        time: Where they are.
-        basis: How the unit is known, in words.
-        stamp: Int64 ns, (rows,).
-        notes: What was wrong with them, a sentence each.
-        doubt: What may be wrong with them, as a question; empty: nothing.
-    """
+    """The stamps of a part."""
 
     time: Time
-    basis: str
-    stamp: TimeArray
-    notes: tuple[str, ...] = ()
-    doubt: str = ""
+    basis: str  # how the unit is known, in words
+    stamp: TimeArray  # int64 ns, (rows,)
+    notes: tuple[str, ...] = ()  # what was wrong with them, a sentence each
+    doubt: str = ""  # what may be wrong with them, as a question; empty: nothing
 
     @staticmethod
     def of(table: Table, time: Time, basis: str, doubt: str = "") -> Clock:
-        """The clock of a table.
-
-        Raises:
-            RunError: It has no such stamps.
-        """
+        """The clock of a table."""
         stamp, notes = time.stamps(table)
         return Clock(time, basis, stamp, tuple(notes), doubt)
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A column of positions.
+    """A column of positions."""
 
-    Attributes:
-        column: Its name or field path.
-        axis: What it seems to be called.
-        unit: ``mm``, ``rad``, …
-        basis: How the unit is known: ``name``, ``type``, ``turn``, or ``range``, which is a guess.
-        plain: Its numbers in that unit, (rows,).
-        turns: Whether it is an angle that begins anew after each turn.
-        where: In which of the rows it is this axis, where others are in rows of their own.
-    """
-
-    column: str
-    axis: str
-    unit: str
-    basis: str
-    plain: FloatArray
-    turns: bool = False
+    column: str  # its name or field path
+    axis: str  # what it seems to be called
+    unit: str  # 'mm', 'rad', …
+    basis: str  # how the unit is known: 'name', 'type', 'turn', or 'range', which is a guess
+    plain: FloatArray  # its numbers in that unit, (rows,)
+    turns: bool = False  # whether it is an angle that begins anew after each turn
+    # in which of the rows it is this axis, where others are in rows of their own
     where: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     @property
@@ -157,33 +136,20 @@ class Signal:
 
 @dataclass(frozen=True)
 class Part:
-    """A table of a log: a file, a topic or an entity.
-
-    Attributes:
-        file: Where it is.
-        topic: Which topic of it.
-        entity: Which entity of it.
-        where: Which of its rows.
-        type: Of its messages; empty of a table.
-        rows: How many.
-        clock: Its stamps; None: none was found.
-        signals: Its columns of positions.
-        left_out: Its other columns of numbers, and why they are none.
-        notes: What is to be said of it.
-        attitudes: Its orientations, each beside x, y, z of the same source.
-    """
+    """A table of a log: a file, a topic or an entity."""
 
     file: Path
-    topic: str = ""
-    entity: str = ""
-    where: Mapping[str, Any] = field(default_factory=dict[str, Any])
-    type: str = ""
+    topic: str = ""  # which topic of it
+    entity: str = ""  # which entity of it
+    where: Mapping[str, Any] = field(default_factory=dict[str, Any])  # which of its rows
+    type: str = ""  # of its messages; empty of a table
     rows: int = 0
-    clock: Clock | None = None
-    signals: tuple[Signal, ...] = ()
+    clock: Clock | None = None  # its stamps; None: none was found
+    signals: tuple[Signal, ...] = ()  # its columns of positions
+    # its other columns of numbers, and why they are none
     left_out: Mapping[str, str] = field(default_factory=dict[str, str])
-    notes: tuple[str, ...] = ()
-    attitudes: tuple[Attitude, ...] = ()
+    notes: tuple[str, ...] = ()  # what is to be said of it
+    attitudes: tuple[Attitude, ...] = ()  # its orientations, each beside x, y, z of the same source
 
     @property
     def label(self) -> str:
@@ -198,15 +164,7 @@ class Part:
 
 
 def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
-    """What a log has: a table, a recording, or a folder of them.
-
-    Args:
-        log: The file or folder.
-        rate: How often rows, or frames, come in tables without stamps [Hz]; 0: not known.
-
-    Raises:
-        RunError: There is nothing that can be read.
-    """
+    """What a log has: a table, a recording, or a folder of them; ``rate`` is that of rows without stamps [Hz], or 0."""
     found: list[Part] = []
     for path in _files(log):
         if path.suffix in _TEXTS and path != log:
@@ -259,7 +217,6 @@ def _files(log: Path) -> list[Path]:
 
 
 def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
-    """A part with its clock and its columns, from its table."""
     signals, left_out, times, paths = list[Signal](), dict[str, str](), list[str](), list(_numeric_paths(table))
     joints, counts = _joints(table, paths), {name for name in table.columns if _counts(table, name) is not None}
     rows = _axes_in_rows(table)
@@ -317,7 +274,6 @@ def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
 
 
 def _likeliest(columns: Sequence[str]) -> list[str]:
-    """Those of many columns that are read."""
     return list(columns) if len(columns) <= _MOST_READ else names.likeliest_first(columns)[:_MOST_READ]
 
 
@@ -571,11 +527,7 @@ def _stamp_columns(table: Table) -> Iterator[str]:
 def _clock_of(table: Table, name: str, stroke: float, span: float = 0.0) -> Clock | None:
     """The stamps of a column; None if they do not run like those of a clock.
 
-    Args:
-        table: The table.
-        name: The column.
-        stroke: How many rows a motion takes, see :func:`_stroke`.
-        span: How long another clock says that the table lasts [s]; 0: unknown.
+    A motion takes ``stroke`` rows; another clock says that the table lasts ``span`` [s], 0: none does.
     """
     doubt = ""
     try:
@@ -611,10 +563,7 @@ def _runs(stamp: TimeArray) -> bool:
 
 
 def _nameless_clock(table: Table, stroke: float) -> Clock | None:
-    """The first column, which is called after no clock, if its numbers rise, but do not count rows.
-
-    Where they are of whole seconds and the second column may be the nanoseconds, both: ``ros2 topic echo --csv``.
-    """
+    """The first column, which is called after no clock, if its numbers rise, but do not count rows."""
     first, *others = table.columns
     try:
         numbers = table.plain(first)[0]
@@ -668,11 +617,7 @@ def _no_clock(table: Table, name: str) -> str:
 
 
 def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str, str]:
-    """The unit of stamps, by what it is known, and a question where that may be wrong.
-
-    By what date they would be, or else by how long another clock says that it all takes, or by the time between rows.
-    Where rows would be as far apart as a robot's hardly are, the motion has to be one of a robot, too.
-    """
+    """The unit of stamps, by what it is known, and a question where that may be wrong."""
     known = values[np.isfinite(values)]
     if len(known) < 2:
         return "s", "default", ""

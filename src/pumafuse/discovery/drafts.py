@@ -28,26 +28,13 @@ _COMMENT = 48  # column at which comments begin
 
 
 def drafts(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess], folder: Path) -> dict[str, str]:
-    """The three files by name.
-
-    Args:
-        found: What was found in the log.
-        arm: To begin with, from :func:`.guesses.guess`.
-        sensors: Likewise.
-        folder: Where they will be: files of the log are named from there.
-    """
+    """The three files by name, with the files of the log named from the folder where they will be."""
     made = _run_toml(found, arm, folder), _arm_toml(found, arm), _fusion_toml(found, arm, sensors)
     return dict(zip(FILES, made, strict=True))
 
 
 def sketch(name: str, undecided: UndecidedError, folder: Path) -> str:
-    """``run.toml`` of a log that does not say who is who: what is in it, in comments that its owner sorts.
-
-    Args:
-        name: Of the log.
-        undecided: What is in it, and what of it is known.
-        folder: Where the file will be.
-    """
+    """``run.toml`` of a log that does not say who is who: what is in it, in comments that its owner sorts."""
     lines = ["# What is in the log. Lines that begin with # are not used: take the # from those that are meant."]
     if undecided.roles is not None:
         told = _source(["command"], undecided.roles.command, folder)
@@ -118,12 +105,10 @@ def _unused(roles: Roles, folder: Path) -> Iterator[str]:
 
 
 def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
-    """The table of a source."""
     return [*_place(table, stream, folder), *_columns(stream)]
 
 
 def _place(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
-    """Where a source is, and its stamps."""
     part, clock = stream.part, stream.part.clock
     assert clock is not None
     lines = ["", _line(_header(table), printable(stream.why, 200)), _line(_pair("file", _from(folder, part.file)))]
@@ -137,7 +122,6 @@ def _place(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
 
 
 def _columns(stream: Stream) -> list[str]:
-    """The axes of a source, and its orientation."""
     lines = list[str]()
     pose = _pose(stream)
     if pose and stream.attitude:
@@ -252,7 +236,6 @@ def _fusion_toml(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess
 
 
 def _by_kind(key: str, values: Mapping[str, float], arm: ArmGuess, comment: str) -> Iterable[str]:
-    """A key for the axes of each kind, with a number for each axis."""
     for kind, screen in SCREEN.items():
         mine = {axis: _digits(value * screen.scale) for axis, value in values.items() if arm.axes[axis].kind == kind}
         if mine:
@@ -265,7 +248,6 @@ def _digits(value: float, digits: int = 2) -> float:
 
 
 def _from(folder: Path, file: Path) -> str:
-    """A file as it is named in a folder."""
     try:
         return Path(os.path.relpath(file.absolute(), folder.absolute())).as_posix()
     except ValueError:  # on another drive

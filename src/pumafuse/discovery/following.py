@@ -30,36 +30,20 @@ _MIRRORED = 0.1  # a negative correlation must be stronger by this than any posi
 
 @dataclass(frozen=True)
 class Following:
-    """How one signal follows another.
+    """How one signal follows another."""
 
-    Attributes:
-        lag: How late it is behind the path through the other's points [s].
-        correlation: Of their changes at that lag, outliers apart.
-        slope: By how much it moves when the other moves by 1.
-        offset: How far its level is from slope ± 1 times the other's [m or rad].
-        scatter: Its noise, roughly, [m or rad].
-        resolution: That of the steps in which its values come.
-        misfit: Standard deviation of what the other, delayed and scaled, leaves of it, outliers apart [m or rad].
-        outliers: The share of its values that jump away from their neighbours.
-    """
-
-    lag: float
-    correlation: float
-    slope: float
-    offset: float
-    scatter: float
-    resolution: float
-    misfit: float
-    outliers: float
+    lag: float  # how late it is behind the path through the other's points [s]
+    correlation: float  # of their changes at that lag, outliers apart
+    slope: float  # by how much it moves when the other moves by 1
+    offset: float  # how far its level is from slope ± 1 times the other's [m or rad]
+    scatter: float  # its noise, roughly, [m or rad]
+    resolution: float  # that of the steps in which its values come
+    misfit: float  # standard deviation of what the other, delayed and scaled, leaves of it, outliers apart [m or rad]
+    outliers: float  # the share of its values that jump away from their neighbours
 
 
 def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, FloatArray]) -> Following | None:
-    """How the second signal follows the first; None where they do not overlap, or one of them stands still.
-
-    Args:
-        leader: Stamps [ns] and values, (n,).
-        follower: Likewise, (m,).
-    """
+    """How the second signal, stamps [ns] and values, follows the first; None without overlap or if one rests."""
     origin = int(leader[0][leader[0] != NO_STAMP].min(initial=2**62))
     (t, u), (s, z) = known(*leader, origin), known(*follower, origin)
     inside = (s > t[0] if len(t) else s > np.inf) & (s < t[-1] if len(t) else False)
@@ -170,10 +154,7 @@ def resolution(value: FloatArray) -> float:
 
 
 def isolated(value: FloatArray) -> BoolArray:
-    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,).
-
-    By the sensor alone: what an arm does that nobody commanded is none, nor is a turn of its motion.
-    """
+    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,)."""
     found = np.zeros(len(value), dtype=np.bool_)
     if len(value) < _FEWEST:
         return found

@@ -33,31 +33,18 @@ _SURELY = 2.0  # half intervals, from which a sensor is earlier than the densest
 
 @dataclass(frozen=True)
 class AxisGuess:
-    """An axis: lag [s] behind the held command, plant, and noise [m or rad].
+    """An axis: lag [s] behind the held command, plant, and noise [m or rad]."""
 
-    Attributes:
-        kind: Whether it is a length or an angle.
-        follows: The sensor from which it is known; empty: none.
-        lag: Behind the held command at constant velocity [s].
-        time_constant: Of the plant [s].
-        gain: How far it moves when the command moves by 1.
-        misfit: What the delayed command leaves.
-        start: Where it starts, if that is not at its first command; None: it is, or nothing tells.
-        offset_sd: For ``[start]``.
-        input_noise: Its density [m/√Hz].
-        drift: Its density [m/√s].
-    """
-
-    kind: Kind
-    follows: str
-    lag: float
-    time_constant: float
-    gain: float
-    misfit: float
-    start: float | None
-    offset_sd: float
-    input_noise: float
-    drift: float
+    kind: Kind  # whether it is a length or an angle
+    follows: str  # the sensor from which it is known; empty: none
+    lag: float  # behind the held command at constant velocity [s]
+    time_constant: float  # of the plant [s]
+    gain: float  # how far it moves when the command moves by 1
+    misfit: float  # what the delayed command leaves
+    start: float | None  # where it starts, if that is not at its first command; None: it is, or nothing tells
+    offset_sd: float  # of [start] in fusion.toml
+    input_noise: float  # its density [m/√Hz]
+    drift: float  # its density [m/√s]
 
 
 @dataclass(frozen=True)
@@ -97,11 +84,7 @@ class SensorGuess:
 
 
 def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
-    """The arm, and each sensor.
-
-    Raises:
-        RunError: There are fewer than two commands.
-    """
+    """The arm, and each sensor."""
     run = found.run
     period = period_of(run.command)
     if math.isnan(period):
@@ -129,10 +112,7 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
 def _against_each_other(
     run: Run, relations: Mapping[tuple[str, str], Following]
 ) -> tuple[str, dict[str, float], dict[str, Pair]]:
-    """The source that is earliest, the reference if there is one; how much later each is [s]; each beside the densest.
-
-    Without sensors that have no motion in common with the one that has the most rows.
-    """
+    """The earliest source, or the reference; how much later each is [s]; each beside the densest."""
     lags: dict[str, list[float]] = {}
     for (name, _), one in relations.items():
         lags.setdefault(name, []).append(one.lag)

@@ -40,17 +40,11 @@ Rows: TypeAlias = tuple[TimeArray, FloatArray]  # stamps [ns] and values
 
 
 class Grid(NamedTuple):
-    """Even bins over a run, and further ones on both sides for shifts.
+    """Even bins over a run, and further ones on both sides for shifts."""
 
-    Attributes:
-        time: The middle of each bin, int64 ns, (n + 2m,).
-        step: Their width [s].
-        margin: m, how many on each side.
-    """
-
-    time: TimeArray
-    step: float
-    margin: int
+    time: TimeArray  # the middle of each bin, int64 ns, (n + 2m,)
+    step: float  # their width [s]
+    margin: int  # m, how many on each side
 
     @staticmethod
     def over(first: int, last: int, period: float) -> Grid:
@@ -81,21 +75,13 @@ class Grid(NamedTuple):
 
 
 class Match(NamedTuple):
-    """What explains the motion that a sensor measures on an axis.
+    """What explains the motion that a sensor measures on an axis."""
 
-    Attributes:
-        axis: The axis whose commands it follows.
-        shift: How late it is [s]; 0 where that is no more than a wrong delay or latency explains.
-        correlation: With the commanded motion then, apart from a constant and a trend.
-        slope: Measured over commanded motion.
-        is_steady: Whether short pieces of the run, each about its mean, tell about the same slope: drifts do not.
-    """
-
-    axis: str
-    shift: float
-    correlation: float
-    slope: float
-    is_steady: bool
+    axis: str  # the axis whose commands it follows
+    shift: float  # how late it is [s]; 0 where that is no more than a wrong delay or latency explains
+    correlation: float  # with the commanded motion then, apart from a constant and a trend
+    slope: float  # measured over commanded motion
+    is_steady: bool  # whether short pieces of the run, each about its mean, tell about the same slope: drifts do not
 
 
 class _Fits(NamedTuple):
@@ -110,12 +96,8 @@ def matches(measured: Mapping[str, FloatArray], led: Mapping[str, FloatArray], g
     """The simplest good explanation of what a sensor measures on each of its axes.
 
     That is the axis's own commands about when they act; or, where that leaves much less unexplained, the commands of
-    another axis, or all axes at another time: a sensor has one clock.
-
-    Args:
-        measured: By axis, the means of :meth:`Grid.mean`, (n,).
-        led: By commanded axis, where the commands lead, at ``grid.time``, (n + 2m,).
-        grid: The bins.
+    another axis, or all axes at another time: a sensor has one clock. ``measured`` are means of :meth:`Grid.mean`,
+    (n,), ``led`` where the commands lead at ``grid.time``, (n + 2m,).
     """
     names, commanded = list(led), np.stack([value - value.mean() for value in led.values()])
     every = np.arange(-grid.margin, grid.margin + 1)
@@ -149,12 +131,8 @@ def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple
     """How late a sensor is whose clock is another one [s]; None where it follows nothing, or about at once.
 
     Both are laid side by side from their own beginnings on and shifted by up to half of the run, and to where their
-    clocks would be one; of shifts that are about as good the one counts that is nearest to none.
-
-    Args:
-        led: Stamps [ns], ascending, and commanded values, by axis, (n,).
-        measured: Likewise of the sensor, of the same axes, (m,).
-        near: From and to what lag [s] it would be on the commands' clock.
+    clocks would be one; of shifts that are about as good the one counts that is nearest to none. Stamps [ns] ascend;
+    ``near`` are the lags [s] on one clock.
     """
     first, begin = (min(int(stamp[0]) for stamp, _ in one.values()) for one in (led, measured))
     until, last = (max(int(stamp[-1]) for stamp, _ in one.values()) for one in (led, measured))
@@ -177,15 +155,7 @@ def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple
 
 
 def slope_of_pieces(measured: FloatArray, led: FloatArray) -> tuple[float, float]:
-    """Slope of measured over commanded motion in short pieces of a run, each about its mean, and its standard error.
-
-    Args:
-        measured: NaN where there is nothing, (n,).
-        led: (n,).
-
-    Returns:
-        Both; 0 and infinity where nothing moves. The error is what the pieces scatter, infinite where few move.
-    """
+    """Slope of measured over commanded motion in short pieces of a run, each about its mean, and its standard error."""
     seen = np.isfinite(measured)
     pieces = zip(*(np.array_split(part[seen], _PIECES) for part in (measured, led)), strict=True)
     centred = [(value - value.mean(), motion - motion.mean()) for value, motion in pieces if len(value)]
@@ -199,10 +169,7 @@ def slope_of_pieces(measured: FloatArray, led: FloatArray) -> tuple[float, float
 
 
 def without_spikes(value: FloatArray) -> BoolArray:
-    """Values that are no single or double outliers, far from the median of the five around them, (n,).
-
-    A motion is none, however fast: where it goes on, each value is that median itself.
-    """
+    """Values that are no single or double outliers, far from the median of the five around them, (n,)."""
     if len(value) < 3:
         return np.ones(len(value), dtype=np.bool_)
     padded = np.concatenate((value[2:0:-1], value, value[-2:-4:-1]))  # reflected
@@ -215,10 +182,7 @@ def without_spikes(value: FloatArray) -> BoolArray:
 
 
 def _fits(measured: FloatArray, led: FloatArray, margin: int) -> _Fits:
-    """The regressions of values, NaN where there is none, (n,), on motions about zero, (A, n + 2m), at −m to m bins.
-
-    They are by sums over the bins that have measurements.
-    """
+    """The regressions of values, NaN where there is none, (n,), on motions about zero, (A, n + 2m), at −m to m bins."""
     seen = np.isfinite(measured)
     count, numbers = np.count_nonzero(seen), np.arange(len(measured))
     trend = np.where(seen, numbers - numbers[seen].mean(), 0.0)
@@ -259,25 +223,15 @@ def _between(unexplained: FloatArray, place: int) -> float:
 
 @dataclass(frozen=True)
 class Tracking:
-    """Up to 500 positions that a sensor measures on an axis, and where the commands lead, relative to the start.
+    """Up to 500 positions that a sensor measures on an axis, and where the commands lead, relative to the start."""
 
-    Attributes:
-        time: Since the first [s], (n,).
-        measured: [m or rad], (n,).
-        led: [m or rad], (n,).
-        before: Where the commands had led shortly before each [m or rad], (n,).
-        noise: Standard deviation of what varies [m or rad].
-        zero_sd: That of the difference of both zeros, by the priors [m or rad].
-        drift: Density of the random walk [m/√s or rad/√s].
-    """
-
-    time: FloatArray
-    measured: FloatArray
-    led: FloatArray
-    before: FloatArray
-    noise: float
-    zero_sd: float
-    drift: float
+    time: FloatArray  # since the first [s], (n,)
+    measured: FloatArray  # [m or rad], (n,)
+    led: FloatArray  # [m or rad], (n,)
+    before: FloatArray  # where the commands had led shortly before each [m or rad], (n,)
+    noise: float  # standard deviation of what varies [m or rad]
+    zero_sd: float  # that of the difference of both zeros, by the priors [m or rad]
+    drift: float  # density of the random walk [m/√s or rad/√s]
 
     @cached_property
     def _near(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

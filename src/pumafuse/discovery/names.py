@@ -185,13 +185,9 @@ def no_position(column: str) -> str | None:
 def family(column: str, columns: Container[str]) -> tuple[str, str, str]:
     """What columns of one source share, whose names have no words of roles: list, copy of a header, desired values.
 
-    Args:
-        column: Its name or field path.
-        columns: The names beside it, without what is before their last point.
-
-    Returns:
-        The list that it is an element of (``state.q``); the number of the copy (``.1``); for desired values beside
-        measured ones, as ``q_d[0]`` beside ``q[0]`` or ``q_d1`` beside ``q1``, the name of these. Each may be empty.
+    The list that it is an element of (``state.q``); the number of the copy (``.1``); for desired values beside measured
+    ones, as ``q_d[0]`` beside ``q[0]`` or ``q_d1`` beside ``q1``, the name of these. Each may be empty. ``columns`` are
+    the names beside it, without what is before their last point.
     """
     base, _, number = column.rpartition(".")
     copy = f".{number}" if number.isdigit() and last(base) in columns else ""
@@ -223,12 +219,7 @@ def is_turning(axis: str) -> bool:
 
 
 def axis_of(column: str, labels: list[str]) -> str:
-    """What a column's axis is called: the words of its name that say nothing else.
-
-    Args:
-        column: Its name, or a field path.
-        labels: What the elements of lists are, where the log says so.
-    """
+    """What a column's axis is called: the words of its name that say nothing else; ``labels`` are of lists."""
     column = re.sub(r"(?<=\])\.\d+$", "", column)  # a copy of a header
     label = None if unit_of(column) else re.search(r"\[([^\]]*)\]$", column)
     if label and label[1].isdigit():

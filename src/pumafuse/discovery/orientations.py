@@ -46,23 +46,15 @@ _UR = re.compile(r"(?i)tcp_?pose[_\[]$")  # x, y, z in m and a rotation vector i
 
 @dataclass(frozen=True)
 class Attitude:
-    """Columns of an orientation.
+    """Columns of an orientation."""
 
-    Attributes:
-        columns: As ``run.toml`` has them.
-        quaternion: x, y, z, w, NaN in rows that have none, (rows, 4).
-        basis: How it is known what they are.
-        place: Which axes the columns beside them are, where its own names say it.
-        place_unit: Of these; empty: their names say it.
-        doubt: What may be wrong, as a question; empty: nothing.
-    """
-
-    columns: Orientation
-    quaternion: FloatArray
-    basis: str
+    columns: Orientation  # as 'run.toml' has them
+    quaternion: FloatArray  # x, y, z, w, NaN in rows that have none, (rows, 4)
+    basis: str  # how it is known what they are
+    # which axes the columns beside them are, where its own names say it
     place: Mapping[str, str] = field(default_factory=dict[str, str])
-    place_unit: str = ""
-    doubt: str = ""
+    place_unit: str = ""  # of these; empty: their names say it
+    doubt: str = ""  # what may be wrong, as a question; empty: nothing
 
     @property
     def role_words(self) -> list[str]:
@@ -204,15 +196,7 @@ def _of_angles(table: Table, columns: tuple[str, str, str], convention: str) -> 
 
 
 def in_order(attitude: Attitude, stamp: TimeArray, other: Attitude, other_stamp: TimeArray, *, leads: bool) -> Attitude:
-    """An orientation whose order is open in the order in which it turns with another one, where that tells.
-
-    Args:
-        attitude: Whose order is open.
-        stamp: Of its rows.
-        other: What is known.
-        other_stamp: Of its rows.
-        leads: Whether the first is commanded, and the other follows.
-    """
+    """An orientation whose order is open in the order in which it turns with another one, where that tells."""
     both, known = [attitude, attitude.exchanged()], (other_stamp, other.quaternion)
     pairs = [((stamp, one.quaternion), known) for one in both]
     shares = [_turning_alike(*(pair if leads else pair[::-1])) for pair in pairs]

@@ -28,17 +28,11 @@ _FEWEST = 20  # rows
 
 @dataclass(frozen=True)
 class OwnFrame:
-    """Why a sensor seems to stand in a frame of its own.
+    """Why a sensor seems to stand in a frame of its own."""
 
-    Attributes:
-        speeds: How its speed follows the commanded one.
-        least: The correlation of the axis that follows worst.
-        angle: By how much it is turned [rad]; NaN of a mirrored frame.
-    """
-
-    speeds: Following
-    least: float
-    angle: float
+    speeds: Following  # how its speed follows the commanded one
+    least: float  # the correlation of the axis that follows worst
+    angle: float  # by how much it is turned [rad]; NaN of a mirrored frame
 
     @property
     def words(self) -> str:
@@ -57,10 +51,7 @@ def own_frames(run: Run) -> dict[str, OwnFrame]:
 
 
 def speeds_follow(command: Source, source: Source) -> Following | None:
-    """How the speed of a sensor follows the commanded one, of its place or of its turning, whichever does so better.
-
-    None where one of them is in other axes, or stands still.
-    """
+    """How the speed of a sensor follows the commanded one, of its place or of its turning, whichever does so better."""
     axes = _axes(command, source)
     if len(axes) < 2:
         return None

@@ -36,10 +36,7 @@ def _placed(knots: FloatArray, coefficients: FloatArray) -> FloatArray:
 
 
 def _responses(t: FloatArray, u: FloatArray, knots: FloatArray) -> Basis:
-    """Responses to held commands that make up that of any linear arm: those to integrated hats.
-
-    They are a function of instants [s], (m,), which gives (m, k) of knots of the impulse response [s], (k + 2,).
-    """
+    """Responses to held commands that make up that of any linear arm: those to integrated hats."""
     from scipy.interpolate import PPoly
 
     held = np.concatenate([u[:1], u]) - u.mean()
@@ -65,10 +62,7 @@ class Shrunk:
 
 
 class Products(NamedTuple):
-    """Products of columns without means, (k, k), of these with what they are to explain, (k,), and its square.
-
-    Of how many rows they are, too.
-    """
+    """Products of columns without means, (k, k), of these with what they are to explain, (k,), and its square."""
 
     square: FloatArray
     score: FloatArray
@@ -96,19 +90,12 @@ def shrunk(products: Products, penalty: float | None = None) -> Shrunk:
 
 @dataclass(frozen=True)
 class Residue:
-    """What the commands leave of a path: a spline whose knots are as far apart as cross-validation says, or nothing.
+    """What the commands leave of a path: a spline whose knots are as far apart as cross-validation says, or nothing."""
 
-    Attributes:
-        spline: The spline; None: 0.
-        begin: Where it begins [s].
-        end: Where it ends [s].
-        freedom: Its degrees of freedom.
-    """
-
-    spline: Callable[[FloatArray], FloatArray] | None = None
-    begin: float = 0.0
-    end: float = 0.0
-    freedom: float = 0.0
+    spline: Callable[[FloatArray], FloatArray] | None = None  # None: 0
+    begin: float = 0.0  # where it begins [s]
+    end: float = 0.0  # where it ends [s]
+    freedom: float = 0.0  # its degrees of freedom
 
     def __call__(self, at: FloatArray) -> FloatArray:
         """Its value at instants [s], (n,)."""
@@ -120,13 +107,7 @@ class Residue:
 
 
 def residue(s: FloatArray, rest: FloatArray, freedom: float) -> Residue:
-    """The residue of rows.
-
-    Args:
-        s: Their instants [s], ascending, (n,).
-        rest: What the commands leave of them, (n,).
-        freedom: Degrees of freedom that were fitted to them before.
-    """
+    """The residue of what the commands leave at ascending instants [s], after a fit with some degrees of freedom."""
     from scipy.interpolate import make_lsq_spline
 
     def error(left: FloatArray, used: float) -> float:
@@ -150,21 +131,13 @@ def interpolated(s: FloatArray, rest: FloatArray) -> Residue:
 
 @dataclass(frozen=True)
 class Path:
-    """The path of an axis by one sensor.
+    """The path of an axis by one sensor."""
 
-    Attributes:
-        basis: Of the responses to the commands.
-        coefficients: Of these.
-        level: Its constant [m or rad].
-        residue: What the commands leave.
-        sd: Noise of the sensor [m or rad].
-    """
-
-    basis: Basis
-    coefficients: FloatArray
-    level: float
-    residue: Residue
-    sd: float
+    basis: Basis  # of the responses to the commands
+    coefficients: FloatArray  # of these
+    level: float  # its constant [m or rad]
+    residue: Residue  # what the commands leave
+    sd: float  # noise of the sensor [m or rad]
 
     def __call__(self, at: FloatArray) -> FloatArray:
         """Positions at instants [s], (n,) [m or rad]."""
@@ -172,14 +145,7 @@ class Path:
 
 
 def path(command: tuple[FloatArray, FloatArray], lag: float, s: FloatArray, z: FloatArray) -> Path:
-    """The path by the rows of a sensor.
-
-    Args:
-        command: Instants [s], ascending, (n,), and commands [m or rad], (n,).
-        lag: How late the sensor follows, roughly [s].
-        s: Its instants [s], ascending, (m,).
-        z: Its positions [m or rad], (m,).
-    """
+    """The path by the rows of a sensor, which follows roughly ``lag`` [s] late; instants [s] ascend."""
     knots = _KNOTS + lag - _BEFORE - min(max(lag, _SHORT), _LONG)
     basis, found, rest = _explained(command, knots, s, z)
     for _ in range(_PLACED):

@@ -128,5 +128,4 @@ def _reach(source: Source, axis: str) -> float:
 
 
 def _sure(doubtful: list[str], else_: str = "a guess") -> str:
-    """How surely something is known."""
     return f"{else_}: {', '.join(map(printable, dict.fromkeys(doubtful)))}" if doubtful else "sure"

@@ -49,23 +49,14 @@ _Group: TypeAlias = tuple[str, str, str, bool]  # words of roles, list, copy, wh
 
 @dataclass(frozen=True)
 class Stream:
-    """A source of the run to be: columns of a part that belong together.
-
-    Attributes:
-        name: What it is called.
-        role: What it is; None: its names do not say.
-        why: How that is known.
-        part: Where it is.
-        axes: For each axis its columns, which are added up.
-        attitude: Its orientation, if it tells one.
-    """
+    """A source of the run to be: columns of a part that belong together."""
 
     name: str
-    role: Role | None
-    why: str
+    role: Role | None  # what it is; None: its names do not say
+    why: str  # how that is known
     part: Part
-    axes: Mapping[str, Sequence[Signal]]
-    attitude: Attitude | None = None
+    axes: Mapping[str, Sequence[Signal]]  # for each axis its columns, which are added up
+    attitude: Attitude | None = None  # its orientation, if it tells one
 
     @property
     def source(self) -> Source:
@@ -95,12 +86,7 @@ class Stream:
 
 
 class UndecidedError(RunError):
-    """A log does not say what is commanded, or what measures.
-
-    Attributes:
-        parts: What is in it.
-        roles: Who is who, as far as it is known; None: nothing tells which numbers are the commands.
-    """
+    """A log with these parts does not say what is commanded, or what measures; roles as far as they are known."""
 
     def __init__(self, log: str, why: str, parts: Sequence[Part], roles: Roles | None = None) -> None:
         super().__init__(f"{log}: {why}")
@@ -109,19 +95,12 @@ class UndecidedError(RunError):
 
 @dataclass(frozen=True)
 class Roles:
-    """Who is who.
-
-    Attributes:
-        command: The commands.
-        sensors: The sensors.
-        reference: The reference, if there is one.
-        left_out: What is none of them, or not for these axes, and why.
-    """
+    """Who is who."""
 
     command: Stream
     sensors: Sequence[Stream]
     reference: Stream | None
-    left_out: Sequence[tuple[Stream, str]]
+    left_out: Sequence[tuple[Stream, str]]  # what is none of them, or not for these axes, and why
 
     @property
     def measured(self) -> dict[str, Stream]:
@@ -160,12 +139,7 @@ class Roles:
 
 
 def roles_of(parts: Iterable[Part], log: str) -> Roles:
-    """Who is who among the parts of a log.
-
-    Raises:
-        UndecidedError: There are no positions, or none that can be commands.
-        RunError: Nothing has a clock.
-    """
+    """Who is who among the parts of a log."""
     parts = list(parts)
     streams = [stream for part in parts for stream in streams_of(part)]
     if not streams:
@@ -232,10 +206,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
 
 
 def _in_order(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
-    """The commands and what follows them, with quaternions in the order in which both turn alike.
-
-    Without a commanded orientation that no rotation vector can follow: the reason is added to ``left_out``.
-    """
+    """The commands and what follows them, with quaternions in the order in which both turn alike."""
     command, *others = streams
     known = next((one for one in others if one.attitude and not one.attitude.is_open), None)
     if command.attitude and command.attitude.is_open and known is not None:
@@ -511,10 +482,7 @@ def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
 
 
 def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]:
-    """How many axes of others run behind a stream, each as far as its motion is the same; and by how much, in all [s].
-
-    Of one in a frame of its own the speed does.
-    """
+    """How many axes of others run behind a stream, each as far as its motion is the same; by how much, in all [s]."""
     count = late = 0.0
     for other in streams:
         if other is not leader and other.role != "command":
@@ -529,12 +497,7 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]
 
 
 def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
-    """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not.
-
-    Positions do on most axes, later, and all with one gain; torques and currents do not. Of those that are called as
-    the commands are without a word of these, ``q`` beside ``q_cmd``, an axis is enough: joints may rest. In a frame of
-    its own its speed does.
-    """
+    """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not."""
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
     found = _relations(command, stream)
@@ -593,7 +556,6 @@ def _relation(leader: Stream, axis: str, follower: Stream, other: str) -> Follow
 
 
 def _relations(leader: Stream, follower: Stream) -> list[Following]:
-    """How the axes of a stream follow those of another of the same names."""
     shared = [axis for axis in follower.axes if axis in leader.axes]
     return [found for axis in shared if (found := _relation(leader, axis, follower, axis)) is not None]
 
@@ -642,10 +604,7 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
 
 
 def _with_units(roles: Roles) -> Roles:
-    """Units that are guesses made to fit, one of a kind for each source, by the axes that somebody measures.
-
-    The commands' to sources whose units are known, else by their range; then all others' to those.
-    """
+    """Units that are guesses made to fit, one of a kind for each source, by the axes that somebody measures."""
     command, reference = _angles_by_name(roles), roles.reference
     others = [one for one in (reference, *reversed(roles.sensors)) if one is not None]
     sure = [one for one in others if not one.guessed]

@@ -73,27 +73,16 @@ class Step:
 
 @dataclass(frozen=True)
 class Alignment:
-    """How much later a sensor tells the same motion than another.
+    """How much later a sensor tells the same motion than another."""
 
-    Attributes:
-        latency: By how much [s]; where it steps, that of the longest part.
-        latency_ci95: Its 95 % interval; where it steps, of all parts.
-        scale: How far it moves where the other moves by 1; ± 1 where that may be, or axes do not agree.
-        scale_ci95: The interval of the factor that was fitted; None where axes do not agree.
-        sd: Its noise on each axis at rest [m or rad].
-        latency_sd: Standard deviation of the latency from row to row [s]; 0: not seen to.
-        bunched: Whether its rows arrive in bunches.
-        steps: Where the latency steps.
-    """
-
-    latency: float
-    latency_ci95: tuple[float, float]
-    scale: float
-    scale_ci95: tuple[float, float] | None
-    sd: dict[str, float]
-    latency_sd: float
-    bunched: bool
-    steps: Sequence[Step] = ()
+    latency: float  # by how much [s]; where it steps, that of the longest part
+    latency_ci95: tuple[float, float]  # its 95 % interval; where it steps, of all parts
+    scale: float  # how far it moves where the other moves by 1; ± 1 where that may be, or axes do not agree
+    scale_ci95: tuple[float, float] | None  # the interval of the factor that was fitted; None where axes do not agree
+    sd: dict[str, float]  # its noise on each axis at rest [m or rad]
+    latency_sd: float  # standard deviation of the latency from row to row [s]; 0: not seen to
+    bunched: bool  # whether its rows arrive in bunches
+    steps: Sequence[Step] = ()  # where the latency steps
 
     @property
     def half(self) -> float:
@@ -134,13 +123,7 @@ class Alignment:
 
 
 def aligned(runs: Sequence[Run], first: str, second: str) -> Alignment | None:
-    """How much later the second sensor is than the first; None where they see no common motion.
-
-    Args:
-        runs: Recorded runs.
-        first: Name of a sensor, or ``reference``.
-        second: Likewise.
-    """
+    """How much later the second sensor is than the first; None where they see no common motion."""
     found = [one for run in runs if (one := _of_run(run, first, second)) is not None]
     if len(found) < 2:
         return found[0] if found else None
@@ -157,14 +140,7 @@ def aligned(runs: Sequence[Run], first: str, second: str) -> Alignment | None:
 
 
 def noise(command: Source, source: Source, axis: str, lag: float) -> float:
-    """Noise of a sensor beside the path of its axis [m or rad]; infinite where it has too few rows for one.
-
-    Args:
-        command: The commands.
-        source: The sensor.
-        axis: The axis.
-        lag: How late it follows, roughly [s].
-    """
+    """Noise of a sensor beside the path of its axis [m or rad]; infinite where it has too few rows for one."""
     origin = int(command.stamp[command.stamp != NO_STAMP].min(initial=2**62))
     s, z = _thinned(*known(*_clean(source.stamp, source.values[axis]), origin))
     told = known(command.stamp, command.values[axis], origin)
@@ -183,7 +159,6 @@ class _Design(NamedTuple):
 
 
 def _design(basis: Basis, at: FloatArray) -> _Design:
-    """The responses at instants [s], (n,)."""
     responses = basis(at)
     responses -= responses.mean(axis=0)
     slopes = (basis(at + ASIDE) - basis(at - ASIDE)) / (2.0 * ASIDE)

@@ -35,30 +35,23 @@ _STEPS, _FINEST = 10, 1e-3  # of an update period; s
 
 @dataclass(frozen=True)
 class Survey:
-    """What was found in a log.
-
-    Attributes:
-        log: The file or folder.
-        run: The run in it, in the arm's axes, without sensors in frames of their own. Axes rx, ry, rz are in it where
-            a sensor follows how the tool is turned.
-        relations: How each sensor, and ``reference``, follows the commands, by its name and the axis.
-        parts: Its tables or topics; none where it has a ``run.toml``.
-        roles: Who is who; None where a ``run.toml`` says it.
-        manifest: What that ``run.toml`` holds.
-        own_frames: The sensors that seem to stand in frames of their own.
-        interpolation: In which steps the run's commands seem to go on between those of the log [s]; 0: they do not. A
-            ``run.toml`` is taken as it is, all the same.
-        unused: Why a sensor that a ``run.toml`` describes is not used on an axis, by its name and the axis.
-    """
+    """What was found in a log."""
 
     log: Path
+    # the run in it, in the arm's axes, without sensors in frames of their own. Axes rx, ry, rz are in it where a sensor
+    # follows how the tool is turned
     run: Run
+    # how each sensor, and 'reference', follows the commands, by its name and the axis
     relations: Mapping[tuple[str, str], Following]
-    parts: Sequence[Part] = ()
-    roles: Roles | None = None
-    manifest: Mapping[str, Any] | None = None
+    parts: Sequence[Part] = ()  # its tables or topics; none where it has a 'run.toml'
+    roles: Roles | None = None  # who is who; None where a 'run.toml' says it
+    manifest: Mapping[str, Any] | None = None  # what that 'run.toml' holds
+    # the sensors that seem to stand in frames of their own
     own_frames: Mapping[str, OwnFrame] = field(default_factory=dict[str, OwnFrame])
+    # in which steps the run's commands seem to go on between those of the log [s]; 0: they do not. A 'run.toml' is
+    # taken as it is, all the same
     interpolation: float = 0.0
+    # why a sensor that a 'run.toml' describes is not used on an axis, by its name and the axis
     unused: Mapping[tuple[str, str], str] = field(default_factory=dict[tuple[str, str], str])
 
     @property
@@ -75,16 +68,7 @@ def name_of(log: Path) -> str:
 
 
 def survey(log: Path, rate: float = 0.0) -> Survey:
-    """Look at a log of any kind that can be read.
-
-    Args:
-        log: The file or folder.
-        rate: How often rows, or frames, come in tables without stamps [Hz]; 0: not known.
-
-    Raises:
-        PumafuseError: Nothing can be read.
-        UndecidedError: Nothing in it can be commands, or nothing follows them.
-    """
+    """Look at a log of any kind that can be read; ``rate`` is that of rows without stamps [Hz], or 0."""
     described = log if log.name == "run.toml" else log / "run.toml"
     if os.path.isfile(described):  # noqa: PTH113 - Path.is_file raises on a name that is too long
         manifest = tomllib.loads(described.read_text(encoding="utf-8"))
@@ -133,10 +117,7 @@ def _along_axes(run: Run, aside: Collection[str]) -> Run:
 
 
 def _followed(run: Run, related: _Relations) -> tuple[Run, _Relations]:
-    """A run without orientations that do not follow the commanded one, and how the rest of it follows.
-
-    A marker may be turned on the tool. Where no sensor follows the commanded orientation, nobody measures it.
-    """
+    """A run without orientations that do not follow the commanded one, and how the rest of it follows."""
     turned = set[str]()
     for name in run.measured:  # on its axes together, each as far as the tool is told to turn
         turning = [axis for axis in TURNING if (name, axis) in related]

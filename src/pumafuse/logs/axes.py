@@ -20,24 +20,13 @@ FAR_TURN = math.radians(120.0)  # from where on the axes of a rotation vector ar
 
 
 def in_axes(run: Run, frame: Frame | None, tool: tuple[float, float, float] | None = None) -> tuple[Run, Placed | None]:
-    """The run with every source in x, y, z converted into axes; sources that name axes stay as they are.
+    """The run with sources in x, y, z converted into axes, and the placed frame; without a frame as it is, and None.
 
-    Orientations become axes rx, ry, rz where the commands have one, too.
+    Orientations become axes rx, ry, rz where the commands have one, too; ``tool`` is the reference orientation as a
+    rotation vector [rad], None: the mean of the commanded ones. ``frame`` is for runs without one of their own.
 
     Stray stamps are removed first (:func:`pumafuse.logs.clock.without_strays`): the start level and the whole turns,
     which x and y leave open, must not come from them.
-
-    Args:
-        run: The run as logged.
-        frame: The frame to use where the run itself has none.
-        tool: The reference orientation as a rotation vector [rad]; None: the mean of the commanded ones.
-
-    Returns:
-        The run in axes and the placed frame; without a frame the run as it is and None.
-
-    Raises:
-        RunError: A source gives x without y, or names an axis both ways; or the start is not known in x and y; or the
-            tool turns too far.
     """
     run = _turning(without_strays(run), tool)
     frame = frame if run.frame is None else run.frame
@@ -113,11 +102,7 @@ def _placed(run: Run, frame: Frame) -> Placed:
 
 
 def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:
-    """The frame placed at a start level of x and y [m] in the log.
-
-    Raises:
-        RunError: That is on the base's axis, where there is no angle.
-    """
+    """The frame placed at a start level of x and y [m] in the log."""
     if isinstance(frame, Rotated):
         return Placed(frame, 1.0, frame.azimuth)
     dx, dy = x - frame.base[0], y - frame.base[1]

@@ -58,17 +58,11 @@ class Record(NamedTuple):
 
 @dataclass
 class Faults:
-    """What is wrong with a recording.
+    """What is wrong with a recording."""
 
-    Attributes:
-        cut: Whether it was cut off.
-        left_out: How many things of each kind could not be used.
-        first: Of each kind, what was wrong with the first.
-    """
-
-    cut: bool = False
-    left_out: Counter[str] = field(default_factory=Counter[str])
-    first: dict[str, str] = field(default_factory=dict[str, str])
+    cut: bool = False  # whether it was cut off
+    left_out: Counter[str] = field(default_factory=Counter[str])  # how many things of each kind could not be used
+    first: dict[str, str] = field(default_factory=dict[str, str])  # of each kind, what was wrong with the first
 
     def leave_out(self, what: str, error: Exception) -> None:
         """Count something that cannot be used."""
@@ -92,11 +86,7 @@ DAMAGE = (
 
 
 def decoder_of(channel: Channel) -> Decoder:
-    """What decodes the messages of a channel into their fields.
-
-    Raises:
-        ValueError: Nothing here does.
-    """
+    """What decodes the messages of a channel into their fields."""
     match channel.encoding:
         case "cdr" | "ros1":
             return _ros_decoder(channel)
@@ -214,11 +204,7 @@ def plain(value: Any) -> Any:
 
 
 def records_of(path: Path, topic: str | None, faults: Faults, seen: set[Channel]) -> Iterator[Record]:
-    """The messages of a topic, or of all for None, in the order of the file or files; all channels go into ``seen``.
-
-    Raises:
-        RunError: It is no such file or folder.
-    """
+    """The messages of a topic, or of all for None, in the order of the file or files; all channels go into ``seen``."""
     if path.is_dir():
         listed = sorted(path.iterdir())  # metadata.yaml says no more, and is missing where recording was cut off
         parts = [part for part in listed if part.suffix in (".mcap", ".db3")]

@@ -143,18 +143,11 @@ def without_strays(run: Run) -> Run:
 
 
 def segments(run: Run) -> tuple[list[Run], list[str]]:
-    """Cut a run, without its stray stamps, where the commands' clock was set back by more than 1 s.
+    """Cut a run where the commands' clock was set back by more than 1 s: the segments, and a sentence on each jump.
 
     A segment is a run of its own, at rest at its first command. The clocks of the sensors and the reference must have
     been set back as often as that of the commands. A sensor whose clock was set back alone cuts nothing: its rows
     become too late.
-
-    Returns:
-        The segments in order, and a sentence on each jump.
-
-    Raises:
-        RunError: The commands' clock jumped and another source's did not, or it jumps all the time; or it jumped and
-            only a part of the run is to be used.
     """
     run = without_strays(run)
     cuts = _jumps(run.command)
@@ -207,16 +200,7 @@ def _jumps(source: Source) -> list[int]:
 
 
 def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
-    """A sentence on each sensor whose stamps are not of the commands' time.
-
-    Args:
-        run: One segment of a recorded run.
-        period: The arm's update period T [s].
-        sensors: Those that are asked about.
-
-    Raises:
-        RunError: The stamps of a source are in another unit than they are taken to be in.
-    """
+    """A sentence on each of some sensors whose stamps are not of the commands' time; ``period`` is the arm's T [s]."""
     found, label, stamp = list[str](), run.command.label, run.command.stamp
     command = np.sort(stamp[stamp != NO_STAMP], kind="stable")
     first = run.command.series(run.axes[0])[0] if run.command.apart else command
@@ -247,16 +231,10 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
 
 
 def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit", "lost", "other"]] | None:
-    """Whether the interval of commands is far from the update period.
+    """Whether the interval of commands by ascending stamps is far from the update period [s]; None where it is not.
 
-    Args:
-        stamp: Of the commands, ascending, int64 ns, (n,).
-        period: The arm's update period T [s].
-
-    Returns:
-        A sentence that ends in a question, and what it is: stamps in another ``unit``, a steady stream in which most
-        commands are ``lost``, or another interval (who sends only what changes leaves commands out on purpose); None
-        where it is not far.
+    A sentence that ends in a question, and what it is: stamps in another ``unit``, a steady stream in which most
+    commands are ``lost``, or another interval (who sends only what changes leaves commands out on purpose).
     """
     every = np.diff(stamp[:_MANY])  # rows that share a stamp are there, even if only the last one counts
     intervals = every[every > 0]
@@ -278,12 +256,7 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit"
 
 
 def two_senders(stamp: TimeArray, period: float) -> str | None:
-    """A sentence if commands of two senders lie between each other: each sends every update period.
-
-    Args:
-        stamp: Of the commands, ascending, int64 ns, (n,).
-        period: The arm's update period T [s].
-    """
+    """A sentence if commands of two senders lie between each other: each sends every update period [s]."""
     every = np.diff(stamp[:_MANY])
     intervals = every[every > 0]  # rows may share a stamp
     if len(intervals) < _FEW:
@@ -306,11 +279,7 @@ def missing_commands(command: Source, origin: int | None = None) -> str | None:
     """A sentence if commands of a steady stream are missing where they move: many, or for longer than a second.
 
     Short gaps count in mid-motion, long ones if the command jumps: who sends a command only when it changes leaves the
-    others out on purpose.
-
-    Args:
-        command: The commands.
-        origin: Since when times are told [ns]; None: the first command.
+    others out on purpose. Times are told since ``origin`` [ns], or the first command.
     """
     rows = np.flatnonzero(command.stamp != NO_STAMP)
     rows = rows[np.append(True, np.diff(command.stamp[rows]) > 0)[: len(rows)]]
@@ -364,7 +333,6 @@ def _apart(stamp: TimeArray, first: int, last: int) -> list[str]:
 
 
 def _duration(time: int) -> str:
-    """A time [ns] for people."""
     units = {"years": 8766 * _HOUR_NS, "days": 24 * _HOUR_NS, "hours": _HOUR_NS, "s": _TAIL_NS}
     unit = next((name for name, size in units.items() if time >= size), "s")
     return f"{time / units[unit]:.4g} {unit}"

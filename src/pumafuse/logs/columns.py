@@ -71,35 +71,19 @@ _MOST_BYTES = 1 << 30  # of a table
 
 @dataclass(frozen=True)
 class Table:
-    """One table: a file, or a topic of one.
-
-    Attributes:
-        path: Where it was read from.
-        columns: Its columns by name; they may be nested.
-        rows: Number of rows.
-        notes: What was wrong with the file as a whole, a sentence each.
-        names: Names and field paths of all that the file has, also where ``columns`` are only some of it.
-        sentinel_of: Which size in a column stands for "none", where the file has more rows; None: these tell.
-    """
+    """One table: a file, or a topic of one."""
 
     path: Path
-    columns: Columns
+    columns: Columns  # by name; they may be nested
     rows: int
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what was wrong with the file as a whole, a sentence each
+    # names and field paths of all that the file has, also where 'columns' are only some of it
     names: tuple[str, ...] = ()
+    # which size in a column stands for "none", where the file has more rows; None: these tell
     sentinel_of: Callable[[str], float | None] | None = None
 
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
-        """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels.
-
-        Args:
-            name: The column, or a field path.
-            unit: The ending of its unit (``_mm``); empty: what the name ends in.
-
-        Raises:
-            RunError: The column is absent, its name ends in no unit of a length or an angle, or it holds something else
-                than numbers.
-        """
+        """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels."""
         self._plain_column(name)
         unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
         given, note = self.plain(name)
@@ -115,20 +99,12 @@ class Table:
         return units.si_of(values, unit), note
 
     def plain(self, name: str) -> tuple[FloatArray, str | None]:
-        """A column of numbers without conversion, with NaN and note as in :meth:`numbers`.
-
-        Raises:
-            RunError: The column is absent or holds something else than numbers.
-        """
+        """A column of numbers without conversion, with NaN and note as in :meth:`numbers`."""
         column, note = self._numeric(name)
         return _filled(column.cast(pa.float64(), safe=False), np.nan), note
 
     def texts(self, name: str) -> list[str]:
-        """A column as trimmed text, empty where a cell is; whole numbers without a point.
-
-        Raises:
-            RunError: The column is absent or has no text.
-        """
+        """A column as trimmed text, empty where a cell is; whole numbers without a point."""
         column = self.column(name)
         if pa.types.is_floating(column.type):
             whole = pc.and_(pc.less(pc.abs(column), 1e15), pc.equal(column, pc.round(column)))
@@ -138,18 +114,10 @@ class Table:
     def stamps(self, name: str, nanoseconds: str = "", unit: str = "") -> tuple[TimeArray, str | None]:
         """Stamps in int64 ns, ``NO_STAMP`` where a cell is empty or no time, and a note on cells that were text.
 
-        Whole numbers, also beside cells of text, decimals, dates and Arrow's timestamps are exact, and so are seconds
-        and nanoseconds apart. A date without a time zone is in UTC; a time without a date is since its midnight.
-
-        Args:
-            name: A column, or a field path: numbers, timestamps, dates or times as text, or structs of seconds and
-                nanoseconds.
-            nanoseconds: A column beside it: then both are whole numbers, and ``name`` is of seconds.
-            unit: The ending of the unit of numbers (``_ms``); empty: what the name ends in.
-
-        Raises:
-            RunError: The column is absent, its unit is not known, it holds no time, dates are mixed with numbers, or
-                with and without a zone, or a stamp is beyond reach of int64 ns.
+        Numbers, timestamps, dates or times as text, or structs of seconds and nanoseconds; with a column of
+        ``nanoseconds`` beside it whole seconds. Whole numbers, also beside cells of text, decimals, dates and Arrow's
+        timestamps are exact, and so are seconds and nanoseconds apart. A date without a time zone is in UTC; a time
+        without a date is since its midnight. ``unit`` is that of numbers (``_ms``); empty: what the name ends in.
         """
         column = self.column(name)
         if pa.types.is_struct(column.type):
@@ -172,15 +140,7 @@ class Table:
         return self._of_numbers(name, 10**exponent)
 
     def frames(self, rate: float, name: str = "") -> tuple[TimeArray, str | None]:
-        """Stamps of rows that come at a rate [Hz], in int64 ns since frame 0, and a note on cells that were text.
-
-        Args:
-            rate: How often there is a frame [Hz].
-            name: A column that counts frames; without one each row is the next.
-
-        Raises:
-            RunError: The column is absent or holds something else than numbers, or a stamp is beyond reach.
-        """
+        """Stamps of rows that come at a rate [Hz], in int64 ns since frame 0, and a note on cells that were text."""
         number, note = self.plain(name) if name else (np.arange(self.rows, dtype=np.float64), None)
         time = number / rate
         if (np.abs(time) >= REACH_NS / 1e9).any():
@@ -214,11 +174,7 @@ class Table:
         return [path for path in self.names if _NANOSECONDS.search(path.rpartition(".")[2])]
 
     def column(self, path: str) -> pa.ChunkedArray:
-        """The column of a name or a field path, nothing converted. A column that has the whole path as its name wins.
-
-        Raises:
-            RunError: There is none; says what there is. Or two have this name.
-        """
+        """The column of a name or a field path, nothing converted. One that has the whole path as its name wins."""
         if path not in self.columns and self.names.count(path) > 1:
             raise RunError(f"{self.path}: two columns are named '{path}'")
         return find(self.columns, path, str(self.path))
@@ -242,7 +198,6 @@ class Table:
         return found, note
 
     def _of_two(self, name: str, nanoseconds: str) -> tuple[TimeArray, str | None]:
-        """Stamps of whole seconds and nanoseconds apart."""
         (seconds, note), (rest, other) = self._whole(name), self._whole(nanoseconds)
         missing = (seconds == NO_STAMP) | (rest == NO_STAMP)
         self._refuse_beyond(name, ~missing & (np.abs(seconds * 1e9) >= REACH_NS))
@@ -328,7 +283,6 @@ class Table:
             raise RunError(f"{self.path}: column '{shortened(name)}': {str(error).splitlines()[0]}") from None
 
     def _ending(self, name: str, accepted: tuple[str, ...], example: str) -> str:
-        """The unit in which a name ends."""
         unit = units.ending(leaf(name))
         if unit is None or unit not in accepted:
             short = shortened(name)
@@ -339,7 +293,6 @@ class Table:
         return unit
 
     def _plain_column(self, name: str) -> pa.ChunkedArray:
-        """A column of numbers or text."""
         column = self.column(name)
         if _is_any(column.type, _NEITHER_NUMBERS_NOR_TEXT):
             raise RunError(f"{self.path}: column '{shortened(name)}' holds {_in_words(column.type)}, not numbers")
@@ -375,25 +328,15 @@ class Table:
 
 @dataclass(frozen=True)
 class Topic:
-    """What a recording has of one topic, or of one entity.
+    """What a recording has of one topic, or of one entity."""
 
-    Attributes:
-        name: The topic, or the entity.
-        type: Of its messages, such as ``sensor_msgs/msg/JointState``, or the names of its components.
-        count: Number of messages, or of rows.
-        first: When the first was recorded, int ns; None: not known.
-        last: When the last was.
-        fields: Field paths of the numbers in its first message; of an entity, also its timelines.
-        fault: Why its messages cannot be decoded; empty if they can.
-    """
-
-    name: str
-    type: str
-    count: int
-    first: int | None
-    last: int | None
-    fields: tuple[str, ...]
-    fault: str = ""
+    name: str  # the topic, or the entity
+    type: str  # of its messages, such as 'sensor_msgs/msg/JointState', or the names of its components
+    count: int  # number of messages, or of rows
+    first: int | None  # when the first was recorded, int ns; None: not known
+    last: int | None  # when the last was
+    fields: tuple[str, ...]  # field paths of the numbers in its first message; of an entity, also its timelines
+    fault: str = ""  # why its messages cannot be decoded; empty if they can
 
 
 def leaf(path: str) -> str:
@@ -413,10 +356,7 @@ def largest(sizes: FloatArray) -> FloatArray:
 
 
 def sentinel_among(sizes: FloatArray) -> float | None:
-    """The sentinel of a column with these :func:`largest` sizes.
-
-    It is told by its digits, and must be ten times as far as all others, of which there must be some.
-    """
+    """The sentinel of a column with these :func:`largest` sizes."""
     if len(sizes) <= _OTHERS or sizes[-1] not in SENTINELS or sizes[-1] <= _FAR * sizes[-2]:
         return None
     return float(sizes[-1])
@@ -488,16 +428,8 @@ def numeric_paths(value: Any, path: str = "", names: Any = None) -> Iterator[str
 def find(columns: Columns, path: str, where: str, *, part: bool = False) -> pa.ChunkedArray:
     """What a name or a field path leads to among columns, nothing converted.
 
-    The longest name that fits wins: flat tables have columns that are called ``a.b`` or ``a[0]``.
-
-    Args:
-        columns: By name.
-        path: The name or field path.
-        where: The file, for errors.
-        part: Whether there are more rows than these: then these alone need not have the element of a list.
-
-    Raises:
-        RunError: It leads nowhere; says where it ends and what is there.
+    The longest name that fits wins: flat tables have columns that are called ``a.b`` or ``a[0]``. Where they are only a
+    part of the rows, these alone need not have the element of a list.
     """
     name = longest(columns, path)
     if name is None:
@@ -518,11 +450,7 @@ def _ends(path: str) -> list[int]:
 
 
 def joined(tables: Iterable[pa.Table], what: str) -> pa.Table | None:
-    """One table of many, whose columns may differ; None of none.
-
-    Raises:
-        ValueError: They do not fit each other, or are too large.
-    """
+    """One table of many, whose columns may differ; None of none."""
     parts, size = list[pa.Table](), 0
     for table in tables:
         parts.append(table)

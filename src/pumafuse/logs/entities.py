@@ -38,29 +38,17 @@ _NO_ROWS = pa.record_batch({})
 
 @dataclass(frozen=True)
 class Recording:
-    """The Rerun recording that a run was read from.
-
-    Attributes:
-        application: Its application id.
-        id: Its recording id.
-        timeline: The timeline of the run's stamps; empty: they are on none.
-        kind: What it holds: ``timestamp[ns]``, ``duration[ns]``, or whole numbers (``int64``).
-        unit: What one of these is [ns].
-    """
+    """The Rerun recording that a run was read from."""
 
     application: str
     id: str
-    timeline: str
-    kind: str
-    unit: int
+    timeline: str  # the timeline of the run's stamps; empty: they are on none
+    kind: str  # what it holds: 'timestamp[ns]', 'duration[ns]', or whole numbers ('int64')
+    unit: int  # what one of these is [ns]
 
 
 def read(path: Path, entity: str, fields: Sequence[str] | None) -> Table:
-    """An entity, its rows in the order in which they were logged.
-
-    Raises:
-        RunError: It is no such recording, has no such entity or nothing on it, or is damaged.
-    """
+    """An entity, its rows in the order in which they were logged."""
     place, known = _place(entity), dict[str, set[str]]()
     with _opened(path, place) as opened:
         table = joined(_parts(opened.chunks, place, fields, known), f"entity '{place}'")
@@ -79,11 +67,7 @@ def read(path: Path, entity: str, fields: Sequence[str] | None) -> Table:
 
 
 def topics(path: Path) -> tuple[Topic, ...]:
-    """The entities of a recording.
-
-    Raises:
-        RunError: It is no such recording, or damaged.
-    """
+    """The entities of a recording."""
     components, fields = dict[str, set[str]](), dict[str, dict[str, None]]()
     rows, ends = Counter[str](), dict[str, list[int]]()
     with _opened(path) as opened:
@@ -102,17 +86,7 @@ def topics(path: Path) -> tuple[Topic, ...]:
 
 
 def recording_of(path: Path, entity: str, time: str, unit: str) -> Recording:
-    """What a result needs to open on top of the Rerun recording that it was made from.
-
-    Args:
-        path: The file.
-        entity: The entity whose stamps are those of the run.
-        time: What they are called.
-        unit: The ending of their unit, if they are numbers.
-
-    Raises:
-        RunError: It is no recording.
-    """
+    """What a result needs to open on top of the Rerun recording that it was made from, by the entity of its stamps."""
     place = _place(entity)
     with _opened(path, place) as opened:
         chunk = next(chunk for name, chunk in opened.chunks if name == place)
@@ -234,7 +208,6 @@ def _read(path: Path, entity: str) -> Generator[_Opened]:
 
 
 def _messages(path: Path, pipe: IO[bytes]) -> Iterator[tuple[dict[str, str], pa.Table]]:
-    """What the process sends: metadata and rows."""
     while True:
         try:
             with pa.ipc.open_stream(pipe) as stream:
@@ -253,7 +226,6 @@ def _messages(path: Path, pipe: IO[bytes]) -> Iterator[tuple[dict[str, str], pa.
 
 
 def _main(path: Path, entity: str) -> None:
-    """Write a recording to standard output."""
     sys.stdout.buffer.write(b"\n")  # it has started: if it is aborted from now on, that is the recording's fault
     sys.stdout.buffer.flush()
     fault = ""

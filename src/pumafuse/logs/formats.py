@@ -26,20 +26,12 @@ _FEWEST = 2  # rows: one number is a setting
 
 
 def names(path: Path) -> list[str]:
-    """What the tables of a file are called: the only one is called nothing.
-
-    Raises:
-        RunError: It cannot be read, or has no table.
-    """
+    """What the tables of a file are called: the only one is called nothing."""
     return list(_tables(path, path.stat().st_mtime_ns if path.is_file() else 0))
 
 
 def table(path: Path, name: str) -> pa.Table | bytes:
-    """A table of a file; of a sheet its cells as CSV.
-
-    Raises:
-        RunError: It cannot be read, or has no such table.
-    """
+    """A table of a file; of a sheet its cells as CSV."""
     found = _tables(path, path.stat().st_mtime_ns if path.is_file() else 0)
     if name not in found:
         raise unknown_part(path, "topic", name, dict.fromkeys(found, "a table"), ())
@@ -88,7 +80,6 @@ def _topics(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
 
 
 def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
-    """The tables that arrays, structs and records of a file make."""
     if path.suffix == ".json":
         text = file.read()
         try:

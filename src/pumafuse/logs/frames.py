@@ -23,11 +23,9 @@ _TURN = 2.0 * math.pi
 _QUIET = np.errstate(over="ignore", invalid="ignore")  # a sensor without a target may report infinity, or 1.8e308
 
 
-class _Kind(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
-    pass
-
-
-class Cylindrical(_Kind, frozen=True, kw_only=True, tag="cylindrical"):
+class Cylindrical(
+    msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", tag="cylindrical", forbid_unknown_fields=True
+):
     """Cylindrical axes about the arm's base.
 
     Attributes:
@@ -39,7 +37,7 @@ class Cylindrical(_Kind, frozen=True, kw_only=True, tag="cylindrical"):
     positive: Direction = "counterclockwise"
 
 
-class Rotated(_Kind, frozen=True, kw_only=True, tag="rotated"):
+class Rotated(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", tag="rotated", forbid_unknown_fields=True):
     """Axes at a fixed angle in the log's x and y.
 
     Attributes:

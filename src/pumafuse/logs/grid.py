@@ -40,18 +40,6 @@ def regular_grid(stamp: TimeArray, period: float, label: str, what: str = COMMAN
     A wrong assignment shows in the residuals and is refused: too many stamps off their ticks, a row of them on one side
     longer than a logger's queue, one earlier than the jitter explains, phases so spread that any period would fit as
     well, or so much jitter beside missing ticks that more than 1 % of the commands may be a tick aside.
-
-    Args:
-        stamp: Strictly ascending stamps, int64 ns, (n,).
-        period: T [s].
-        label: The source, for messages.
-        what: What its rows are, for messages.
-
-    Returns:
-        The stamps on the grid, (n,), and a sentence on drift and stamps off their ticks, or None.
-
-    Raises:
-        RunError: The stamps do not follow ticks of T.
     """
     tick = period * 1e9
     since = (stamp - stamp[0]).astype(np.float64)
@@ -86,11 +74,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str, what: str = COMMAN
 
 
 def ticks_of(stamp: TimeArray) -> float:
-    """The period [s] on which stamps that jitter come, by their periodogram: of a few rows first, then of more.
-
-    Args:
-        stamp: Strictly ascending stamps, int64 ns, (n,).
-    """
+    """The period [s] of ascending stamps that jitter, by their periodogram: of a few rows first, then of more."""
     since = (stamp - stamp[0]).astype(np.float64)
     tick, width, size = float(np.median(np.diff(since))), _ROUGHLY, _FIRST
     while True:
@@ -106,7 +90,6 @@ def ticks_of(stamp: TimeArray) -> float:
 
 
 def _refusal(fault: str, stamp: TimeArray, period: float, label: str, what: str) -> RunError:
-    """The error with the fault and the fix."""
     advice = "check update_period_ms, or " if what == COMMANDS else ""
     median = float(np.median(np.diff(stamp))) / 1e6
     return RunError(
@@ -148,7 +131,6 @@ def _aside(ticks: IntArray, late: BoolArray, spread: float) -> float:
 
 
 def _longest(flag: BoolArray) -> int:
-    """Length of the longest row of flags."""
     return int(np.diff(np.flatnonzero(np.concatenate(([True], ~flag, [True])))).max()) - 1
 
 

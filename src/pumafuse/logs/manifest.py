@@ -31,18 +31,13 @@ _IN_TRANSFORM = "translation", "rotation"
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A column or field path, and its unit (``mm``) where its name does not end in it.
+    """A column or field path, and its unit (``mm``) where its name does not end in it."""
 
-    Attributes:
-        column: Its name or field path.
-        unit: Without the bar.
-        turn: After which an angle begins anew [rad]: it is made to go on; 0: never.
-        where: In which of the rows it is the axis: those in which each of these columns has this value.
-    """
-
-    column: str
-    unit: str = ""
+    column: str  # its name or field path
+    unit: str = ""  # without the bar
+    # after which an angle begins anew [rad]: it is made to go on; 0: never
     turn: NotNegative = msgspec.field(name="turn_deg", default=0.0)
+    # in which of the rows it is the axis: those in which each of these columns has this value
     where: dict[str, bool | int | float | str] = {}
 
     @property
@@ -57,22 +52,15 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the stamps of rows are.
+    """Where the stamps of rows are."""
 
-    Attributes:
-        column: Of stamps; with a rate, of numbers of frames, and empty where each row is the next frame.
-        unit: Without the bar.
-        nanoseconds: A column beside it, which is then of whole seconds.
-        counter: A column that numbers the rows, where they come in packets: they are spread by it.
-        shift: What is added to the stamps [s], as its clock is another one.
-        rate: At which frames come [Hz], for a table without stamps; 0: there are some.
-    """
-
-    column: str = ""
-    unit: str = ""
-    nanoseconds: str = ""
-    counter: str = ""
+    column: str = ""  # of stamps; with a rate, of numbers of frames, and empty where each row is the next frame
+    unit: str = ""  # without the bar
+    nanoseconds: str = ""  # a column beside it, which is then of whole seconds
+    counter: str = ""  # a column that numbers the rows, where they come in packets: they are spread by it
+    # what is added to the stamps [s], as its clock is another one
     shift: float = msgspec.field(name="shift_s", default=0.0)
+    # at which frames come [Hz], for a table without stamps; 0: there are some
     rate: NotNegative = msgspec.field(name="rate_hz", default=0.0)
 
     @property
@@ -86,10 +74,7 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return [column for column in (self.column, self.nanoseconds, self.counter) if column]
 
     def stamps(self, table: Table) -> tuple[TimeArray, list[str]]:
-        """Stamps of the rows of a table, which go on where its clock begins anew, and notes.
-
-        See :meth:`Table.stamps`, :meth:`Table.frames` and :mod:`.stamps`.
-        """
+        """Stamps of the rows of a table, which go on where its clock begins anew, and notes."""
         stamp, note = self.as_logged(table)
         notes = [] if note is None else [note]
         if not self.rate:
@@ -109,23 +94,14 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Columns of an orientation in one of three forms, see :mod:`pumafuse.space.rotations`.
-
-    Attributes:
-        quaternion: Four columns.
-        order: Where w is among them.
-        rotation_vector: Three columns of angles along the base's axes.
-        euler: Three columns of angles, in the order of the convention's letters.
-        convention: ``kuka``, ``fanuc``, ``rpy`` or letters as scipy has them; ``abb`` for a quaternion w, x, y, z.
-        unit: Of the angles, without the bar, where their names do not end in it.
-    """
+    """Columns of an orientation in one of three forms, see :mod:`pumafuse.space.rotations`."""
 
     quaternion: tuple[str, str, str, str] | None = None
-    order: rotations.Order = "xyzw"
-    rotation_vector: tuple[str, str, str] | None = None
-    euler: tuple[str, str, str] | None = None
-    convention: str = ""
-    unit: str = ""
+    order: rotations.Order = "xyzw"  # where w is among them
+    rotation_vector: tuple[str, str, str] | None = None  # three columns of angles along the base's axes
+    euler: tuple[str, str, str] | None = None  # three columns of angles, in the order of the convention's letters
+    convention: str = ""  # 'kuka', 'fanuc', 'rpy' or letters as scipy has them; 'abb' for a quaternion w, x, y, z
+    unit: str = ""  # of the angles, without the bar, where their names do not end in it
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -153,17 +129,11 @@ class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 class RowNoise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A column that tells how noisy each row is, of the position and of the orientation alike.
+    """A column that tells how noisy each row is, of the position and of the orientation alike."""
 
-    Attributes:
-        sd: A column of standard deviations, or of an error.
-        variance: A column of variances in its place.
-        typical: The value in a row whose noise is that of ``fusion.toml``, in the unit of the column.
-    """
-
-    sd: str = ""
-    variance: str = ""
-    typical: Positive
+    sd: str = ""  # a column of standard deviations, or of an error
+    variance: str = ""  # a column of variances in its place
+    typical: Positive  # the value in a row whose noise is that of 'fusion.toml', in the unit of the column
 
     @property
     def column(self) -> str:
@@ -196,40 +166,25 @@ class Robot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 def chain_of(robot: Robot) -> Chain:
-    """The kinematics of a robot.
-
-    Raises:
-        PumafuseError: See :meth:`pumafuse.space.kinematics.Chain.load`.
-    """
+    """The kinematics of a robot."""
     return Chain.load(robot.urdf, robot.base, robot.tip)
 
 
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """A source of a run: where its rows are, and its columns.
+    """A source of a run: where its rows are, and its columns."""
 
-    Attributes:
-        file: The table or recording, beside ``run.toml``.
-        topic: Which part of an MCAP or a bag.
-        entity: Which part of a Rerun recording.
-        where: Which of the rows: those in which each of these columns has this value.
-        time: Their stamps.
-        clock: Whether these are used as they are (``stamps``), or even ticks fitted to them (``regular``).
-        axes: For each axis its columns, which are added up.
-        orientation: The columns of its orientation.
-        joints: The columns of the joints of the ``[robot]``, which are a pose.
-        noise: The column of how noisy each row is; only sensors have one.
-    """
-
-    file: str
-    topic: str = ""
-    entity: str = ""
+    file: str  # the table or recording, beside 'run.toml'
+    topic: str = ""  # which part of an MCAP or a bag
+    entity: str = ""  # which part of a Rerun recording
+    # which of the rows: those in which each of these columns has this value
     where: dict[str, bool | int | float | str] = {}
     time: Time
+    # whether these are used as they are ('stamps'), or even ticks fitted to them ('regular')
     clock: Literal["stamps", "regular"] = "stamps"
-    axes: dict[str, list[Column]]
+    axes: dict[str, list[Column]]  # for each axis its columns, which are added up
     orientation: Orientation | None = None
-    joints: dict[str, list[Column]] = {}
-    noise: RowNoise | None = None
+    joints: dict[str, list[Column]] = {}  # the columns of the joints of the '[robot]', which are a pose
+    noise: RowNoise | None = None  # the column of how noisy each row is; only sensors have one
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -263,16 +218,11 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CommandEntry(SourceEntry, frozen=True, kw_only=True):
-    """The commands.
+    """The commands."""
 
-    Attributes:
-        start: The start level by axis [m or rad].
-        kinds: The kinds of axes that its keys say.
-        interpolation: In which steps the controller goes on from one command to the next [s]; 0: it holds each.
-    """
-
-    start: dict[str, float] = {}
-    kinds: dict[str, Kind] = {}
+    start: dict[str, float] = {}  # the start level by axis [m or rad]
+    kinds: dict[str, Kind] = {}  # the kinds of axes that its keys say
+    # in which steps the controller goes on from one command to the next [s]; 0: it holds each
     interpolation: NotNegative = msgspec.field(name="interpolation_ms", default=0.0)
 
 
@@ -309,20 +259,12 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 def load(path: Path) -> Manifest:
-    """Read ``run.toml``.
-
-    Raises:
-        ConfigError: The file is no manifest; names the key and the accepted ones.
-    """
+    """Read ``run.toml``."""
     return of_tables(toml.read(path), str(path))
 
 
 def of_tables(tree: dict[str, Any], where: str = "run.toml") -> Manifest:
-    """What the tables of a ``run.toml`` say, with every number in SI.
-
-    Raises:
-        ConfigError: They are no manifest; names the key and the accepted ones.
-    """
+    """What the tables of a ``run.toml`` say, with every number in SI."""
     kinds = {"command": CommandEntry, "reference": ReferenceEntry}
     tree |= {key: _source(tree[key], kind, where, key) for key, kind in kinds.items() if key in tree}
     if not isinstance(tree.setdefault("sensors", {}), dict):
@@ -342,9 +284,6 @@ def stamps_of(run: Path) -> dict[str, tuple[int, int]]:
     """Size [bytes] and time of the last change [ns since 1970] of each file of a run; none where they cannot be told.
 
     Its files are ``run.toml``, the tables and recordings that it lists, and the URDF of its robot.
-
-    Args:
-        run: As :meth:`Run.read` takes it.
     """
     listed, files = run / "run.toml" if run.is_dir() else run, [run]
     try:
@@ -405,7 +344,6 @@ def _with_pose(keys: dict[str, Any], where: str, path: str) -> dict[str, Any]:
 
 
 def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path: str) -> None:
-    """Refuse columns of an orientation that say too much or too little."""
     one = toml.struct(given, Orientation, where, path)
     forms = [one.quaternion, one.rotation_vector, one.euler]
     if sum(form is not None for form in forms) != 1:
@@ -432,7 +370,6 @@ def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path:
 
 
 def _check_noise(given: Any, kind: type[SourceEntry], axes: dict[str, list[Any]], where: str, path: str) -> None:
-    """Refuse a noise of rows that says too much or too little, or that is of no sensor."""
     one = toml.struct(given, RowNoise, where, path)
     if bool(one.sd) == bool(one.variance):
         raise ConfigError(f"{where}: {path}: expected one of sd = 'error_mm' and variance = 'pose.covariance[0]'")
@@ -443,7 +380,6 @@ def _check_noise(given: Any, kind: type[SourceEntry], axes: dict[str, list[Any]]
 
 
 def _joints(given: Any, beside: Iterable[str], where: str, path: str) -> dict[str, Any]:
-    """The columns of each joint."""
     if not isinstance(given, dict) or not given:
         raise ConfigError(f"{where}: {path}: expected a column for each joint, as in {{ j1 = 'j1_deg' }}")
     if twice := next(iter(beside), None):
@@ -474,7 +410,6 @@ def _columns(given: Any, where: str, path: str) -> list[Any]:
 
 
 def _time(given: Any, where: str, path: str) -> dict[str, Any]:
-    """The column of stamps, or the two of seconds and nanoseconds."""
     match given:
         case str() if given:
             return {"column": given}
@@ -515,11 +450,7 @@ def _check_unit(column: dict[str, Any], accepted: tuple[str, ...], where: str, p
 
 
 def axis_of(key: str, where: str, path: str) -> str:
-    """``x_mm`` → ``x``; the number itself is already in m or rad.
-
-    Raises:
-        ConfigError: The key ends in no unit of a length or an angle.
-    """
+    """``x_mm`` → ``x``; the number itself is already in m or rad."""
     unit = ending(key)
     if unit is None or kind_of(key) is None:
         raise ConfigError(f"{where}: {path}.{key} has no unit in its name, as in {key}_mm or {key}_deg")

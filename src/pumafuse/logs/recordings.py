@@ -35,29 +35,13 @@ _AROUND = ("request", "goal", "trajectory", "joint_trajectory")  # what goals of
 
 
 def read(path: Path, name: str, fields: Sequence[str] | None = None) -> Table:
-    """A topic or an entity, its rows in the order in which they were recorded.
-
-    Args:
-        path: A file, or the folder of a ROS 2 bag.
-        name: The topic, or the entity of a Rerun recording.
-        fields: Columns, whole or to a field, that are wanted. None: all.
-
-    Raises:
-        RunError: It is no such recording, has no such topic or nothing on it, or is too damaged.
-    """
+    """A topic or an entity, its rows in the order of recording; of all fields, or those that are wanted."""
     with one_line(path, "'pumafuse[bags]'"):
         return (entities.read if path.suffix == ".rrd" else _read_topic)(path, name, fields)
 
 
 def topics(path: Path) -> tuple[Topic, ...]:
-    """What a recording has, by topic or entity.
-
-    Args:
-        path: A file, or the folder of a ROS 2 bag.
-
-    Raises:
-        RunError: It is no such recording, or too damaged.
-    """
+    """What a file, or the folder of a ROS 2 bag, has, by topic or entity."""
     with one_line(path, "'pumafuse[bags]'"):
         return (entities.topics if path.suffix == ".rrd" else _topics)(path)
 
@@ -80,7 +64,6 @@ def _read_topic(path: Path, topic: str, fields: Sequence[str] | None) -> Table:
 
 
 def _messages(path: Path, topic: str, faults: Faults, seen: set[Channel]) -> Iterator[tuple[Record, Message]]:
-    """The messages of a topic, recorded and decoded."""
     decoders = dict[Channel, bags.Decoder]()
     for record in bags.records_of(path, topic, faults, seen):
         if record.channel not in decoders:
@@ -258,13 +241,11 @@ def begin_of(trajectory: Mapping[str, Any], received: int) -> int:
 
 
 def _nanoseconds(time: Mapping[str, int]) -> int:
-    """A time, or a duration, of a message."""
     seconds, rest = next(pair for pair in SPLIT_STAMPS if pair[0] in time and pair[1] in time)
     return int(time[seconds]) * 10**9 + int(time[rest])
 
 
 def _numbers(point: Mapping[str, Any], key: str, joints: Sequence[str]) -> FloatArray:
-    """What a point has for each joint, (joints,)."""
     found = np.array(point[key], dtype=np.float64)
     if found.shape != (len(joints),) or not np.isfinite(found).all():
         raise ValueError(f"a point has no {key} for each of its {len(joints)} joints")

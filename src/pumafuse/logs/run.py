@@ -447,11 +447,6 @@ def _on_the_line(stamp: TimeArray, value: FloatArray, at: TimeArray) -> FloatArr
     """Values at some instants on the lines from one to the next, (m,); before the first that.
 
     No bit of it depends on other values than the two beside an instant: a stream tells the same of what it has by then.
-
-    Args:
-        stamp: Int ns, ascending, (n,).
-        value: (n,).
-        at: The instants, int ns, (m,).
     """
     before = np.clip(np.searchsorted(stamp, at, side="right") - 1, 0, None)
     after = np.minimum(before + 1, len(stamp) - 1)
@@ -524,7 +519,6 @@ def _number(value: float | None, absent: float) -> float:
 
 
 def _from_arrays(label: str, arrays: Any, notes: list[str]) -> Source:
-    """A source of stamps and values."""
     match arrays:
         case [_, Mapping()]:
             time, values = cast(tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]], arrays)
@@ -571,11 +565,7 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
 
 
 def described(text: str, folder: Path) -> Run:
-    """The run that the text of a ``run.toml`` in a folder describes.
-
-    Raises:
-        PumafuseError: Not a recorded run; says what, where, and what is accepted.
-    """
+    """The run that the text of a ``run.toml`` in a folder describes."""
     return _read(manifest.of_tables(toml.parsed(text, "run.toml")), folder)
 
 
@@ -593,16 +583,7 @@ def _read(listed: manifest.Manifest, folder: Path) -> Run:
 def of_tables(
     listed: manifest.Manifest, folder: Path, read_table: Callable[[manifest.SourceEntry], tables.Table]
 ) -> Run:
-    """A run from its tables.
-
-    Args:
-        listed: What ``run.toml`` says.
-        folder: Where that is.
-        read_table: Gives the table of a source; it is asked once for sources of one table.
-
-    Raises:
-        RunError: A column is absent or of another type, a clock stands still, or there is no command.
-    """
+    """A run from its tables; ``read_table`` is asked once for sources of one table."""
     scored, notes, units = listed.reference, list[str](), dict(listed.command.kinds)
     entries, read = listed.entries, dict[tuple[str, ...], tables.Table]()
     robot = None if listed.robot is None else listed.robot.beside(folder)
@@ -666,7 +647,6 @@ def _on_ticks(source: Source, notes: list[str]) -> Source:
 
 
 def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recording | None:
-    """The first of the Rerun recordings that sources are in."""
     found = next((entry for entry in entries if entry.entity), None)
     if found is None:
         return None
@@ -677,11 +657,7 @@ def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recordi
 
 
 def clock_of(table: tables.Table) -> str:
-    """The column of stamps of a table that is a run.
-
-    Raises:
-        RunError: There is none, or more than one.
-    """
+    """The column of stamps of a table that is a run."""
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
         listed = ", ".join(table.columns)
@@ -690,11 +666,7 @@ def clock_of(table: tables.Table) -> str:
 
 
 def of_table(table: tables.Table) -> Run:
-    """A run from one table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``.
-
-    Raises:
-        RunError: It is none.
-    """
+    """A run from one table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``."""
     path, clock, listed = table.path, clock_of(table), ", ".join(table.columns)
     groups: dict[str, dict[str, list[manifest.Column]]] = {}
     for column in (name for name in table.columns if "." in name):

@@ -14,29 +14,12 @@ from ..units import SCREEN, Screen, seconds
 from . import tables
 from .run import NOISE, Run, Source
 
-_KEYS = (
-    "file",
-    "topic",
-    "entity",
-    "where",
-    "time",
-    "start",
-    "clock",
-    NOISE,
-)  # of a source in run.toml; others are axes
+_KEYS = ("file", "topic", "entity", "where", "time", "start", "clock", NOISE)  # of a source in run.toml
 _TAKEN = ("commands", "truth", "trials", "samples", "path")
 
 
 def save(run: Run, folder: Path) -> None:
-    """Write a run that :meth:`Run.read` reads back: stamps to the ns within 26 days of 0, lengths to the nm.
-
-    Args:
-        run: The run; its notes are not written.
-        folder: An existing folder.
-
-    Raises:
-        RunError: See :func:`check_name` and :func:`check_axis`.
-    """
+    """Write a run that :meth:`Run.read` reads back: stamps to the ns within 26 days of 0, lengths to the nm."""
     for name in run.sensors:
         check_name(name)
     for axis in run.axes:
@@ -58,11 +41,7 @@ def save(run: Run, folder: Path) -> None:
 
 
 def check_name(sensor: str) -> None:
-    """Refuse a sensor whose name cannot be that of its file.
-
-    Raises:
-        RunError: It has characters of a path, or is the name of another table.
-    """
+    """Refuse a sensor whose name cannot be that of its file."""
     plain = sensor.isprintable() and Path(sensor).name == sensor and not sensor.startswith(".")
     if not plain or not sensor or sensor in _TAKEN:
         raise RunError(
@@ -72,11 +51,7 @@ def check_name(sensor: str) -> None:
 
 
 def check_axis(axis: str) -> None:
-    """Refuse an axis whose name is a key of run.toml.
-
-    Raises:
-        RunError: It is.
-    """
+    """Refuse an axis whose name is a key of run.toml."""
     if axis in _KEYS:
         raise RunError(f"axis '{axis}': run.toml uses this word itself; no axis can be called {', '.join(_KEYS)}")
 
@@ -86,7 +61,6 @@ def _screen(run: Run, axis: str) -> Screen:
 
 
 def _entry(run: Run, source: Source, file: str, folder: Path) -> dict[str, Any]:
-    """Write one source and return its table of ``run.toml``."""
     screens = {axis: _screen(run, axis) for axis in source.values}
     columns = {
         f"{axis}_{screen.unit}": pa.array(np.round(source.values[axis] * screen.scale, 6), from_pandas=True)

@@ -56,11 +56,7 @@ def returns(value: float, before: float, out: Iterable[float]) -> bool:
 
 
 def without_stray_values(command: Source, sensors: Sequence[Source], notes: list[str]) -> Source:
-    """The commands without values that nobody sent: NaN, with a note.
-
-    One or two values that leap away from their neighbours and back by many times the usual step are stray, if no sensor
-    follows them.
-    """
+    """The commands without values that nobody sent: NaN, with a note."""
     if command.joints is not None:  # what nobody sent is among these, and a pose is of all of them
         found = without_stray_values(command.in_joints(), [one.in_joints() for one in sensors], notes)
         if not len(found.stray):
@@ -121,19 +117,12 @@ def _follows(stamp: TimeArray, value: FloatArray, leap: int) -> bool:
 
 
 class Habit(NamedTuple):
-    """How the values of a sensor on an axis change from one to another.
+    """How the values of a sensor on an axis change from one to another."""
 
-    Attributes:
-        smallest: Its steps: the smallest [m or rad],
-        typical: the median,
-        usual: and the one than which few are larger.
-        times: How often each value comes in a row, typically, if it holds its samples; else 1.
-    """
-
-    smallest: float
-    typical: float
-    usual: float
-    times: int
+    smallest: float  # of its steps [m or rad]
+    typical: float  # their median
+    usual: float  # the one than which few are larger
+    times: int  # how often each value comes in a row, typically, if it holds its samples; else 1
 
     @staticmethod
     def of(steps: FloatArray, lengths: IntArray) -> Habit:
@@ -146,14 +135,10 @@ class Habit(NamedTuple):
         return Habit(low, middle, usual_of(steps), int(median(lengths.astype(np.float64))) if holds else 1)
 
     def froze(self, count: int, moved: float, travel: float, leapt: bool, repeats: float) -> bool:
-        """Whether a value that came again and again is that of a sensor that froze, not of an axis that rests.
+        """Whether a value that came ``count`` times is that of a sensor that froze, not of an axis that rests.
 
-        Args:
-            count: How often it came.
-            moved: How far the commands have moved the axis meanwhile [m or rad].
-            travel: How far they move it at all.
-            leapt: Whether it is many times the usual step away from the values beside it.
-            repeats: How often other values are repeated, of 1.
+        Meanwhile the commands ``moved`` the axis, of its whole ``travel`` [m or rad]. It may have ``leapt`` away from
+        the values beside it; other values are repeated so often, of 1.
         """
         if count < _FROZEN * self.times or not self.is_clear(moved):
             return False
@@ -173,13 +158,8 @@ def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArr
     """Which values of a sensor on an axis are no news, (rows,); how often it gives each of them.
 
     A sensor that is slower than its rows gives each value several times: of these the first counts. One that froze
-    gives one value while the commands move the axis by clearly more than its steps.
-
-    Args:
-        stamp: Of the rows, ascending [int ns], (rows,).
-        value: Finite.
-        command: Stamps, ascending, and values of the commands, (n,).
-        lag: How late the axis may follow its commands [ns].
+    gives one value while the commands move the axis by clearly more than its steps. Stamps ascend, values are finite,
+    and the axis follows its commands up to ``lag`` [ns] late.
     """
     begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)
     if len(begin) <= FEWEST or len(begin) == len(value):

@@ -26,21 +26,13 @@ _MOST = 100  # steps
 
 
 class Step(NamedTuple):
-    """A step back of one source's stamps.
+    """A step back of one source's stamps."""
 
-    Attributes:
-        row: The first row after it, of those with a stamp.
-        newest: The stamp before it [ns].
-        back: By how much it steps back [ns].
-        usual: The usual interval of the rows [ns].
-        behind: How many rows are behind ``newest``.
-    """
-
-    row: int
-    newest: int
-    back: float
-    usual: float
-    behind: int
+    row: int  # the first row after it, of those with a stamp
+    newest: int  # the stamp before it [ns]
+    back: float  # by how much it steps back [ns]
+    usual: float  # the usual interval of the rows [ns]
+    behind: int  # how many rows are behind 'newest'
 
 
 def going_on(run: Run) -> tuple[Run, list[str]]:
@@ -154,8 +146,6 @@ def _shortest(stamp: TimeArray, newest: int, back: float) -> int:
 
 
 def _moved(run: Run, newest: int, back: float) -> Run:
-    """A run whose rows after a step go on."""
-
     def moved(_: str, source: Source) -> Source:
         stamp = source.stamp.copy()
         stamp[_rows_after(source, newest, back)] += round(back)

@@ -25,12 +25,7 @@ _LEAST_WAIT = 0.02  # s, from which it matters
 
 
 def going_on(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
-    """Stamps that go on over wraps of 32 bits, midnight and one step of an hour, zeros apart, and a sentence on each.
-
-    Args:
-        stamp: Of the rows, int64 ns, (rows,).
-        label: The file and the column, for the sentences.
-    """
+    """Stamps that go on over wraps of 32 bits, midnight and one step of an hour, without zeros, and notes on each."""
     notes, zero = list[str](), stamp == 0
     others = stamp[~zero & (stamp != NO_STAMP)]
     if zero.any() and len(others) >= _FEWEST and np.abs(others).min() >= max(_FAR_NS, float(np.ptp(others))):
@@ -77,10 +72,6 @@ def spread(stamp: TimeArray, number: FloatArray) -> TimeArray:
 
     No row arrives before it is made. So the line from number to stamp lies below all arrivals; of such lines it is
     the one that is nearest to them on average, an edge of their convex hull.
-
-    Args:
-        stamp: When rows arrived, int64 ns, (rows,).
-        number: What numbers them, (rows,).
     """
     there = (stamp != NO_STAMP) & np.isfinite(number)
     if not there.any():

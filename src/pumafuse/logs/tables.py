@@ -75,18 +75,10 @@ def read(
 ) -> Table:
     """Read a table (CSV, lines of JSON, gzip allowed for both, Parquet, :mod:`.formats`), or a part of a recording.
 
-    Args:
-        path: The file, or the folder of a bag.
-        growing: Whether it may still be growing, or its writer may have been killed. A last line of a CSV without its
-            line break may then be torn within a number: it is left out, and noted.
-        fields: Columns and field paths that will be asked for; of a text that is not wide others are read, too. Of a
-            text also what chooses them among its names. All for None.
-        where: Which rows to read; of Parquet, parts of the file that can have none are skipped.
-        topic: Which part of a recording is the table; which of several tables in a file.
-        entity: The same in a Rerun recording.
-
-    Raises:
-        RunError: The file is absent, empty, or not inside what its ending says; or ``where`` leaves no row.
+    A file may be growing, or its writer may have been killed. A last line of a CSV without its line break may then be
+    torn within a number: it is left out, and noted. ``fields`` are columns and field paths that will be asked for, of a
+    text also what chooses them among its names; None: all. Parts of a Parquet file that have no row for ``where`` are
+    skipped. ``topic`` is also which of several tables in a file.
     """
     where, listed = where or {}, None if callable(fields) else fields
     refuse_endless(path)
@@ -120,11 +112,7 @@ def read(
 
 
 def meets(table: Table, where: Where) -> BoolArray:
-    """Rows in which each of some columns has a value, (rows,).
-
-    Raises:
-        RunError: There is none, or a column is absent or never has such a value.
-    """
+    """Rows in which each of some columns has a value, (rows,)."""
     whole = pa.table(dict(table.columns))
     met = _met(table.path, whole, _conditions(table.path, whole, where))
     found = np.from_dlpack(pc.fill_null(met, False).cast(pa.uint8()).combine_chunks()) > 0
@@ -134,11 +122,7 @@ def meets(table: Table, where: Where) -> BoolArray:
 
 
 def chosen(table: Table, where: Where) -> Table:
-    """The rows of a table in which each of some columns has a value.
-
-    Raises:
-        RunError: There is none, or a column is absent or never has such a value.
-    """
+    """The rows of a table in which each of some columns has a value."""
     if not where:
         return table
     rows = _only(table.path, pa.table(dict(table.columns)), where)
@@ -146,11 +130,7 @@ def chosen(table: Table, where: Where) -> Table:
 
 
 def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
-    """A Parquet table, some rows at a time; see :func:`read`.
-
-    Raises:
-        RunError: The file cannot be read.
-    """
+    """A Parquet table, some rows at a time; see :func:`read`."""
     with one_line(path), _opened(path) as file:
         names = tuple(file.schema.column(place).path for place in range(len(file.schema)))
         wanted, empty = _wanted(path, file, fields, {})
@@ -159,17 +139,7 @@ def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
 
 
 def sentinel_of(path: Path, name: str) -> float | None:
-    """The size of the number that stands for "none" in all of a column of a Parquet table; None without any.
-
-    Where the file's own statistics show that there is none, no row is read.
-
-    Args:
-        path: The table.
-        name: The column, or a field path.
-
-    Raises:
-        RunError: The file cannot be read.
-    """
+    """The size of the number that stands for "none" in all of a column of a Parquet table; None without any."""
     if (most := _largest_by_statistics(path, name)) is not None and most not in SENTINELS:
         return None
     sizes = np.empty(0)
@@ -202,11 +172,7 @@ def row_count(path: Path) -> int:
 
 
 def refuse_endless(path: Path) -> None:
-    """Refuse a pipe, a socket or a device, which a reader may wait for for ever and cannot go back in.
-
-    Raises:
-        RunError: It is one.
-    """
+    """Refuse a pipe, a socket or a device, which a reader may wait for for ever and cannot go back in."""
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):  # what is not there is for others to say
@@ -261,7 +227,6 @@ def one_line(path: Path) -> Generator[None]:
 
 
 def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None, where: Where) -> Table:
-    """A topic or entity of a recording."""
     from . import recordings
 
     key, name, wrong, other = "topic", topic, "entity", entity
@@ -310,11 +275,7 @@ def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
 
 
 def _refuse_deep_lines(path: Path, text: bytes) -> None:
-    """Refuse lines that would end the process: pyarrow goes into each level with a call of its own.
-
-    Raises:
-        RunError: A line is nested as no log is.
-    """
+    """Refuse lines that would end the process: pyarrow goes into each level with a call of its own."""
     codes = np.frombuffer(text, dtype=np.uint8)
     ends = np.concatenate([[-1], np.flatnonzero(codes == ord("\n")), [len(codes)]])
     for line in np.flatnonzero(np.diff(ends) > _LONG_LINE).tolist():
@@ -323,11 +284,6 @@ def _refuse_deep_lines(path: Path, text: bytes) -> None:
 
 
 def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
-    """Refuse columns in which nobody can look for numbers.
-
-    Raises:
-        RunError: One is nested as none of a log is.
-    """
     level = [column.type for column in table.columns]
     for _ in range(_DEEPEST):
         level = [kind.field(place).type for kind in level for place in range(kind.num_fields)]
@@ -337,7 +293,6 @@ def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
 
 
 def _of_csv(path: Path, text: bytes, choice: Choice | None) -> _Text:
-    """The table in a CSV text; lines with the wrong number of cells are left out and noted."""
     try:
         table, names, more = _parsed(path, text, choice)
     except (UnicodeDecodeError, pa.ArrowInvalid) as error:
@@ -483,7 +438,6 @@ class _Layout(NamedTuple):
 
 
 def _layout(text: bytes) -> _Layout:
-    """How a text is laid out, by its first lines."""
     head = text[: max(_HEAD, text.find(b"\n") + 1)].removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace")
     *lines, last = re.split("\r\n|\r|\n", head)
     lines, broken = _whole_lines([*lines, last] if not lines or (last and len(text) <= _HEAD) else lines)
@@ -591,7 +545,6 @@ def _is_headless(lines: Sequence[str], first: int, separator: str) -> bool:
 
 
 def _column(place: int) -> str:
-    """What a column without a name is called."""
     return FIRST.replace("1", str(place + 1))
 
 
@@ -614,7 +567,6 @@ def _separator(line: str) -> str:
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    """The cells of a line, without quotes."""
     return [one.strip().strip('"').strip().replace("\0", separator) for one in _split(line, separator)]
 
 
@@ -667,7 +619,6 @@ def _wanted(
 
 
 def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] | None) -> Iterator[pa.Table]:
-    """Some columns of a Parquet file, some rows at a time."""
     for batch in file.iter_batches(_BATCH, row_groups=groups, columns=columns, use_threads=False):
         yield _filterable(pa.Table.from_batches([batch]))
 
@@ -679,7 +630,6 @@ def _filterable(table: pa.Table) -> pa.Table:
 
 
 def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
-    """The rows of a table that ``where`` chooses."""
     chosen = whole.filter(_met(path, whole, _conditions(path, whole, where))) if where else whole
     if where and not chosen.num_rows:
         raise _no_row(path, [whole], where)
@@ -740,16 +690,13 @@ def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
 
 
 def _written(value: Any) -> str:
-    """A value as it is written in run.toml."""
     return shortened(repr(value) if isinstance(value, str) else str(value).lower())
 
 
 def _named(table: pa.Table) -> dict[str, pa.ChunkedArray]:
-    """The columns of a table by name, without those that share one."""
     repeated = _repeated(table.column_names)
     return {name: table.column(name) for name in table.column_names if name not in repeated}
 
 
 def _repeated(names: Sequence[str]) -> set[str]:
-    """The names that more than one column has."""
     return {name for name, count in Counter(names).items() if count > 1}
