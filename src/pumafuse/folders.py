@@ -50,6 +50,14 @@ def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Call
         raise FolderError(f"{folder}: exists; --force replaces it, or choose another folder")
 
 
+def check_replaceable(path: Path, force: bool, ours: bool, what: str) -> None:
+    """Refuse to replace a file that is not ours, no ``what``, also with --force: its name may be a slip."""
+    if path.exists() and not ours:
+        raise FolderError(f"{path}: exists and is no {what}, which is not ours to replace; choose another")
+    if path.exists() and not force:
+        raise FolderError(f"{path}: exists; --force replaces it")
+
+
 @contextmanager
 def replacing(folder: Path) -> Generator[Path]:
     """A new folder to write into, which replaces ``folder`` on leaving the block.

@@ -95,11 +95,7 @@ def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _plain(value: Any, path: str) -> Any:
-    """A value of a dict as TOML has it: numbers of numpy are numbers, tuples lists.
-
-    Raises:
-        ConfigError: It is none that TOML has.
-    """
+    """A value of a dict as TOML has it: numbers of numpy are numbers, tuples lists."""
     if getattr(value, "shape", None) == ():
         value = value.item()
     if isinstance(value, Mapping):

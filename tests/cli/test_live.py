@@ -133,7 +133,7 @@ def test_an_open_pipe_is_answered_at_once() -> None:
         (["tcp://127.0.0.1:5005", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], "tcp-listen://HOST:PORT"),
         (["stdin", "--out", "tcp://127.0.0.1:5005"], "expected udp://HOST:PORT"),
         (["stdin", "--record", "/dev/null"], "/dev/null"),
-        (["stdin", "--rerun", "paper"], "paper"),
+        (["stdin", "--rerun", "paper"], "--rerun: no mode 'paper'; there are: spawn, connect, web"),
     ],
 )
 def test_what_is_wrong_is_one_line(words: list[str], message: str) -> None:

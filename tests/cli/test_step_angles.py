@@ -80,23 +80,6 @@ def run(folder: Path) -> Path:
     return made
 
 
-def test_the_joints_are_the_true_ones(folder: Path) -> None:
-    """Order, plant, delay and the gain's line, each within twice its interval, from the file that was written."""
-    arm = pf.ArmModel.load(folder / "arm.toml")
-    assert (list(arm.axes), arm.update_period) == (["shoulder", "wrist"], 0.02)
-    for axis, model in arm.axes.items():
-        assert (model.kind, type(model.plant)) == ("angle", type(PLANTS[axis]))
-        pairs = [(DELAY, arm.delay, arm.delay_ci95), (SLOPE, model.gain.slope, model.gain.slope_ci95)]
-        pairs += [(INTERCEPT, model.gain.intercept, model.gain.intercept_ci95)]
-        for name in PLANTS[axis].__struct_fields__:
-            if not name.endswith("_ci95"):
-                pairs.append((getattr(PLANTS[axis], name), *(getattr(model.plant, n) for n in (name, f"{name}_ci95"))))
-        for truth, value, (low, high) in pairs:
-            assert abs(value - truth) <= high - low < 0.2 * truth
-    assert arm.validity.max_angular_speed == pytest.approx(100.0 * DEGREE, rel=1e-9)
-    assert "max_speed_deg_s = 100.0\n" in (folder / "arm.toml").read_text()
-
-
 def test_json_and_page_are_in_degrees(folder: Path) -> None:
     """The noise is found in the RMS, steps and speeds are as listed, the tolerance as given."""
     found = json.loads((folder / "found.json").read_text())
@@ -144,19 +127,6 @@ def test_verify_shows_each_axis_in_its_unit(folder: Path, run: Path, tmp_path: P
     assert page.count("mm RMS</th>") == page.count("deg RMS</th>") == 1
     figures = [page.count(f"position without its mean [{unit}]") for unit in ("mm", "deg")]
     assert figures[1] == 2 * figures[0] > 0
-
-
-def test_fuse_takes_the_arm_with_both_kinds(folder: Path, run: Path, tmp_path: Path) -> None:
-    """The identified joints beside the rail: estimates of each in its unit."""
-    (tmp_path / "fusion.toml").write_text(
-        f'arm = "{folder / "mixed.toml"}"\n[sensors.encoder]\nsd_mm = 0.02\nsd_deg = 0.02\n'
-    )
-    pumafuse("fuse", run, "-c", tmp_path / "fusion.toml", "-o", tmp_path / "out")
-    used = pf.ArmModel.load(tmp_path / "out" / "arm.toml")
-    assert used.axes == pf.ArmModel.load(folder / "mixed.toml").axes
-    axes = json.loads((tmp_path / "out" / "summary.json").read_text())["axes"]
-    assert axes["shoulder"]["sensors"]["encoder"]["innovation_rms_deg"] < 0.2
-    assert axes["rail"]["sensors"]["encoder"]["innovation_rms_mm"] < 0.2
 
 
 def test_plan_for_joints_is_in_degrees(folder: Path, tmp_path: Path) -> None:

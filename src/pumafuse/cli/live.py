@@ -75,11 +75,7 @@ def run(
     allow: list[str],
     ros_args: list[str],
 ) -> None:
-    """Estimate from a stream until it ends, or a signal ends it; the arguments are the options, in s and Hz.
-
-    Raises:
-        PumafuseError: The configuration, the source, the run or a folder is wrong.
-    """
+    """Estimate from a stream until it ends, or a signal ends it; the arguments are the options, in s and Hz."""
     sources, known, start = list(map(Address.parse, given)), FusionConfig.load(config), dict[str, float]()
     alone, kinds = sources[0], [one.kind for one in sources]
     if listen and not set(LISTENERS) & set(kinds):
@@ -168,21 +164,7 @@ def _opened(
     allow: list[str],
     ros_args: list[str],
 ) -> Remote:
-    """A source of the network; the stack closes what has to be.
-
-    Args:
-        address: Of the source.
-        listed: What its ``run.toml`` says, of a kind that has one.
-        config: Of the estimator.
-        stack: It.
-        notify: Takes a sentence for the log.
-        listen: The options.
-        allow: The options.
-        ros_args: The options.
-
-    Raises:
-        PumafuseError: The source cannot be opened.
-    """
+    """A source of the network; the stack closes what has to be."""
     if address.kind == POSES:
         from ..live.openigtlink import OpenIgtLinkSource
 
@@ -219,11 +201,7 @@ def _to_standard_output(lines: list[bytes]) -> None:
 
 
 def _listen(remote: Remote, feeder: _Feeder, signals: list[int]) -> int:
-    """Feed what comes from the network until a signal ends it, and then for at most 1 s what has come until then.
-
-    Returns:
-        How many lines had come and were not taken in.
-    """
+    """Feed what comes from the network until a signal ends it, and then for at most 1 s what has come until then."""
     remote.start()
     try:
         while not signals:
@@ -301,13 +279,7 @@ def _caught_signals() -> Generator[list[int]]:
 
 
 def status(stream: Stream, summaries: Sequence[Callable[[], str]] = (), now: int | None = None) -> Group:
-    """One screen: the position of each axis, and how each sensor does.
-
-    Args:
-        stream: The stream.
-        summaries: Give a sentence each on the parts beside it; empty for nothing.
-        now: What the stream's time has come to [ns] while nothing came; None: that of the newest event.
-    """
+    """One screen: the position of each axis, and how each sensor does."""
     estimate = stream.live.estimate(now)
     time = "no event yet" if stream.live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
     arm, tables = stream.live.config.arm, list[Table]()
