@@ -38,11 +38,12 @@ def with_tracker(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_demo_leaves_everything_it_promises(demo: Path) -> None:
-    """Tables, the configuration as used, pictures and a recording that rerun accepts."""
+    """Tables, the configuration as used, pictures and a small recording that rerun accepts."""
     tables = {"estimates.parquet", "measurements.parquet", "reference.parquet"}
     figures = {"fused.png", "error.png", "validation.png"}
     assert names(demo) == tables | figures | {"summary.json", "log.json", "fusion.toml", "arm.toml", "fused.rrd"}
     assert all((demo / name).read_bytes().startswith(b"\x89PNG") for name in figures)
+    assert 100_000 < (demo / "fused.rrd").stat().st_size < 10_000_000
     rerun = Path(sys.executable).parent / "rerun"
     assert subprocess.run([str(rerun), "rrd", "verify", str(demo / "fused.rrd")], check=False).returncode == 0
 
