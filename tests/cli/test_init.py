@@ -138,9 +138,9 @@ def test_one_command_says_that_the_fit_is_worse_as_tune_does(tmp_path: Path, mon
 
 def test_one_command_says_where_no_arm_was_found(tmp_path: Path) -> None:
     """An encoder that is at each command in the same row; with commands that are gone on from, as is advised, it is."""
-    rng, time = np.random.default_rng(1), 0.1 * np.arange(600)
-    command = np.sin(0.2 * time) + rng.normal(0.0, 0.055, 600)
-    table = np.column_stack([time, command, command + rng.normal(0.0, 0.02, 600)])
+    rng, time = np.random.default_rng(1), 0.1 * np.arange(300)
+    command = np.sin(0.2 * time) + rng.normal(0.0, 0.055, 300)
+    table = np.column_stack([time, command, command + rng.normal(0.0, 0.02, 300)])
     np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t_s,told_rad,seen_rad", comments="")
     described = """
         [command]
@@ -178,7 +178,7 @@ def smoothed(z: np.ndarray, s: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("filters", [False, True])
 def test_one_command_says_what_one_sensor_alone_does_not_show(tmp_path: Path, filters: bool) -> None:
     """Where it filters its values the arm seems to stray, and error bars are too small; white noise has no line."""
-    t, s = np.arange(0.0, 30.0, 0.028), np.arange(0.2, 30.0, 0.01)
+    t, s = np.arange(0.0, 15.0, 0.028), np.arange(0.2, 15.0, 0.01)
     u = 0.05 * np.sin(1.3 * t) + 0.02 * np.sin(3.1 * t)
     plant = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05))
     given, valid = (np.rint(one * 1e9).astype(np.int64) for one in (t, s))

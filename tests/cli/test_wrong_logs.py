@@ -92,7 +92,7 @@ def swings(time: FloatArray) -> FloatArray:
 
 def test_what_reading_notices_is_said_once(tmp_path: Path) -> None:
     """Tuning and fusing read the same rows: two rows that are exchanged are one line."""
-    time = np.arange(0.0, 20.0, 0.025)
+    time = np.arange(0.0, 10.0, 0.025)
     measured = swings(time - 0.11) + np.random.default_rng(2).normal(0.0, 0.05, len(time))
     columns = {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured}
     order = np.arange(len(time))
@@ -127,7 +127,7 @@ def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path
 
 def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(tmp_path: Path) -> None:
     """It is left out, and said to be."""
-    time, rng = np.arange(0.0, 30.0, 0.02), np.random.default_rng(6)
+    time, rng = np.arange(0.0, 15.0, 0.02), np.random.default_rng(6)
     columns = {"t_s": time}
     for axis, late, slower in (("a", 0.09, 1.0), ("b", -0.12, 0.83)):
         columns |= {f"goal_{axis}_deg": swings(slower * time)}

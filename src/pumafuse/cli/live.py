@@ -88,7 +88,8 @@ def run(
     if recorded is not None:
         start = dict(recorded.start)
         known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
-    files = {one: _manifest_of(Path(one.path)) for one in sources if one.kind in OF_A_RUN}
+    given_files = {one: Path(one.path) for one in sources if one.kind in OF_A_RUN}
+    files = {one: path / "run.toml" if path.is_dir() else path for one, path in given_files.items()}
     listed = {address: manifest.load(file) for address, file in files.items()}
     for address, one in listed.items():
         start |= one.command.start
@@ -146,11 +147,6 @@ def run(
         notify(sentence)
     with contextlib.suppress(OSError):
         print_tables([_sensor_table(live, feeder.now)], "stderr")
-
-
-def _manifest_of(path: Path) -> Path:
-    """The ``run.toml`` that a path is, or that a folder has."""
-    return path / "run.toml" if path.is_dir() else path
 
 
 def _opened(
