@@ -232,15 +232,6 @@ def test_the_result_of_a_recording_is_a_layer_of_it(timeline: str, tmp_path: Pat
     assert columns(merged, "/pumafuse/path/tool")
 
 
-@pytest.mark.long
-def test_the_result_of_a_recording_that_nothing_describes_is_a_layer_of_it(tmp_path: Path) -> None:
-    """By `fuse` without a configuration, too."""
-    path = bag_files.written(tmp_path, bag_files.KINDS["rrd"], bag_files.motion())
-    pumafuse("fuse", path, "-o", tmp_path / "fused", "--rrd")
-    (one,) = RrdReader(tmp_path / "fused" / "fused.rrd").recordings()
-    assert (one.application_id, one.recording_id) == ("robot_cell", "take-7")
-
-
 def test_a_sensor_called_like_a_line_has_an_entity_of_its_own(tmp_path: Path) -> None:
     """Its points would be drawn into the estimate's line."""
     stamps = np.arange(50) * 28_000_000
