@@ -1,4 +1,4 @@
-"""The real executable on real files: `demo`, `fuse`, `compare`, `discretize`, and refusals of every command."""
+"""The command line on real files: `demo`, `fuse`, `compare`, `discretize`, and refusals of every command."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""`pumafuse identify`: the real executable on a campaign of a known arm, and on campaigns that are broken."""
+"""`pumafuse identify`: the command line on a campaign of a known arm, and on campaigns that are broken."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_an_axis_with_too_few_trials_gets_no_model_and_an_unknown_period_must_be
 @pytest.mark.long
 def test_samples_and_the_papers_method_are_recorded(trials: Path, tmp_path: Path) -> None:
     """--samples uses only so many; --paper reads delay and gain off."""
-    path = tmp_path / "arm.toml"
+    path = tmp_path / "new" / "arm"  # a name without an ending is no preset
     found = json.loads(pumafuse("identify", trials, "-o", path, "--paper", "--samples", 45, "--json").stdout)
     assert (found["samples"], found["method"]) == (45, "published")
     assert pf.ArmModel.load(path).provenance["method"].endswith("(--paper)")

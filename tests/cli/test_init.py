@@ -1,4 +1,4 @@
-"""`pumafuse init` by the executable: init, tune and fuse without an edit, and what is refused."""
+"""`pumafuse init` by the command line, and `fuse` without a configuration."""
 
 from __future__ import annotations
 

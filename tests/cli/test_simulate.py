@@ -1,4 +1,4 @@
-"""`pumafuse simulate` and many runs at a time: real executable, real files, real signals."""
+"""`pumafuse simulate` and many runs at a time: real files, real signals."""
 
 from __future__ import annotations
 

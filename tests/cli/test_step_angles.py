@@ -1,4 +1,4 @@
-"""`pumafuse identify`, `verify` and `plan` by the executable on joints: angles in degrees, also beside a length."""
+"""`pumafuse identify`, `verify` and `plan` by the command line on joints: angles in degrees, also beside a length."""
 
 from __future__ import annotations
 

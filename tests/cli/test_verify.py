@@ -1,4 +1,4 @@
-"""`pumafuse verify`: the real executable on a simulated white-noise run."""
+"""`pumafuse verify`: the command line on a simulated white-noise run."""
 
 from __future__ import annotations
 

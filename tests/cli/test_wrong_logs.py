@@ -1,4 +1,4 @@
-"""The real executable on a log that somebody got wrong: one line, exit code 1, no folder; or a warning before all."""
+"""The command line on a log that somebody got wrong: one line, exit code 1, no folder; or a warning before all."""
 
 from __future__ import annotations
 

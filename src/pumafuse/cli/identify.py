@@ -29,7 +29,7 @@ def run(
     force: bool,
 ) -> None:
     """Identify an arm from the step trials in a folder, or from recorded runs."""
-    check_replaceable(output, force, _is_arm(output), "arm model")
+    check_replaceable(output, force, output.exists() and _is_arm(output), "arm model")
     trials = [path for path in paths if (path / "trials.csv").exists()]
     if not trials:
         from . import latency
