@@ -55,10 +55,6 @@ def motion(commands: int = 150) -> list[Sample]:
     return found
 
 
-def _stamp(ns: int) -> tuple[int, int]:
-    return ns // 10**9, ns % 10**9
-
-
 def csv(folder: Path, samples: list[Sample]) -> str:
     """A file for each topic; what run.toml has to say of them."""
     columns = {"/command": "x_m,y_m,z_m", "/camera": "x_m,y_m,z_m", "/joints": "other,z_m", "/level": "x_mm"}
@@ -93,6 +89,16 @@ x = "x_mm"
 """
 
 
+def stamp(ns: int) -> dict[str, int]:
+    """A time of ROS 2."""
+    return {"sec": ns // 10**9, "nanosec": ns % 10**9}
+
+
+def header(ns: int, frame: str = "base") -> dict[str, Any]:
+    """A header of ROS 2."""
+    return {"stamp": stamp(ns), "frame_id": frame}
+
+
 ROS = """
 [command]
 file = "{file}"
@@ -123,19 +129,18 @@ x = {{ column = "data", unit = "mm" }}
 
 def _fields(sample: Sample) -> dict[str, Any]:
     """The fields of a ROS message. The order of joints changes from message to message, as drivers' may."""
-    sec, nanosec = _stamp(sample.stamp)
-    header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "base"}
+    top = header(sample.stamp)
     point = dict(zip("xyz", sample.numbers, strict=False))
     turned = sample.logged // 1000 % 2 == 0
     names, values = list(JOINTS), list(sample.numbers)
     return {
         "/command": {
-            "header": header,
+            "header": top,
             "pose": {"position": point, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}},
         },
-        "/camera": {"header": header, "point": point},
+        "/camera": {"header": top, "point": point},
         "/joints": {
-            "header": header,
+            "header": top,
             "name": names[::-1] if turned else names,
             "position": values[::-1] if turned else values,
             "velocity": [],
@@ -155,39 +160,27 @@ def definition_of(kind: str) -> str:
     return get_typestore(Stores.ROS2_HUMBLE).generate_msgdef(kind, ros_version=2)[0]
 
 
-def mcap(path: Path, samples: list[Sample], **options: Any) -> None:
-    """An MCAP file of ROS 2, by mcap-ros2-support."""
-    with path.open("wb") as file:
-        writer = Ros2Writer(file, **options)
-        schemas = {topic: writer.register_msgdef(kind, definition(topic)) for topic, kind in TYPES.items()}
-        for sample in samples:
-            writer.write_message(
-                sample.topic, schemas[sample.topic], _fields(sample), log_time=sample.logged, publish_time=sample.logged
-            )
-        writer.finish()
-
-
 Sent = tuple[str, str, int, dict[str, Any]]  # topic, type, when it was recorded [ns], fields
 
 
-def stamp(ns: int) -> dict[str, int]:
-    """A time of ROS 2."""
-    return {"sec": ns // 10**9, "nanosec": ns % 10**9}
+def _ros2_mcap(path: Path, sent: Sequence[Sent], **options: Any) -> None:
+    with path.open("wb") as file:
+        writer = Ros2Writer(file, **options)
+        kinds = dict.fromkeys(kind for _, kind, _, _ in sent)
+        schemas = {kind: writer.register_msgdef(kind, definition_of(kind)) for kind in kinds}
+        for topic, kind, time, fields in sent:
+            writer.write_message(topic, schemas[kind], fields, time, time)
+        writer.finish()
 
 
-def header(ns: int, frame: str = "base") -> dict[str, Any]:
-    """A header of ROS 2."""
-    return {"stamp": stamp(ns), "frame_id": frame}
+def mcap(path: Path, samples: list[Sample], **options: Any) -> None:
+    """An MCAP file of ROS 2, by mcap-ros2-support."""
+    _ros2_mcap(path, [(one.topic, TYPES[one.topic], one.logged, _fields(one)) for one in samples], **options)
 
 
 def messages(path: Path, sent: Sequence[Sent]) -> None:
-    """An MCAP file of any messages of ROS 2, by mcap-ros2-support."""
-    with path.open("wb") as file:
-        writer = Ros2Writer(file)
-        schemas = {kind: writer.register_msgdef(kind, definition_of(kind)) for _, kind, _, _ in sent}
-        for topic, kind, time, fields in sorted(sent, key=lambda one: one[2]):
-            writer.write_message(topic, schemas[kind], fields, time, time)
-        writer.finish()
+    """The same of any messages, in the order of their times."""
+    _ros2_mcap(path, sorted(sent, key=lambda one: one[2]))
 
 
 def _message(store: Any, kind: str, fields: dict[str, Any]) -> Any:
@@ -201,18 +194,22 @@ def _message(store: Any, kind: str, fields: dict[str, Any]) -> Any:
     return store.types[kind](**found)
 
 
+def _bag(writer: Any, store: Any, serialise: Callable[[Any, str], Any], samples: list[Sample]) -> None:
+    with writer:
+        open_ = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in TYPES.items()}
+        for sample in samples:
+            kind = TYPES[sample.topic]
+            data = serialise(_message(store, kind, _fields(sample)), kind)
+            writer.write(open_[sample.topic], sample.logged, data)
+
+
 def ros2(path: Path, samples: list[Sample], plugin: str, mode: str = "") -> None:
     """The folder of a ROS 2 bag, by rosbags."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[plugin])
     if mode:
         writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
-    with writer:
-        open_ = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in TYPES.items()}
-        for sample in samples:
-            kind = TYPES[sample.topic]
-            data = store.serialize_cdr(_message(store, kind, _fields(sample)), kind)
-            writer.write(open_[sample.topic], sample.logged, data)
+    _bag(writer, store, store.serialize_cdr, samples)
 
 
 def ros1(path: Path, samples: list[Sample], compression: str = "", chunk: int = 1 << 20) -> None:
@@ -222,12 +219,7 @@ def ros1(path: Path, samples: list[Sample], compression: str = "", chunk: int = 
     writer.chunk_threshold = chunk
     if compression:
         writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
-    with writer:
-        open_ = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in TYPES.items()}
-        for sample in samples:
-            kind = TYPES[sample.topic]
-            data = store.serialize_ros1(_message(store, kind, _fields(sample)), kind)
-            writer.write(open_[sample.topic], sample.logged, data)
+    _bag(writer, store, store.serialize_ros1, samples)
 
 
 FOXGLOVE = (
@@ -236,7 +228,7 @@ FOXGLOVE = (
 
 
 def _flat(sample: Sample) -> dict[str, Any]:
-    sec, nsec = _stamp(sample.stamp)
+    sec, nsec = divmod(sample.stamp, 10**9)
     point = dict(zip("xyz", sample.numbers, strict=False))
     return {
         "timestamp": {"sec": sec, "nsec": nsec},
@@ -282,7 +274,7 @@ def protobuf_mcap(path: Path, samples: list[Sample]) -> None:
     with path.open("wb") as out:
         writer = ProtobufWriter(out)
         for sample in samples:
-            sec, nsec = _stamp(sample.stamp)
+            sec, nsec = divmod(sample.stamp, 10**9)
             flat = _flat(sample) | {"timestamp": {"seconds": sec, "nanos": nsec}}
             writer.write_message(sample.topic, made(**flat), log_time=sample.logged, publish_time=sample.logged)
         writer.finish()

@@ -1,4 +1,4 @@
-"""The real executable, as the tests of every command run it."""
+"""The command line, as the tests of every command run it."""
 
 from __future__ import annotations
 
@@ -23,20 +23,10 @@ SCAN, FUSION = DATA / "scan1", DATA / "fusion.toml"
 def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
     """Run the command line; its exit code must be ``code`` and it must never show a traceback.
 
-    What is to be refused is refused in this process, which saves the start of another one.
+    It is run in this process, with the warnings of a new one: to start another one takes longer than most commands.
     """
     words = [str(EXECUTABLE), *map(str, arguments)]
-    if code in (1, 2, 70):
-        done = _here(words)
-    else:
-        done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
-
-
-def _here(words: list[str]) -> subprocess.CompletedProcess[str]:
-    out, err = io.StringIO(), io.StringIO()
+    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
     with (
         warnings.catch_warnings(),
         mock.patch.object(sys, "argv", words),
@@ -44,15 +34,16 @@ def _here(words: list[str]) -> subprocess.CompletedProcess[str]:
         redirect_stderr(err),
         pytest.raises(SystemExit) as ended,
     ):
+        warnings.onceregistry.clear()
+        warnings.resetwarnings()
+        for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
+            warnings.simplefilter("ignore", kind)
         main()
-    return subprocess.CompletedProcess(words, int(ended.value.code or 0), out.getvalue(), err.getvalue())
-
-
-def printed(*arguments: object) -> str:
-    """What a command that succeeds prints, run in this process, which saves the start of another one."""
-    done = _here([str(EXECUTABLE), *map(str, arguments)])
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    texts = (stream.buffer.getvalue().decode() for stream in (out, err))
+    done = subprocess.CompletedProcess(words, int(ended.value.code or 0), *texts)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
 
 
 def refused(*arguments: object) -> str:

@@ -301,9 +301,6 @@ class Both:
         assert all(line.endswith(b"\n") and line.count(b"\n") == 1 for line in lines)
         self._written += lines
 
-    def forget_written(self) -> None:
-        self._written = []
-
     @property
     def written(self) -> bytes:
         return b"".join(self._written)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -12,31 +13,16 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import multivariate_normal
 
-import pumafuse as pf
 from pages import ROOT
 from pumafuse.tuning.arm_search import ArmSearch
-from pumafuse.units import DEG
-
-SHARED = ROOT.parent / "shared" / "data" / "trunk-servo"
 
 
 @pytest.fixture
-def ungated(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    return importlib.import_module("ungated")
-
-
-@pytest.fixture
-def kinematic(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    return importlib.import_module("kinematic")
-
-
-@pytest.fixture
-def lag(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    """Imports one of the benchmarks' modules."""
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
-    return importlib.import_module("lag")
+    return importlib.import_module
 
 
 def covariance(order: int, density: float, time: float, prior: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -51,12 +37,14 @@ def covariance(order: int, density: float, time: float, prior: np.ndarray, s: np
 
 @pytest.mark.parametrize("order", [1, 2, 3])
 @pytest.mark.parametrize(("late", "smooth"), [(0.0, False), (0.07, False), (0.0, True)])
-def test_estimates_are_those_of_a_gaussian_process(ungated: ModuleType, order: int, late: float, smooth: bool) -> None:
+def test_estimates_are_those_of_a_gaussian_process(
+    benchmark: Callable[[str], ModuleType], order: int, late: float, smooth: bool
+) -> None:
     """Filtered, as live and smoothed: mean and sd of a regression on the measurements known then, all at once."""
     rng = np.random.default_rng(1)
     time, at = np.append(0.0, np.sort(rng.uniform(0.0, 3.0, 20))), np.sort(rng.uniform(0.2, 3.0, 15))
     value = 3.0 * np.sin(2.0 * time) + rng.normal(0.0, 0.3, len(time))
-    model = ungated.Process(order, 2.0, 0.3, 0.4)
+    model = benchmark("ungated").Process(order, 2.0, 0.3, 0.4)
     mean, sd = model.estimate(time, value, at, late, smooth)
     prior, level = np.var(value) * 100.0 ** np.arange(order), 0.0 if order == 1 else value[0]
     for k, instant in enumerate(at):
@@ -71,7 +59,9 @@ def test_estimates_are_those_of_a_gaussian_process(ungated: ModuleType, order: i
 
 
 @pytest.mark.parametrize("order", [2, 3])
-def test_filters_with_a_gate_are_a_gaussian_process_without_outliers(kinematic: ModuleType, order: int) -> None:
+def test_filters_with_a_gate_are_a_gaussian_process_without_outliers(
+    benchmark: Callable[[str], ModuleType], order: int
+) -> None:
     """Of two that run side by side: positions and likelihoods of regressions on all but the outlier, at once.
 
     The outlier counts as if it were at the gate.
@@ -80,10 +70,10 @@ def test_filters_with_a_gate_are_a_gaussian_process_without_outliers(kinematic: 
     time, at = np.sort(rng.uniform(0.0, 3.0, 30)), np.sort(rng.uniform(0.2, 3.0, 15))
     value = 0.5 + 0.002 * np.sin(2.0 * time) + rng.normal(0.0, 3e-4, len(time))
     value[20] += 1.0
-    known = kinematic.Known(np.ones(1), np.zeros(1), np.array([-1]), np.zeros(0), 0.5, 0.002, 0.03)
+    known = benchmark("kinematic").Known(np.ones(1), np.zeros(1), np.array([-1]), np.zeros(0), 0.5, 0.002, 0.03)
     densities, sds = np.array([0.01, 0.03]), np.array([3e-4, 5e-4])
-    measured = kinematic.Measured(time, np.zeros(len(time), dtype=np.int64), value)
-    position, likelihood = kinematic.follow(order, np.log([densities, sds]), known, measured, at)
+    measured = benchmark("kinematic").Measured(time, np.zeros(len(time), dtype=np.int64), value)
+    position, likelihood = benchmark("kinematic").follow(order, np.log([densities, sds]), known, measured, at)
     fused, prior = np.arange(len(time)) != 20, np.array([0.002, 0.01, 0.1])[:order] ** 2
     for k, (density, sd) in enumerate(zip(densities, sds, strict=True)):
         K, cross, now = (
@@ -100,39 +90,25 @@ def test_filters_with_a_gate_are_a_gaussian_process_without_outliers(kinematic: 
         assert likelihood[k] == pytest.approx(rest - 0.5 * (np.log(2e6 * np.pi * S) + 25.0), abs=1e-6)
 
 
-def test_least_squares_find_what_the_commands_lead_to(ungated: ModuleType) -> None:
+def test_least_squares_find_what_the_commands_lead_to(benchmark: Callable[[str], ModuleType]) -> None:
     """Superposed step responses, delayed, with another gain and an offset: all four numbers come back."""
     rng = np.random.default_rng(2)
     time = np.cumsum(rng.uniform(0.008, 0.012, 1000))
     command, when = np.cumsum(rng.normal(0.0, 1.0, 1000)), np.sort(rng.uniform(1.0, 9.0, 200))
     late = np.maximum(when[:, None] - 0.13 - time, 0.0)
     moved = command[0] + (1.0 - np.exp(-late[:, 1:] / 0.06)) @ np.diff(command)
-    found = ungated.least_squares(time, command, when, 2.0 + 0.8 * moved)
+    found = benchmark("ungated").least_squares(time, command, when, 2.0 + 0.8 * moved)
     assert [found.delay, found.time_constant] == pytest.approx([0.13, 0.06], abs=1e-4)
     assert [found.gain, found.offset] == pytest.approx([0.8, 2.0], abs=1e-3)
     assert found.at(time, command, when) == pytest.approx(2.0 + 0.8 * moved, abs=1e-2)
 
 
-@pytest.mark.parametrize("name", ["0g", "100g"])
-def test_the_example_is_the_recording(name: str) -> None:
-    """Values and stamps of examples/trunk-servo are those of the recording, which is in degrees, to the digit."""
-    if not SHARED.exists():
-        pytest.skip("the recordings that the example was made from are not at hand")
-    run = pf.Run.read(ROOT / "examples" / "trunk-servo" / name)
-    assert run.reference is not None and not run.notes
-    for file, source in {"commands": run.command, "camera": run.sensors["camera"], "encoder": run.reference}.items():
-        table = np.loadtxt(SHARED / name / f"{file}.csv.gz", delimiter=",", skiprows=1)
-        assert np.array_equal(source.stamp, np.rint(table[:, 0] * 1e9).astype(np.int64))
-        for number, values in enumerate(source.values.values(), 1):
-            assert np.array_equal(values, table[:, number] / DEG)
-
-
 # ---- lags of simulated arms -----------------------------------------------------------------------------------------
 
 
-def test_the_simulated_arm_answers_as_its_equations_say(lag: ModuleType) -> None:
+def test_the_simulated_arm_answers_as_its_equations_say(benchmark: Callable[[str], ModuleType]) -> None:
     """Second order, a gain that recovers: solved as a differential equation by scipy, step by step of the command."""
-    axis = lag.Axis(delay=0.0437, order=2, lag=0.06, damping=0.8, gain=0.9, recovery=0.12)
+    axis = benchmark("lag").Axis(delay=0.0437, order=2, lag=0.06, damping=0.8, gain=0.9, recovery=0.12)
     omega, time = 2.0 * 0.8 / 0.06, np.arange(0.0, 1.0, 0.028)
     u = 0.01 * np.sin(4.0 * time)
     state, at, error, known = np.zeros(2), 0.0437, 0.0, [(0.0, 0.0), (0.0437, 0.0)]
@@ -150,16 +126,16 @@ def test_the_simulated_arm_answers_as_its_equations_say(lag: ModuleType) -> None
         known.append((at, state[0]))
     when, where = np.array(known).T
     inside = when < 0.95
-    assert lag._response(axis, time, u, 1.0)(when[inside]) == pytest.approx(u[0] + where[inside], abs=2e-6)
+    assert benchmark("lag")._response(axis, time, u, 1.0)(when[inside]) == pytest.approx(u[0] + where[inside], abs=2e-6)
 
 
 @pytest.mark.long
-def test_intervals_of_lags_hold_on_arms_of_all_kinds(lag: ModuleType) -> None:
+def test_intervals_of_lags_hold_on_arms_of_all_kinds(benchmark: Callable[[str], ModuleType]) -> None:
     """Ten runs of two axes: 95 % intervals hold in at least 86 % (95 % less 3.5 sd of some 80), and correlation errs.
 
     The RMS error of the lag is at most a third of that of the best correlation with the same held command.
     """
-    found = [lag.examined((seed, 2, 0.0)) for seed in range(300, 310)]
+    found = [benchmark("lag").examined((seed, 2, 0.0)) for seed in range(300, 310)]
     numbers = [one for mine, _, _ in found for one in mine]
     errors = np.array([off for _, mine, _ in found for off in mine])
     assert len(numbers) > 60
@@ -170,7 +146,9 @@ def test_intervals_of_lags_hold_on_arms_of_all_kinds(lag: ModuleType) -> None:
 
 
 @pytest.mark.long
-def test_delays_a_period_away_are_looked_at(lag: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_delays_a_period_away_are_looked_at(
+    benchmark: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In one run a model has two maxima a period of 8 ms apart, in another the first one found is a period off."""
     searches, latency = list[ArmSearch](), importlib.import_module("pumafuse.tuning.latency")
 
@@ -179,32 +157,31 @@ def test_delays_a_period_away_are_looked_at(lag: ModuleType, monkeypatch: pytest
         return searches[-1]
 
     monkeypatch.setattr(latency, "ArmSearch", kept)
-    lag.examined((323, 2, 0.0))
+    benchmark("lag").examined((323, 2, 0.0))
     tops = defaultdict[tuple[int, str], list[float]](list)
     for number, search in enumerate(searches):
         for one in search.posterior.branches:
             tops[number, str(one.model)].append(one.delays[np.argmax(one.log_density)] / 0.008)
     assert any(0.6 < max(each) - min(each) < 1.4 for each in tops.values()), tops
-    found, _, _ = lag.examined((306, 2, 0.0))
+    found, _, _ = benchmark("lag").examined((306, 2, 0.0))
     assert len(found) == 8
     assert all(one.low <= one.truth <= one.high for one in found), found
 
 
 @pytest.mark.long
-def test_a_drift_of_20_ms_is_named(lag: ModuleType) -> None:
+def test_a_drift_of_20_ms_is_named(benchmark: Callable[[str], ModuleType]) -> None:
     """In all of six runs: of such runs 95 % are named."""
     for seed in range(500, 506):
-        _, _, named = lag.examined((seed, 2, 0.02))
+        _, _, named = benchmark("lag").examined((seed, 2, 0.02))
         assert any("drifts" in one for one in named), seed
 
 
 # ---- where tables go ------------------------------------------------------------------------------------------------
 
 
-def test_tables_go_between_the_marks_of_who_makes_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_tables_go_between_the_marks_of_who_makes_them(benchmark: Callable[[str], ModuleType], tmp_path: Path) -> None:
     """The rest of a page stays, also what another one makes."""
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    page, text = importlib.import_module("page"), tmp_path / "page.md"
+    page, text = benchmark("page"), tmp_path / "page.md"
     other, mine = (f"<!-- made by benchmarks/{name}.py -->\n\nold\n\n<!-- until here -->\n" for name in ("a", "b"))
     text.write_text(f"one\n{other}two\n{mine}three\n")
     page.put(text, "b.py", "new")

@@ -50,13 +50,17 @@ def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Call
         raise FolderError(f"{folder}: exists; --force replaces it, or choose another folder")
 
 
+def check_replaceable(path: Path, force: bool, ours: bool, what: str) -> None:
+    """Refuse to replace a file that is not ours, no ``what``, also with --force: its name may be a slip."""
+    if path.exists() and not ours:
+        raise FolderError(f"{path}: exists and is no {what}, which is not ours to replace; choose another")
+    if path.exists() and not force:
+        raise FolderError(f"{path}: exists; --force replaces it")
+
+
 @contextmanager
 def replacing(folder: Path) -> Generator[Path]:
-    """A new folder to write into, which replaces ``folder`` on leaving the block.
-
-    Raises:
-        FolderError: The disk refuses, or another process has written the folder meanwhile.
-    """
+    """A new folder to write into, which replaces ``folder`` on leaving the block."""
     with _refused(folder):
         folder = folder.resolve()  # a link stays a link, its target is replaced
     with _beside(folder) as place:
@@ -81,16 +85,7 @@ def _identity(folder: Path) -> int | None:
 
 
 def write_file(path: Path, content: str | bytes, *, replace: bool = True) -> None:
-    """Write a file whole or not at all.
-
-    Args:
-        path: The file.
-        content: What is in it.
-        replace: Whether in the place of an earlier one; else there was none when the work began.
-
-    Raises:
-        FolderError: The disk refuses, or another process has written the file meanwhile.
-    """
+    """Write a file whole or not at all; without ``replace`` there was none when the work began, and must be none."""
     with _refused(path):
         path = path.resolve()
     with _beside(path) as place:

@@ -41,20 +41,12 @@ class Reported(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file with every number in SI.
-
-    Raises:
-        ConfigError: The file is absent, is not text, is not TOML, or has a number that is not finite.
-    """
+    """The tables of a TOML file with every number in SI."""
     return parsed(text_of(path), str(path))
 
 
 def text_of(path: Path) -> str:
-    """The text of a file that describes something, one character more than it may have at most.
-
-    Raises:
-        ConfigError: The file is absent, or is not text.
-    """
+    """The text of a file that describes something, one character more than it may have at most."""
     try:
         with path.open(encoding="utf-8") as file:
             return file.read(MOST_TEXT + 1)
@@ -67,15 +59,7 @@ def text_of(path: Path) -> str:
 
 
 def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The tables of a TOML text, or of a dict that has what such a text would have, with every number in SI.
-
-    Args:
-        source: The text, or the dict.
-        where: What it is, for errors.
-
-    Raises:
-        ConfigError: The text is not TOML, the dict holds what no TOML can, or a number is not finite.
-    """
+    """The tables of a TOML text, or of a dict that has what such a text would have, with every number in SI."""
     if not isinstance(source, str | Mapping):  # pyright: ignore  (who is not checked may give anything)
         raise ConfigError(f"{where}: expected a text or a dict, got {type(source).__name__}")
     try:
@@ -95,11 +79,7 @@ def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _plain(value: Any, path: str) -> Any:
-    """A value of a dict as TOML has it: numbers of numpy are numbers, tuples lists.
-
-    Raises:
-        ConfigError: It is none that TOML has.
-    """
+    """A value of a dict as TOML has it: numbers of numpy are numbers, tuples lists."""
     if getattr(value, "shape", None) == ():
         value = value.item()
     if isinstance(value, Mapping):
@@ -143,11 +123,7 @@ def struct(tree: Any, kind: type[S], where: str, path: str = "", axis: Kind = "l
 
 
 def check(value: Any, kind: Any, where: str, path: str) -> None:
-    """Refuse a value (SI numbers) that is not of a type.
-
-    Raises:
-        ConfigError: It is not; names file and key.
-    """
+    """Refuse a value (SI numbers) that is not of a type."""
     for problem in _problems(value, kind, path):
         raise ConfigError(f"{where}: {problem}")
 
@@ -158,24 +134,14 @@ def text(tree: Mapping[str, Any]) -> str:
 
 
 def builtins(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
-    """A struct as plain tables with the file's key names; None is left out, as TOML has none.
-
-    Args:
-        value: The struct.
-        axis: What the axes are to which it belongs: its keys get the units of that.
-    """
+    """A struct as plain tables with the file's key names; None is left out, as TOML has none."""
     dates = (datetime.datetime, datetime.date, datetime.time)
     tree = msgspec.to_builtins(_of_kind(value, axis), builtin_types=dates, enc_hook=float)  # numpy's numbers are floats
     return _without_none(tree)
 
 
 def reported(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
-    """A struct (SI numbers) as plain tables for JSON, in the units of the file's key names; None stays.
-
-    Args:
-        value: The struct.
-        axis: What the axes are to which it belongs: its keys have the units of that.
-    """
+    """A struct (SI numbers) as plain tables for JSON, in the units of the file's key names; None stays."""
     return from_si(msgspec.to_builtins(_of_kind(value, axis), enc_hook=float))
 
 

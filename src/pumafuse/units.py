@@ -135,9 +135,6 @@ def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """A parsed TOML table with every number that has a unit in SI; the names stay as they are.
 
     A unit holds for lists and for the entries of a sub-table: ``sd_mm = { x = 0.05 }``. Provenance is kept as is.
-
-    Raises:
-        ConfigError: A number outside an interval (``_ci95``) is not finite.
     """
     return _converted(tree, "", "", _si)
 
@@ -168,9 +165,6 @@ def refuse_name(kind: str, name: str) -> None:
     """Refuse the name of an axis or a sensor that ends like a unit, or that no screen can show.
 
     Its table's numbers would be taken to have that unit, and ``<axis>_mm`` would have two.
-
-    Raises:
-        ConfigError: It does.
     """
     unit = ending(name)
     if unit is not None:

@@ -1,4 +1,4 @@
-"""`pumafuse identify`: the real executable on a campaign of a known arm, and on campaigns that are broken."""
+"""`pumafuse identify`: the command line on a campaign of a known arm, and on campaigns that are broken."""
 
 from __future__ import annotations
 
@@ -17,12 +17,6 @@ TRUE = {
     "vertical": pf.SecondOrder(natural_frequency=53.9, damping=0.864),
 }
 DELAY, SLOPE, INTERCEPT, NOISE = 0.0604, 0.08, 0.94, 2e-5  # s, s/m, 1, m
-SCENARIO = """
-name = "noise"
-arm = "puma560-internal"
-trajectory = { kind = "white-noise", axes = ["radial", "vertical"], amplitude_mm = 5.0, duration_s = 2.0 }
-sensors.eye = { rate_hz = 30.0, sd_mm = 0.5 }
-"""
 
 
 def samples(name: str, plant: pf.FirstOrder | pf.SecondOrder, step_mm: float, seed: int) -> str:
@@ -63,36 +57,14 @@ def identified(trials: Path) -> tuple[Path, dict[str, object]]:
     return path, json.loads(done.stdout)
 
 
-def check(truth: float, value: float, interval: tuple[float, float] | None) -> None:
-    """In twice its 95 % interval, which is not a wide one."""
-    assert interval is not None
-    half = 0.5 * (interval[1] - interval[0])
-    assert abs(value - truth) <= 2.0 * half and half < 0.05 * truth
-
-
-def test_the_arm_is_the_true_one_with_its_provenance(identified: tuple[Path, dict[str, object]]) -> None:
-    """Order, delay, gain line and plant, each within twice its interval; counts and method in the provenance."""
-    arm = pf.ArmModel.load(identified[0])
-    assert (arm.name, arm.update_period, set(arm.axes)) == ("bench", 0.028, {"radial", "vertical"})
-    check(DELAY, arm.delay, arm.delay_ci95)
-    for axis, model in arm.axes.items():
-        assert type(model.plant) is type(TRUE[axis]) and model.gain_recovery is None
-        names = [name for name in model.plant.__struct_fields__ if not name.endswith("_ci95")]
-        for name in names:
-            check(getattr(TRUE[axis], name), getattr(model.plant, name), getattr(model.plant, f"{name}_ci95"))
-        check(INTERCEPT, model.gain.intercept, model.gain.intercept_ci95)
-        low, high = model.gain.slope_ci95
-        assert abs(model.gain.slope - SLOPE) <= high - low < 0.08
-    assert arm.validity.max_speed == pytest.approx(0.5)
-    assert arm.provenance["made_by"].startswith("pumafuse identify ")
-    counted = {"trials": {"radial": 12, "vertical": 12}, "method": "all parameters fitted", "samples": "all"}
-    assert {key: arm.provenance[key] for key in counted} == counted
-
-
 def test_json_agrees_with_the_file(identified: tuple[Path, dict[str, object]]) -> None:
     """The arm with its intervals in file units; trials in the order of the list with their own fits."""
     path, found = identified
     arm, expected = found["arm"], pf.ArmModel.load(path)
+    assert (expected.name, set(expected.axes)) == ("bench", {"radial", "vertical"})
+    assert expected.provenance["made_by"].startswith("pumafuse identify ")
+    counted = {"trials": {"radial": 12, "vertical": 12}, "method": "all parameters fitted", "samples": "all"}
+    assert {key: expected.provenance[key] for key in counted} == counted
     radial, own = arm["axes"]["radial"], expected.axes["radial"]
     assert arm["update_period_ms"] == 28.0
     assert arm["delay_ms"] == pytest.approx(1e3 * expected.delay, rel=1e-12)
@@ -112,19 +84,6 @@ def test_json_agrees_with_the_file(identified: tuple[Path, dict[str, object]]) -
         assert one["combined_rms_mm"] < 0.06
     lag = found["axes"]["vertical"]["delays"]["lag_ms"]["value"]
     assert lag == pytest.approx(60.4 + 2e3 * 0.864 / 53.9, abs=0.5)
-
-
-def test_fuse_takes_the_file_as_it_is(identified: tuple[Path, dict[str, object]], tmp_path: Path) -> None:
-    """A recorded run is fused with the identified arm beside its fusion.toml; the result keeps the arm as read."""
-    (tmp_path / "noise.toml").write_text(SCENARIO)
-    run = tmp_path / "run"
-    pumafuse("simulate", tmp_path / "noise.toml", "-o", run)
-    (run / "arm.toml").write_bytes(identified[0].read_bytes())
-    (run / "fusion.toml").write_text('arm = "arm.toml"\n[sensors.eye]\nsd_mm = 0.5\n')
-    pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", tmp_path / "out")
-    used, expected = pf.ArmModel.load(tmp_path / "out" / "arm.toml"), pf.ArmModel.load(identified[0])
-    assert (used.axes, used.delay) == (expected.axes, expected.delay)
-    assert set(json.loads((tmp_path / "out" / "summary.json").read_text())["axes"]) == {"radial", "vertical"}
 
 
 @pytest.mark.long
@@ -160,22 +119,12 @@ def test_an_axis_with_too_few_trials_gets_no_model_and_an_unknown_period_must_be
 
 
 @pytest.mark.long
-def test_samples_and_the_papers_method_change_the_answer(
-    trials: Path, identified: tuple[Path, dict[str, object]], tmp_path: Path
-) -> None:
-    """--samples uses only so many and records it; --paper reads delay and gain off, which is near and not the same."""
-    arms = {"fitted": pf.ArmModel.load(identified[0])}
-    for name, options in (("short", ("--samples", 45)), ("paper", ("--paper", "--samples", 45))):
-        found = json.loads(pumafuse("identify", trials, "-o", tmp_path / name, *options, "--json").stdout)
-        arms[name] = pf.ArmModel.load(tmp_path / name)
-        assert (found["samples"], found["method"]) == (45, "published" if name == "paper" else "fitted")
-    assert arms["paper"].provenance["method"].endswith("(--paper)")
-    assert arms["short"].provenance["samples"] == 45
-    assert len({arm.axes["radial"].plant.time_constant for arm in arms.values()}) == 3
-    for name, arm in arms.items():
-        assert arm.delay == pytest.approx(DELAY, abs=0.006), name
-        assert arm.axes["radial"].gain.intercept == pytest.approx(INTERCEPT, abs=0.03), name
-    assert abs(arms["fitted"].delay - DELAY) < 0.0005 < abs(arms["paper"].delay - arms["fitted"].delay)
+def test_samples_and_the_papers_method_are_recorded(trials: Path, tmp_path: Path) -> None:
+    """--samples uses only so many; --paper reads delay and gain off."""
+    path = tmp_path / "new" / "arm"  # a name without an ending is no preset
+    found = json.loads(pumafuse("identify", trials, "-o", path, "--paper", "--samples", 45, "--json").stdout)
+    assert (found["samples"], found["method"]) == (45, "published")
+    assert pf.ArmModel.load(path).provenance["method"].endswith("(--paper)")
 
 
 def test_what_is_not_there_is_one_line(trials: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`pumafuse latency` and `identify RUN`: the real executable on the real robot of the examples."""
+"""`pumafuse latency` and `identify RUN`: the command line on the real robot of the examples."""
 
 from __future__ import annotations
 

@@ -12,11 +12,11 @@ from io import StringIO
 
 import numpy as np
 import pytest
-from rich.console import Console, Group
+from rich.console import Console
 
 import pumafuse as pf
 from executable import DATA, EXECUTABLE, FUSION, SCAN, pumafuse, refused
-from pumafuse.cli.live import QUIET, _Feeder, status
+from pumafuse.cli.live import status
 from streams import Both, line, wired
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -59,27 +59,6 @@ def test_the_status_shows_milliseconds_and_millimetres() -> None:
     shown = out.export_text()
     assert "8.0" in shown[shown.index("tracker") :].splitlines()[0].split()
     assert "t = 110.000 s, predicted" in shown
-
-
-def test_the_status_goes_on_while_nothing_comes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the computer's clock: five seconds later the estimate is a prediction, and the tracker silent."""
-    both, now, shown = Both(), [0.0], list[Group]()
-
-    class Screen:
-        def update(self, group: Group, *, refresh: bool) -> None:
-            assert refresh
-            shown.append(group)
-
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    feeder = _Feeder(both.stream, (), 1.0, None, (), Screen(), moved=0.0, drawn=0.0)
-    feeder.take([line(100.0, radial=570.0).strip(), line(100.0, "tracker", radial=570.0).strip()])
-    now[0] = 5.0
-    feeder.take([])
-    out = Console(width=140, record=True, file=StringIO())
-    out.print(shown[-1])
-    text = out.export_text()
-    assert f"t = {105.0 - QUIET:.3f} s, predicted" in text
-    assert f"{5.0 - QUIET:.1f}" in text[text.index("tracker") :].splitlines()[0].split()
 
 
 def test_lines_from_standard_input() -> None:
@@ -133,7 +112,7 @@ def test_an_open_pipe_is_answered_at_once() -> None:
         (["tcp://127.0.0.1:5005", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], "tcp-listen://HOST:PORT"),
         (["stdin", "--out", "tcp://127.0.0.1:5005"], "expected udp://HOST:PORT"),
         (["stdin", "--record", "/dev/null"], "/dev/null"),
-        (["stdin", "--rerun", "paper"], "paper"),
+        (["stdin", "--rerun", "paper"], "--rerun: no mode 'paper'; there are: spawn, connect, web"),
     ],
 )
 def test_what_is_wrong_is_one_line(words: list[str], message: str) -> None:

@@ -80,41 +80,6 @@ def run(folder: Path) -> Path:
     return made
 
 
-def test_the_joints_are_the_true_ones(folder: Path) -> None:
-    """Order, plant, delay and the gain's line, each within twice its interval, from the file that was written."""
-    arm = pf.ArmModel.load(folder / "arm.toml")
-    assert (list(arm.axes), arm.update_period) == (["shoulder", "wrist"], 0.02)
-    for axis, model in arm.axes.items():
-        assert (model.kind, type(model.plant)) == ("angle", type(PLANTS[axis]))
-        pairs = [(DELAY, arm.delay, arm.delay_ci95), (SLOPE, model.gain.slope, model.gain.slope_ci95)]
-        pairs += [(INTERCEPT, model.gain.intercept, model.gain.intercept_ci95)]
-        for name in PLANTS[axis].__struct_fields__:
-            if not name.endswith("_ci95"):
-                pairs.append((getattr(PLANTS[axis], name), *(getattr(model.plant, n) for n in (name, f"{name}_ci95"))))
-        for truth, value, (low, high) in pairs:
-            assert abs(value - truth) <= high - low < 0.2 * truth
-    assert arm.validity.max_angular_speed == pytest.approx(100.0 * DEGREE, rel=1e-9)
-    assert "max_speed_deg_s = 100.0\n" in (folder / "arm.toml").read_text()
-
-
-def test_json_and_page_are_in_degrees(folder: Path) -> None:
-    """The noise is found in the RMS, steps and speeds are as listed, the tolerance as given."""
-    found = json.loads((folder / "found.json").read_text())
-    assert found["tolerance_deg"] == 0.2
-    for trial in found["trials"]:
-        assert trial["speed_deg_s"] == pytest.approx(abs(trial["step_deg"]) / PERIOD, rel=1e-9)
-        assert trial["second"]["rms_deg"] == pytest.approx(NOISE, rel=0.4)
-    assert "step, deg" in (folder / "page" / "report.html").read_text()
-
-
-@pytest.mark.long
-def test_the_terminal_says_units_of_angles(folder: Path, tmp_path: Path) -> None:
-    """Also of the gain's line, in brackets that are no markup; without --tolerance it is 0.1 degrees."""
-    shown = pumafuse("identify", folder / "steps", "-o", tmp_path / "arm.toml").stdout
-    assert "[rad/s]" in shown and "RMS, deg" in shown and " mm" not in shown
-    assert "within 0.1 deg at every level tried" in shown
-
-
 @pytest.mark.long
 def test_verify_shows_each_axis_in_its_unit(folder: Path, run: Path, tmp_path: Path) -> None:
     """A table for the rail and one for the joints, on the page too, with the numbers of the JSON: the noise is left."""

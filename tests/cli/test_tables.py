@@ -8,7 +8,7 @@ import pytest
 
 from pumafuse.cli.tables import print_tables, table
 
-HEADINGS = ["axis", "sensor", "measurements,\nof both", "RMSE, mm", "verdict"]
+HEADINGS = ["axis", "sensor", "measurements,\nof both", "RMSE [mm]", "verdict"]
 ROWS = [
     ["x", "camera of the cell", "17997", "-600.392 ± 0.013", "NIS 0.97, expected 0.96 to 1.04: consistent in size"],
     ["yaw", "lidar :key:", "5", "+0.1", "NIS 12345.678, expected 0.99 to 1.01: follows the velocity"],

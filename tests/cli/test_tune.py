@@ -1,4 +1,4 @@
-"""`pumafuse tune`: the real executable on simulated runs: its files, output, refusals, and Ctrl-C."""
+"""`pumafuse tune`: the command line on simulated runs: its files, output, refusals, and Ctrl-C."""
 
 from __future__ import annotations
 

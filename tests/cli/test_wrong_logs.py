@@ -1,4 +1,4 @@
-"""The real executable on a log that somebody got wrong: one line, exit code 1, no folder; or a warning before all."""
+"""The command line on a log that somebody got wrong: one line, exit code 1, no folder; or a warning before all."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import pytest
 
 from executable import EXECUTABLE, pumafuse, refused
 from pumafuse.arrays import FloatArray
+from tuning_runs import later
 
 MY_RUN = Path(__file__).parents[2] / "examples/my-run"
 
@@ -91,7 +92,7 @@ def swings(time: FloatArray) -> FloatArray:
 
 def test_what_reading_notices_is_said_once(tmp_path: Path) -> None:
     """Tuning and fusing read the same rows: two rows that are exchanged are one line."""
-    time = np.arange(0.0, 20.0, 0.025)
+    time = np.arange(0.0, 10.0, 0.025)
     measured = swings(time - 0.11) + np.random.default_rng(2).normal(0.0, 0.05, len(time))
     columns = {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured}
     order = np.arange(len(time))
@@ -103,7 +104,7 @@ def test_what_reading_notices_is_said_once(tmp_path: Path) -> None:
     assert len(set(lines)) == len(lines)
 
 
-@pytest.mark.parametrize("early", [0.05, 0.31])
+@pytest.mark.parametrize("early", [0.05, later(0.31)])
 def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path: Path) -> None:
     """Fuse and latency refuse it in one line; with the shift_s that this names its lag is the guess."""
     time = np.arange(0.0, 30.0, 0.02)
@@ -127,7 +128,7 @@ def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path
 @pytest.mark.parametrize("described", [False, True])
 def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(described: bool, tmp_path: Path) -> None:
     """It is left out, and said to be; where run.toml describes it, it goes by its commands, and has no lag."""
-    time, rng = np.arange(0.0, 30.0, 0.02), np.random.default_rng(6)
+    time, rng = np.arange(0.0, 15.0, 0.02), np.random.default_rng(6)
     columns = {"t_s": time}
     for axis, late, slower in (("a", 0.09, 1.0), ("b", -0.12, 0.83)):
         columns |= {f"goal_{axis}_deg": swings(slower * time)}
@@ -172,8 +173,7 @@ def test_an_exception_that_nobody_foresaw_is_a_line_for_a_report(
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
-@pytest.mark.parametrize("name", ["log.csv", "log.mcap", "log.parquet"])
-@pytest.mark.parametrize("command", ["fuse", "latency"])
+@pytest.mark.parametrize(("name", "command"), [("log.csv", "fuse"), ("log.mcap", "latency"), ("log.parquet", "fuse")])
 def test_a_pipe_that_nobody_writes_into_is_refused_at_once(name: str, command: str, tmp_path: Path) -> None:
     """Reading it would wait for ever."""
     os.mkfifo(pipe := tmp_path / name)

@@ -16,7 +16,7 @@ import pyarrow.parquet as papq
 import pytest
 
 import pumafuse as pf
-from executable import printed
+from executable import pumafuse
 from pumafuse.cli.tables import outcome_table
 from pumafuse.fusion import results
 from pumafuse.live.stream import Stream
@@ -151,7 +151,7 @@ def test_files_and_screens_have_the_units_of_the_axis(folders: dict[str, Path], 
     shown: dict[str, str] = {}
     for unit in ("mm", "deg"):
         given = ["fuse", folders[unit], "-c", folders[unit] / "fusion.toml", "-o", tmp_path / unit]
-        shown[unit] = printed(*given)
+        shown[unit] = pumafuse(*given).stdout
     words = {unit: re.sub(r"─+|\S*/\S*", "", text).replace("deg", "mm").split() for unit, text in shown.items()}
     assert words["deg"][1:] == words["mm"][1:]  # but for the run's name
     for file in ("estimates", "measurements", "reference"):
@@ -176,7 +176,7 @@ def test_files_and_screens_have_the_units_of_the_axis(folders: dict[str, Path], 
     again = result.scores(result.reference)
     assert again["a"].rmse_deg == pytest.approx(angle["score"]["rmse_deg"], rel=1e-9)
     assert pf.FusionConfig.load(tmp_path / "deg" / "fusion.toml") == fused(folders["deg"]).config
-    compared = json.loads(printed("compare", tmp_path / "deg", tmp_path / "mm", "--json"))
+    compared = json.loads(pumafuse("compare", tmp_path / "deg", tmp_path / "mm", "--json").stdout)
     assert compared[0]["axes"]["a"]["rmse_deg"] == pytest.approx(compared[1]["axes"]["a"]["rmse_mm"], rel=1e-8)
 
 

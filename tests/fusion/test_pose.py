@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
 import turning
-from executable import printed
+from executable import pumafuse
 from pumafuse.errors import RunError
 from pumafuse.fusion import results
 from pumafuse.fusion.config import Tool
@@ -130,7 +130,7 @@ def test_files_have_the_quaternion_of_the_axes_beside_them(est: pf.Estimates, sa
 def test_a_trajectory_has_the_orientation(est: pf.Estimates, saved: Path, tmp_path: Path) -> None:
     """In the TUM format, from Python and from a result folder, which has the reference, too."""
     est.to_tum(tmp_path / "fused.tum")
-    printed("compare", saved, "--tum", tmp_path / "out")
+    pumafuse("compare", saved, "--tum", tmp_path / "out")
     for path in (tmp_path / "fused.tum", tmp_path / "out" / "fused.tum"):
         rows = np.loadtxt(path)
         assert apart(Rotation.from_quat(rows[:, 4:]), turned(est)).max() < 1e-12
@@ -165,7 +165,7 @@ def test_results_about_other_reference_orientations_are_compared_as_one(
     tool = Tool(reference=tuple(other.as_rotvec().tolist()))
     pf.fuse(turning.recorded(), msgspec.structs.replace(config, tool=tool)).save(tmp_path / "second")
     reference = ("--reference", saved / "reference.parquet", "--json")
-    first, second = msgspec.json.decode(printed("compare", saved, tmp_path / "second", *reference))
+    first, second = msgspec.json.decode(pumafuse("compare", saved, tmp_path / "second", *reference).stdout)
     assert all(second["difference"][axis]["rms_deg"] < 0.02 for axis in TURNING)
     assert second["orientation"]["rms_deg"] == pytest.approx(first["orientation"]["rms_deg"], abs=0.01)
     assert all(second["axes"][axis]["rmse_deg"] < 0.5 for axis in TURNING)
@@ -173,11 +173,13 @@ def test_results_about_other_reference_orientations_are_compared_as_one(
 
 def test_the_command_says_the_angle(tmp_path: Path) -> None:
     """`fuse` and `compare` print it beside what is expected, and `summary.json` has it."""
-    said = printed("fuse", turning.written(tmp_path), "-c", turning.configured(tmp_path), "-o", tmp_path / "fused")
+    said = pumafuse(
+        "fuse", turning.written(tmp_path), "-c", turning.configured(tmp_path), "-o", tmp_path / "fused"
+    ).stdout
     found = msgspec.json.decode((tmp_path / "fused" / "summary.json").read_bytes())["orientation"]
     assert found.keys() == {"rms_deg", "expected_deg", "rows", "left_out"}
     wanted = [f"{found['rms_deg']:.3f}", f"{found['expected_deg']:.3f}", str(found["rows"]), str(found["left_out"])]
-    for text in (said, printed("compare", tmp_path / "fused")):
+    for text in (said, pumafuse("compare", tmp_path / "fused").stdout):
         assert wanted in [line.split()[1:] for line in text.splitlines()]
 
 

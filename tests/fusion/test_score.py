@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import pumafuse as pf
-from executable import printed
+from executable import pumafuse
 from pumafuse.fusion import results
 from pumafuse.fusion.score import ReferenceTrack, score_velocity
 
@@ -95,10 +95,12 @@ def test_summary_table_and_compare_show_the_velocity(tmp_path: Path) -> None:
     found = summary.axes["radial"].score
     assert found.velocity_rmse_mm_s == pytest.approx(2.0, rel=1e-6)
     assert found.velocity_coverage == 0.0
-    (compared,) = json.loads(printed("compare", tmp_path / "out", "--json"))
+    (compared,) = json.loads(pumafuse("compare", tmp_path / "out", "--json").stdout)
     assert compared["axes"]["radial"]["velocity_rmse_mm_s"] == pytest.approx(2.0, rel=1e-6)
     assert compared["axes"]["radial"]["velocity_coverage"] == 0.0
-    (row,) = [line for line in printed("compare", tmp_path / "out").splitlines() if line.split()[-1:] == ["0.0%"]]
+    (row,) = [
+        line for line in pumafuse("compare", tmp_path / "out").stdout.splitlines() if line.split()[-1:] == ["0.0%"]
+    ]
     assert row.split()[-2:] == ["2.000", "0.0%"]
 
 
@@ -111,6 +113,6 @@ def test_smoothed_estimates_show_no_velocity(tmp_path: Path) -> None:
     for column in ("radial.velocity_mm_s", "radial.velocity_sd_mm_s"):
         assert table[column].null_count == 50
     assert np.isnan(results.read(tmp_path / "out").axes["radial"].velocity).all()
-    out = printed("compare", tmp_path / "out")
+    out = pumafuse("compare", tmp_path / "out").stdout
     assert "RMSE, mm" in out
     assert "velocity" not in out

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from executable import printed
+from executable import pumafuse
 from fusion_oracle import Response, commands
 from pumafuse.fusion import results
 from pumafuse.fusion.skill import PredictionError, Skill, skill
@@ -205,7 +205,7 @@ def test_files_and_screens_have_it(est: pf.Estimates, tmp_path: Path) -> None:
     table = results.tables.read(tmp_path / "set-back" / "measurements.parquet")
     assert table.columns["segment"].to_pylist() == est.measurements.segment.tolist()
 
-    text, found_again = (printed("compare", tmp_path / "set-back", *more) for more in ((), ("--json",)))
+    text, found_again = (pumafuse("compare", tmp_path / "set-back", *more).stdout for more in ((), ("--json",)))
     one = json.loads(found_again)[0]["skill"]["radial"]["range"]
     row = next(line for line in text.splitlines() if " range " in line and " / " in line)
     cells = [f"{one[key]['rms_mm']:.3f} / {one[key]['median_mm']:.3f}" for key in list(one)[1:]]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from executable import printed, refused
+from executable import pumafuse, refused
 from pumafuse.errors import RunError
 from pumafuse.fusion import results
 from refusals import one_line
@@ -53,7 +53,7 @@ def test_with_a_frame_the_trajectories_are_in_the_coordinates_of_the_log(tmp_pat
     config = _configured("tangential radial vertical", frame={"kind": "rotated", "azimuth_deg": 30.0})
     run = _recorded()
     results.write(pf.fuse(run, config), tmp_path / "fused", force=False)
-    assert "trajectories written to " in printed("compare", tmp_path / "fused", "--tum", tmp_path / "out")
+    assert "trajectories written to " in pumafuse("compare", tmp_path / "fused", "--tum", tmp_path / "out").stdout
     stamps, numbers = _read(tmp_path / "out" / "fused.reference.tum")
     assert stamps == [START_NS + 7 + 20_000_000 * k for k in range(100)]
     truth = np.column_stack([run.reference.values[axis] for axis in "xyz"])

@@ -25,7 +25,7 @@ from pumafuse.live.stream import Stream
 from pumafuse.live.wire import Event
 from pumafuse.views import colours, live_drawer, live_viewer
 from pumafuse.views import live as live_view
-from pumafuse.views.live import Frame, LiveView, SensorHead
+from pumafuse.views.live import Frame, LiveView
 from recordings import columns, series
 
 AXES = ("tangential", "radial", "vertical")
@@ -37,11 +37,15 @@ CONFIG = pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"), sensors=SENSO
 LONGEST = 30.0  # s until a test gives up
 
 
+def own_ports(patch: pytest.MonkeyPatch) -> None:
+    for name in ("PORT", "WEB_PORT"):
+        patch.setattr(live_view, name, live_viewer._free(0))
+
+
 @pytest.fixture(autouse=True)
 def ports(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every test asks for ports of its own."""
-    monkeypatch.setattr(live_view, "PORT", live_viewer._free(0))
-    monkeypatch.setattr(live_view, "WEB_PORT", live_viewer._free(0))
+    own_ports(monkeypatch)
 
 
 def until(there: Callable[[], object]) -> None:
@@ -88,22 +92,18 @@ class Driven:
         return any(words in line for line in self.notices)
 
 
-@pytest.fixture
-def recorder(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
+@contextlib.contextmanager
+def recording(path: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A server of Rerun that keeps what arrives in a file."""
-    path = tmp_path / "arrived.rrd"
-    server = start_recorder(path)
-    yield server, path
-    server.send_signal(signal.SIGCONT)
-    server.kill()
-    server.wait()
-
-
-def start_recorder(path: Path) -> subprocess.Popen[bytes]:
     where = ["--bind", "127.0.0.1", "--port", str(live_view.PORT)]
     server = live_viewer._start([*where, "--save", str(path)], keep=False)
-    until(lambda: live_viewer._listens(live_view.PORT))
-    return server
+    try:
+        until(lambda: live_viewer._listens(live_view.PORT))
+        yield server
+    finally:
+        server.send_signal(signal.SIGCONT)
+        server.kill()
+        server.wait()
 
 
 def alive(process: psutil.Process) -> bool:
@@ -112,51 +112,43 @@ def alive(process: psutil.Process) -> bool:
     return False
 
 
-def test_the_view_needs_a_mode_that_exists() -> None:
-    """One line that names those there are."""
-    with pytest.raises(pf.ConfigError, match=r"^--rerun: no mode 'film'; there are: spawn, connect, web$"):
-        LiveView("film", CONFIG, print)
+def logged(path: Path, what: str) -> list[str]:
+    return [one for chunk in columns(path, "/log") for one in chunk[f"TextLog:{what}"].flatten().to_pylist()]
 
 
-def test_the_estimators_process_does_not_load_rerun() -> None:
-    """It is slow to load, and what draws is another process."""
-    code = "import sys, pumafuse.views.live; sys.exit(bool({'rerun', 'rerun_bindings'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Driven, Path]:
+    """Sixty update periods, drawn into a viewer that opens late; then two faults begin and end."""
+    path = tmp_path_factory.mktemp("drawn") / "arrived.rrd"
+    with pytest.MonkeyPatch.context() as patch:
+        own_ports(patch)
+        driven = Driven("connect")
+        until(lambda: driven.noticed("no viewer listens at"))
+        with recording(path):
+            until(lambda: driven.noticed("drawing into the viewer"))
+            driven.go(60)
+            health = driven.live.health()
+            for faults in ((), ("sensor 'range': twice",), ("sensor 'range': twice", "commands: two senders"), ()):
+                read, now = driven.view._health_read, replace(health, faults=faults)
+                until(lambda read=read, now=now: driven.view.tick(lambda: now) or driven.view._health_read > read)
+            until(lambda: driven.tick() or len(logged(path, "text")) == 4)
+            until(lambda: len(series(path, "/radial/estimate")[0]) == 60 and len(series(path, "/nis/tracker")[0]))
+            driven.view.close()  # not before all has arrived: it waits for no longer than 2 s
+    return driven, path
 
 
-def test_faults_are_logged_as_they_begin_and_end(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
-    """Each once with its time: a warning, and that it is over."""
-    driven, path = Driven("connect"), recorder[1]
-    until(lambda: driven.noticed("drawing into the viewer"))
-    driven.go(30)
-    health = driven.live.health()
-    for faults in ((), ("sensor 'range': twice",), ("sensor 'range': twice", "commands: two senders"), ()):
-        read = driven.view._health_read
-        until(
-            lambda faults=faults, read=read: (
-                driven.view.tick(lambda: replace(health, faults=faults)) or driven.view._health_read > read
-            )
-        )
-    logged = lambda: [  # noqa: E731
-        text for chunk in columns(path, "/log") for text in chunk["TextLog:text"].flatten().to_pylist()
-    ]
-    until(lambda: driven.tick() or len(logged()) == 4)
+def test_a_missing_viewer_is_reported_once_and_faults_as_they_begin_and_end(drawn: tuple[Driven, Path]) -> None:
+    """The first viewer that opens is drawn into. Each fault once with its time: a warning, and that it is over."""
+    driven, path = drawn
+    assert sum("no viewer" in line for line in driven.notices) == 1
     said = ["sensor 'range': twice", "commands: two senders"]
-    assert logged() == [*said, *(f"no longer: {one}" for one in said)]
-    levels = [level for chunk in columns(path, "/log") for level in chunk["TextLog:level"].flatten().to_pylist()]
-    assert levels == ["WARN", "WARN", "INFO", "INFO"]
-    driven.view.close()
+    assert logged(path, "text") == [*said, *(f"no longer: {one}" for one in said)]
+    assert logged(path, "level") == ["WARN", "WARN", "INFO", "INFO"]
 
 
-def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
+def test_events_and_estimates_arrive(drawn: tuple[Driven, Path]) -> None:
     """In mm, at seconds since the first event: commands, estimates, measurements at their valid times, one rejected."""
-    driven, path = Driven("connect"), recorder[1]
-    until(lambda: driven.noticed("drawing into the viewer"))
-    driven.go(60)
-    read = driven.view._health_read
-    until(lambda: driven.tick() or driven.view._health_read > read)
-    until(lambda: len(series(path, "/radial/estimate")[0]) == 60 and len(series(path, "/nis/tracker")[0]))
-    driven.view.close()  # not before all has arrived: it waits for no longer than 2 s
+    driven, path = drawn
     time_, value = series(path, "/radial/command")
     assert np.allclose(time_, 0.028 * np.arange(60), atol=1e-6)
     assert np.allclose(value, 500.0)
@@ -172,7 +164,12 @@ def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Pa
     assert np.all(value > 500.0) and np.all(value < 510.0)  # at the edge of the plot
     assert np.allclose(series(path, "/radial/range")[1], 500.0, atol=0.5)
     assert np.all(np.abs(series(path, "/residual/radial/range")[1]) < 0.5)
-    assert len(series(path, "/nis/tracker")[0])
+
+
+def test_the_estimators_process_does_not_load_rerun() -> None:
+    """It is slow to load, and what draws is another process."""
+    code = "import sys, pumafuse.views.live; sys.exit(bool({'rerun', 'rerun_bindings'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def newest(path: Path, entity: str, component: str, *, static: bool = False) -> np.ndarray:
@@ -186,9 +183,7 @@ def newest(path: Path, entity: str, component: str, *, static: bool = False) -> 
     return np.array(found[-1].to_pylist()[-1])
 
 
-def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(
-    recorder: tuple[subprocess.Popen[bytes], Path], tmp_path: Path
-) -> None:
+def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(tmp_path: Path) -> None:
     """Its newest pose, its ellipsoid of 95 % ten times as large, the camera in the cell and its marker on the tool.
 
     Measurements lie at frame · z − R · marker with R of the same row; one that was rejected is red.
@@ -205,12 +200,13 @@ def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(
         for t, point, turn in zip(given[name][0], given[name][1], given[name][2].as_quat(), strict=True)
     ]
     notices, lines = list[str](), list[bytes]()
-    live, view, path = pf.LiveEstimator(config), LiveView("connect", config, notices.append), recorder[1]
-    until(lambda: view.tick(live.health) or any("drawing into" in line for line in notices))
-    Stream(live, lines.extend, notices.append, watchers=[view]).take(sorted(events, key=lambda event: event.t))
-    seen = "/path/measured/camera"
-    until(lambda: view.tick(live.health) or columns(path, seen))
-    view.close()
+    live, view = pf.LiveEstimator(config), LiveView("connect", config, notices.append)
+    path, seen = tmp_path / "arrived.rrd", "/path/measured/camera"
+    with recording(path):
+        until(lambda: view.tick(live.health) or any("drawing into" in line for line in notices))
+        Stream(live, lines.extend, notices.append, watchers=[view]).take(sorted(events, key=lambda event: event.t))
+        until(lambda: view.tick(live.health) or columns(path, seen))
+        view.close()
 
     now = msgspec.json.decode(lines[-1])
     point, sd = (np.array([now[axis][of] for axis in "xyz"]) for of in ("position_mm", "sd_mm"))
@@ -242,7 +238,7 @@ def test_a_scaled_measurement_is_where_it_saw_the_tool() -> None:
     """Z = −2 p, 8 ms late: the position at the valid time, and what it is off the estimate between two others."""
     estimates = live_drawer.Recent(2)
     estimates.add(np.array([[1.0, 1.1], [0.50, 0.60]]))
-    residuals = live_drawer.Residuals(SensorHead(scale=-2.0, latency=0.008, biased=False), estimates)
+    residuals = live_drawer.Residuals(pf.Sensor(sd=1e-3, scale=-2.0, latency=0.008), False, estimates)
     residuals.add(np.array([[1.058], [-1.12], [0.0]]))
     time_, position, residual, _ = residuals.take()
     assert np.allclose([time_[0], position[0], residual[0]], [1.05, 0.56, 0.01])
@@ -289,26 +285,17 @@ def test_a_drawing_process_that_dies_is_reported_once() -> None:
     assert sum("ended" in line for line in driven.notices) == 1
 
 
-def test_a_missing_viewer_is_reported_once_and_waited_for(tmp_path: Path) -> None:
-    """The first viewer that opens is drawn into, with what is new then."""
-    driven = Driven("connect")
-    until(lambda: driven.noticed("no viewer listens at"))
-    driven.go(20)
-    server = start_recorder(tmp_path / "late.rrd")
-    try:
-        until(lambda: driven.noticed("drawing into the viewer"))
-        until(lambda: (driven.go(5), len(series(tmp_path / "late.rrd", "/radial/estimate")[0]))[1])
-        driven.view.close()
-    finally:
-        server.kill()
-        server.wait()
-    assert sum("no viewer" in line for line in driven.notices) == 1
-
-
 def test_the_page_speaks_with_this_machine_only() -> None:
-    """Server and page listen on loopback; the page's policy lets the viewer speak with its server only."""
+    """Server and page listen on loopback; the page's policy lets the viewer speak with its server only.
+
+    A second view at once finds other ports.
+    """
     driven = Driven("web")
     until(lambda: driven.noticed("open http://127.0.0.1:"))
+    other = Driven("web")
+    until(lambda: other.noticed("open http://127.0.0.1:"))
+    assert f":{live_view.WEB_PORT}/" in driven.notices[0] and f":{live_view.WEB_PORT}/" not in other.notices[0]
+    other.view.close()
     drawer = psutil.Process(driven.child.pid)
     (server,) = drawer.children()
     places = [
@@ -332,15 +319,6 @@ def test_the_page_speaks_with_this_machine_only() -> None:
     until(lambda: not any(map(alive, (drawer, server))))
 
 
-def test_other_ports_are_used_where_these_are_taken() -> None:
-    """Two views at once: the second one finds other ports."""
-    with socket.create_server(("127.0.0.1", live_view.PORT)), socket.create_server(("127.0.0.1", live_view.WEB_PORT)):
-        driven = Driven("web")
-        until(lambda: driven.noticed("open http://127.0.0.1:"))
-        assert f":{live_view.WEB_PORT}/" not in driven.notices[0]
-        driven.view.close()
-
-
 def test_nothing_is_left_when_the_estimator_is_killed() -> None:
     """Its end of the pipe closes, and with it all that was started."""
     code = (
@@ -362,20 +340,20 @@ def test_nothing_is_left_when_the_estimator_is_killed() -> None:
 
 
 @pytest.mark.long
-def test_a_viewer_that_stalls_is_left_alone_until_it_goes_on(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
+def test_a_viewer_that_stalls_is_left_alone_until_it_goes_on(tmp_path: Path) -> None:
     """Nothing piles up in the drawing process meanwhile; later measurements arrive after all."""
-    driven, (server, path) = Driven("connect"), recorder
-    until(lambda: driven.noticed("drawing into the viewer"))
-    driven.go(20)
-    server.send_signal(signal.SIGSTOP)
-
-    drawer, resident, begin = psutil.Process(driven.child.pid), [], time.monotonic()
-    while time.monotonic() < begin + 25.0:
-        driven.go(5)
-        time.sleep(0.02)
-        resident.append(drawer.memory_info().rss)
-    assert resident[-1] - resident[len(resident) // 2] < 20e6  # by then all the frames wait that ever will
-    server.send_signal(signal.SIGCONT)
-    later = 0.028 * driven.step
-    until(lambda: driven.go() or (len(found := series(path, "/radial/command")[0]) and found.max() > later - 1e-6))
-    driven.view.close()
+    driven, path = Driven("connect"), tmp_path / "arrived.rrd"
+    with recording(path) as server:
+        until(lambda: driven.noticed("drawing into the viewer"))
+        driven.go(20)
+        server.send_signal(signal.SIGSTOP)
+        drawer, resident, begin = psutil.Process(driven.child.pid), [], time.monotonic()
+        while time.monotonic() < begin + 25.0:
+            driven.go(5)
+            time.sleep(0.02)
+            resident.append(drawer.memory_info().rss)
+        assert resident[-1] - resident[len(resident) // 2] < 20e6  # by then all the frames wait that ever will
+        server.send_signal(signal.SIGCONT)
+        later = 0.028 * driven.step
+        until(lambda: driven.go() or (len(found := series(path, "/radial/command")[0]) and found.max() > later - 1e-6))
+        driven.view.close()

@@ -16,7 +16,6 @@ from pumafuse.logs.frames import Cylindrical
 from pumafuse.views.rerun import to_rerun
 from recordings import columns, series, times
 
-DATA = Path(pf.__file__).parent / "data"
 XYZ, AXES = ("x", "y", "z"), ("tangential", "radial", "vertical")
 
 
@@ -121,22 +120,6 @@ def test_outcomes_are_states_and_silence_is_one(tmp_path: Path) -> None:
     assert stamp[49] < times(chunks)[3] < stamp[50]
 
 
-@pytest.mark.parametrize("count", [2, 4])
-def test_lengths_of_any_names_are_a_path(count: int, tmp_path: Path) -> None:
-    """Two are a position in a plane; of more than three the first three are one in space."""
-    names = ["slide", "lift", "reach", "rail"][:count]
-    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05))
-    arm = pf.ArmModel(name="gantry", update_period=0.02, delay=0.03, axes=dict.fromkeys(names, axis))
-    time = np.arange(100) * 0.02
-    run = pf.Run.from_arrays(time, {name: 0.1 * number * np.sin(time) for number, name in enumerate(names, 1)})
-    est = pf.fuse(run, pf.FusionConfig(arm=arm))
-    pf.to_rerun(est, run, tmp_path / "fused.rrd")
-    wanted = np.zeros((len(est.time), 3))
-    for number, name in enumerate(names[:3]):
-        wanted[:, number] = 1e3 * est[name].position
-    np.testing.assert_allclose(strip(tmp_path / "fused.rrd", "/path/estimate"), wanted, atol=1e-4)
-
-
 def test_a_stream_of_the_caller_gets_the_same(
     fused: tuple[pf.Estimates, pf.Run], recorded: Path, tmp_path: Path
 ) -> None:
@@ -149,47 +132,60 @@ def test_a_stream_of_the_caller_gets_the_same(
     assert np.array_equal(series(path, "/radial/estimate"), series(recorded, "/radial/estimate"))
 
 
-@pytest.mark.parametrize(("names", "frame"), [(XYZ, Cylindrical(base=(0.1, -0.2), positive="clockwise")), (AXES, None)])
+def gantry(*names: str) -> pf.ArmModel:
+    """An arm whose axes answer alike; the one called yaw turns."""
+    plant = pf.FirstOrder(time_constant=0.05)
+    axes = {name: pf.AxisModel(kind="angle" if name == "yaw" else "length", plant=plant) for name in names}
+    return pf.ArmModel(name="gantry", update_period=0.028, delay=0.03, axes=axes)
+
+
+PUMA = pf.ArmModel.load("puma560-internal")
+
+
+@pytest.mark.parametrize(
+    ("arm", "told", "frame", "path"),
+    [
+        (PUMA, XYZ, Cylindrical(base=(0.1, -0.2), positive="clockwise"), XYZ),
+        (PUMA, AXES, None, AXES),
+        (gantry("z", "yaw", "x", "y"), ("z", "yaw", "x", "y"), None, XYZ),
+        (gantry("slide", "lift"), ("slide", "lift"), None, ("slide", "lift")),
+        (
+            gantry("slide", "lift", "reach", "rail"),
+            ("slide", "lift", "reach", "rail"),
+            None,
+            ("slide", "lift", "reach"),
+        ),
+    ],
+)
 def test_the_path_in_space_is_in_the_logs_own_coordinates(
-    names: tuple[str, str, str], frame: Cylindrical | None, tmp_path: Path
+    arm: pf.ArmModel, told: tuple[str, ...], frame: Cylindrical | None, path: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """Command, estimate and tool in mm: x, y, z with a frame, beside plots of the axes; else these."""
+    """Command, estimate and tool in mm, beside plots of the axes: x, y, z with a frame or of an arm that has them.
+
+    Else the first three lengths, of whatever names; two are a position in a plane. An angle is no part of it.
+    """
     angle = np.linspace(0.5, 1.5, 80)
-    values = (0.1 + 0.4 * np.cos(angle), -0.2 + 0.4 * np.sin(angle), np.linspace(0.0, 0.1, 80))
-    run = pf.Run.from_arrays(100.0 + 0.028 * np.arange(80), dict(zip(names, values, strict=True)), frame=frame)
-    est, path = pf.fuse(run, pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")), rate=50.0), tmp_path / "p.rrd"
-    pf.to_rerun(est, run, path)
+    circle = (0.1 + 0.4 * np.cos(angle), -0.2 + 0.4 * np.sin(angle), np.linspace(0.0, 0.1, 80), 0.3 * angle)
+    values = dict(zip(told, circle, strict=False))
+    run = pf.Run.from_arrays(100.0 + 0.028 * np.arange(80), values, frame=frame)
+    est, file = pf.fuse(run, pf.FusionConfig(arm=arm), rate=50.0), tmp_path / "p.rrd"
+    pf.to_rerun(est, run, file)
     position = est.cartesian if frame else {name: axis.position for name, axis in est.axes.items()}
-    estimated = np.column_stack([position[name] for name in names]) * 1e3
-    assert np.allclose(strip(path, "/path/command"), np.column_stack(values) * 1e3, rtol=1e-6, atol=1e-4)
-    assert np.allclose(strip(path, "/path/estimate"), estimated, rtol=1e-6, atol=1e-4)
-    tool = columns(path, "/path/tool")
+    for entity, of in (("estimate", position), ("command", values)):
+        wanted = np.column_stack([of[name] for name in path]) * 1e3
+        found = strip(file, f"/path/{entity}")
+        assert np.allclose(found[:, : len(path)], wanted, rtol=1e-6, atol=1e-4)
+        assert not found[:, len(path) :].any()
+    tool = columns(file, "/path/tool")
     points = np.concatenate([[row.as_py()[0] for row in chunk["Points3D:positions"]] for chunk in tool])
     assert np.allclose(times(tool), est.time, atol=1e-9, rtol=0)
-    assert np.allclose(points, estimated, rtol=1e-6, atol=1e-4)
-    assert {entity.split("/")[1] for entity in entities(path)} == {*AXES, "path"}
+    assert np.allclose(points, strip(file, "/path/estimate"), rtol=1e-6, atol=1e-4)
+    assert {entity.split("/")[1] for entity in entities(file)} == {*arm.axes, "path"}
     if frame:
-        assert np.allclose(series(path, "/radial/command")[1], 400.0)
-        assert np.allclose(series(path, "/tangential/command")[1], np.linspace(0.0, -400.0, 80))
-
-
-def test_x_y_z_of_an_arm_are_a_path_in_space(tmp_path: Path) -> None:
-    """Without a frame, in the arm's own order of axes; an axis that is an angle is no part of it."""
-    axis, turning = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05)), pf.FirstOrder(time_constant=0.04)
-    axes = {"z": axis, "yaw": pf.AxisModel(kind="angle", plant=turning), "x": axis, "y": axis}
-    arm = pf.ArmModel(name="gantry", update_period=0.02, delay=0.03, axes=axes)
-    time = np.arange(100) * 0.02
-    command = {name: 0.1 * number * np.sin(time) for number, name in enumerate(axes, 1)}
-    run = pf.Run.from_arrays(time, command)
-    est = pf.fuse(run, pf.FusionConfig(arm=arm))
-    assert tuple(est.axes) == tuple(axes)
-    pf.to_rerun(est, run, tmp_path / "fused.rrd")
-    (chunk,) = columns(tmp_path / "fused.rrd", "/path/tool")
-    shown = np.array([row.as_py()[0] for row in chunk["Points3D:positions"]])
-    wanted = np.column_stack([1e3 * est[name].position for name in "xyz"])
-    np.testing.assert_allclose(shown, wanted, atol=1e-4)
-    _, degrees = series(tmp_path / "fused.rrd", "/yaw/estimate")
-    np.testing.assert_allclose(degrees, np.rad2deg(est["yaw"].position), atol=1e-9)
+        assert np.allclose(series(file, "/radial/command")[1], 400.0)
+        assert np.allclose(series(file, "/tangential/command")[1], np.linspace(0.0, -400.0, 80))
+    if "yaw" in est.axes:
+        assert np.allclose(series(file, "/yaw/estimate")[1], np.rad2deg(est["yaw"].position), atol=1e-9)
 
 
 def test_measurements_are_shown_where_they_put_the_tool(tmp_path: Path) -> None:
@@ -209,19 +205,6 @@ def test_measurements_are_shown_where_they_put_the_tool(tmp_path: Path) -> None:
     assert abs(np.mean(value) - 500.0) < 5.0
     _, shown = series(tmp_path / "range.rrd", "/innovation/radial/range")
     assert np.allclose(shown, est.measurements.innovation / est.measurements.innovation_sd)
-
-
-def test_the_shipped_scan_makes_a_small_file_that_rerun_accepts(tmp_path: Path) -> None:
-    """A minute, three axes, three sensors at 200 estimates a second: under 10 MB, and `rerun rrd verify` agrees."""
-    run = pf.Run.read(DATA / "scan1")
-    path = tmp_path / "scan1.rrd"
-    pf.to_rerun(pf.fuse(run, pf.FusionConfig.load(DATA / "fusion.toml"), rate=200.0), run, path)
-    assert 100_000 < path.stat().st_size < 10_000_000
-    rerun = Path(sys.executable).parent / "rerun"
-    done = subprocess.run([str(rerun), "rrd", "verify", str(path)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    for sensor, axes in (("tracker", 3), ("vision", 3), ("range", 1)):
-        assert sum(entity.endswith(f"/{sensor}") for entity in entities(path)) == 3 * axes + 1
 
 
 @pytest.mark.parametrize(
@@ -247,15 +230,6 @@ def test_the_result_of_a_recording_is_a_layer_of_it(timeline: str, tmp_path: Pat
     stamps = [np.concatenate([chunk["robot_time"].cast("int64").to_numpy() for chunk in chunks]) for chunks in found]
     assert np.array_equal(*stamps)
     assert columns(merged, "/pumafuse/path/tool")
-
-
-@pytest.mark.long
-def test_the_result_of_a_recording_that_nothing_describes_is_a_layer_of_it(tmp_path: Path) -> None:
-    """By `fuse` without a configuration, too."""
-    path = bag_files.written(tmp_path, bag_files.KINDS["rrd"], bag_files.motion())
-    pumafuse("fuse", path, "-o", tmp_path / "fused", "--rrd")
-    (one,) = RrdReader(tmp_path / "fused" / "fused.rrd").recordings()
-    assert (one.application_id, one.recording_id) == ("robot_cell", "take-7")
 
 
 def test_a_sensor_called_like_a_line_has_an_entity_of_its_own(tmp_path: Path) -> None:

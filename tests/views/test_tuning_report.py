@@ -7,7 +7,6 @@ import re
 from functools import cache, partial
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -22,7 +21,7 @@ from pumafuse.tuning.intervals import Profile
 from pumafuse.views import colours as style
 from pumafuse.views import tuning_report
 from pumafuse.views.tuning_report import page
-from tuning_runs import fitted, quietly
+from tuning_runs import fitted, quietly, with_sensors
 
 T, END = 0.02, 20.0
 STEADY = ("maneuver_noise_mm_rtHz_per_m_s", "maneuver_drift_mm_rts_per_m_s")  # fixed: the process noise is constant
@@ -72,29 +71,18 @@ def drawn(found: pf.Tuning) -> dict[str, Profile]:
     return {one.key: one for one in found.profiles}
 
 
-def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_loaded() -> None:
-    """All parts in their order, pictures under their headings; the only addresses are those of the page itself."""
-    text = shown()
+def test_every_part_of_the_page_is_there_and_nothing_is_loaded() -> None:
+    """Parts in their order with sentences, pictures, and each parameter's numbers; all addresses are the page's own."""
+    (found, _), text = tuned(), shown()
     seen = outline(text)
-    parts = [
-        "Tuning: a run",
-        "What to know",
-        "What was fitted",
-        "Profiles of the likelihood",
-        "Validation",
-        "Innovations before and after",
-    ]
-    assert seen.headings == [*parts, "fusion.toml", "arm.toml"]
-    for heading in (parts[0], *parts[2:]):
+    parts = ["Tuning: a run", "What to know", "What was fitted", "Profiles of the likelihood", "Validation"]
+    parts += ["Innovations before and after", "fusion.toml", "arm.toml"]
+    assert seen.headings == parts
+    for heading in (parts[0], *parts[2:6]):
         assert len(seen.sentences[heading]) > 60, heading
     assert seen.pictures == [parts[3], parts[5]]
     assert not re.search(r"""(src|href)=["'](?!#|data:image/png;base64,)""", text)
     assert "<script" not in text and "@import" not in text and "url(http" not in text
-
-
-def test_the_table_has_every_number_with_its_interval() -> None:
-    """Key, before, fitted and both ends of each parameter, in its row."""
-    (found, _), text = tuned(), shown()
     assert len(found.details.parameters) == 5
     for one in found.details.parameters:
         row = re.search(rf"<tr><td>{re.escape(one.key)}</td>(.*)</tr>", text)
@@ -126,24 +114,18 @@ def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -
 def test_the_profile_of_a_lone_parameter_is_the_likelihood_of_a_fusion() -> None:
     """With all else fixed, the curve is the log density of what `fuse` reports, less the one at the best."""
     run, config = recorded("tip", "camera", "a run"), known("tip", "camera")
-    found = quietly(
-        lambda: pf.tune([run], with_sd(config, 5e-4, gate=50.0), fix=["process"], sd_prior=False, profiles=True)
-    )
+    found = quietly(lambda: pf.tune([run], config, fix=["process"], sd_prior=False, profiles=True))
     (curve,) = drawn(found).values()
     assert curve.key == "sensors.camera.sd_mm.tip"
     assert curve.log
 
     def height(sd: float) -> float:
-        est = pf.fuse(run, with_sd(config, sd, gate=50.0))
+        est = pf.fuse(run, with_sensors(config, sd=sd))
         return float(densities_of(est.measurements, est.config.sensors).sum())
 
     heights = np.array([height(value * 1e-3) for value in curve.values])
     np.testing.assert_allclose(curve.drop, heights - heights[np.argmax(curve.drop)], atol=1e-3)
     assert curve.drop.min() < -3.0
-
-
-def with_sd(config: pf.FusionConfig, sd: float, gate: float) -> pf.FusionConfig:
-    return msgspec.structs.replace(config, sensors={"camera": pf.Sensor(sd=sd, gate=gate)})
 
 
 @pytest.fixture

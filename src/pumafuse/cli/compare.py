@@ -59,11 +59,7 @@ class Difference(toml.Reported, frozen=True, kw_only=True):
 
 
 def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | None = None, draw: bool = False) -> None:
-    """Compare result folders; write their trajectories and references into the folder ``tum``.
-
-    Raises:
-        PumafuseError: A folder holds no results, a reference covers none of them, or there is no trajectory.
-    """
+    """Compare result folders; write their trajectories and references into the folder ``tum``."""
     if tum is not None:
         _write_trajectories(given, reference, tum, quiet=json)
     compared = list[Compared]()

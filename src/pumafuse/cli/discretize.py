@@ -18,11 +18,7 @@ _MATRICES = ("F", "B", "H", "Q")
 
 
 def run(source: str, axis: str | None, period_ms: float | None, json: bool) -> None:
-    """Print the discrete model of an arm's axes.
-
-    Raises:
-        PumafuseError: No such arm or axis.
-    """
+    """Print the discrete model of an arm's axes."""
     arm = ArmModel.load(source)
     warn(arm.doubts())
     period = arm.update_period if period_ms is None else si(period_ms, "_ms")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import ConfigError, warn
-from ..folders import FolderError, write_file
+from ..folders import check_replaceable, write_file
 from ..fusion.config import FusionConfig
 from ..live.estimator import LiveEstimator
 from ..live.export import MARK, header, identifier, left_out
@@ -13,18 +13,9 @@ from .screen import say
 
 
 def run(config: Path, output: Path, force: bool) -> None:
-    """Write a configuration as a C header.
-
-    Args:
-        config: The ``fusion.toml``.
-        output: The header; what it is called is what the names in it begin with.
-        force: Replace an earlier one.
-
-    Raises:
-        PumafuseError: The configuration is wrong or cannot be followed live, or the file is in the way.
-    """
-    if output.exists():
-        _check_replaceable(output, force)
+    """Write a configuration as a C header."""
+    ours = output.is_file() and output.read_bytes().startswith(MARK.encode())
+    check_replaceable(output, force, ours, "header of pumafuse export")
     name = identifier(output.stem)
     if name.lower() in ("pf", "pumafuse"):
         raise ConfigError(f"{output}: its names would be those of pumafuse.h; choose another")
@@ -40,13 +31,3 @@ def run(config: Path, output: Path, force: bool) -> None:
         say(f"it is in the arm's axes: turning x, y, z into {axes}, as [frame] says, is left to the controller")
     if known.tool is not None or any(sensor.is_placed for sensor in known.sensors.values()):
         say(f"it is in the base's axes: {left_out(known)} left to the controller, which gives {axes} of the tool point")
-
-
-def _check_replaceable(path: Path, force: bool) -> None:
-    """Refuse to replace what is no header of ours, also with --force: its name may be a slip."""
-    if not path.is_file() or not path.read_bytes().startswith(MARK.encode()):
-        raise FolderError(
-            f"{path}: exists and is no header of pumafuse export, which is not ours to replace; choose another"
-        )
-    if not force:
-        raise FolderError(f"{path}: exists; --force replaces it")

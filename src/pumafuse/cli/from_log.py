@@ -56,11 +56,6 @@ def run(
     """Fuse a log of which nothing is known into a result folder: what ``init``, ``tune`` and ``fuse`` do, at once.
 
     The folder also has the ``run.toml`` that was found, so that every other command takes it for a run.
-
-    Raises:
-        PumafuseError: The log cannot be read, has no commands or no sensor, or nothing can be fitted to it.
-        Exit: With 130 after Ctrl-C while it was fitted, when the best until then is fused; with 3 where what was fitted
-            is worse than the first guess on the last third of the log.
     """
     results.check_writable(output, force, with_run=True)
     try:

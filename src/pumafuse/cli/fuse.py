@@ -45,9 +45,6 @@ def run(
     """Fuse each run into a result folder; a run that fails is reported and does not stop the others.
 
     With ``resume`` results that are there and were made in the same way are kept.
-
-    Raises:
-        PumafuseError: The configuration is wrong, or at least one run failed.
     """
     given = FusionConfig.load(config)
     given.sensor_names(sensors)  # before any run is read
@@ -82,11 +79,7 @@ def run(
 
 
 def demo(output: Path, force: bool) -> None:
-    """Fuse the shipped scan, score it, draw it, and say what to open next.
-
-    Raises:
-        PumafuseError: The folder is in the way.
-    """
+    """Fuse the shipped scan, score it, draw it, and say what to open next."""
     say(
         "A 60 s scan of a panel by a PUMA 560 (simulated with masses, friction, elastic joints and servos of which the"
         " filter knows\nnothing): a command every 28 ms, a camera (0.5 mm noise, 45 ms late, dropouts and outliers),"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import ConfigError, warn
-from ..folders import FolderError, write_file
+from ..folders import check_replaceable, write_file
 from ..identification.identify import Identification, identify
 from ..identification.trials import StepTrials
 from ..model.arm import ArmModel
@@ -28,25 +28,8 @@ def run(
     json: bool,
     force: bool,
 ) -> None:
-    """Identify an arm from the step trials in a folder, or from recorded runs.
-
-    Args:
-        paths: One folder of trials, or runs.
-        output: Where the model goes.
-        sensor: Of runs: whose stamps are right.
-        period: Of trials: T [s].
-        samples: Of trials: how many of each are used.
-        paper: Of trials: whether to do as the paper did.
-        tolerance: Of trials: RMS up to which the model is valid, in the screen's unit of their axes.
-        report: Where a page goes.
-        json: Whether to print JSON.
-        force: Whether to replace what is there.
-
-    Raises:
-        PumafuseError: The trials or runs cannot be used, or what is to be written is in the way.
-    """
-    if output.exists():
-        _check_replaceable(output, force)
+    """Identify an arm from the step trials in a folder, or from recorded runs."""
+    check_replaceable(output, force, output.exists() and _is_arm(output), "arm model")
     trials = [path for path in paths if (path / "trials.csv").exists()]
     if not trials:
         from . import latency
@@ -75,14 +58,12 @@ def run(
     say(f"next: pumafuse verify RUN --arm {output}")
 
 
-def _check_replaceable(path: Path, force: bool) -> None:
-    """Refuse to replace a file that is no arm model, also with --force: its name may be a slip."""
+def _is_arm(path: Path) -> bool:
     try:
         ArmModel.load(path)
     except ConfigError:
-        raise FolderError(f"{path}: exists and is no arm model, which is not ours to replace; choose another") from None
-    if not force:
-        raise FolderError(f"{path}: exists; --force replaces it")
+        return False
+    return True
 
 
 def _show(found: Identification) -> None:

@@ -27,18 +27,7 @@ _FEW = 4  # columns that are named
 
 
 def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
-    """Look at a log, print what it holds, and write three files to begin with.
-
-    Args:
-        log: The log.
-        output: Where they go; None: a new folder named after the log.
-        rate: How often rows come in tables without stamps [Hz]; 0: not known.
-        force: Replace them.
-
-    Raises:
-        PumafuseError: The log cannot be read, has no commands or no sensor, or the files are in the way; or its sensors
-            cannot be registered: then ``run.toml`` alone is written, to be mended.
-    """
+    """Look at a log, print what it holds, and write three files to begin with."""
     folder = Path(f"{name_of(log)}-fusion") if output is None else output
     there = [name for name in FILES if (folder / name).exists()]
     if there and not force:
@@ -74,14 +63,7 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
 
 
 def registered(found: Survey, recorded: Run) -> FusionConfig | None:
-    """The configuration with the sensors registered that stand in frames of their own, which is printed.
-
-    Returns:
-        None where none of them can be registered, and others measure along the base's axes.
-
-    Raises:
-        PumafuseError: None can be, and no other sensor measures anything.
-    """
+    """The configuration with the sensors registered that stand in frames of their own, which is printed."""
     from ..registration.runs import register  # scipy takes its time, and most logs need none of it
     from . import register as shown
 

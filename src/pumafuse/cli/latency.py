@@ -24,11 +24,7 @@ def run(
     force: bool,
     part: tuple[float | None, float | None] = (None, None),
 ) -> None:
-    """Tell how late everything is; the arguments are the options of the command.
-
-    Raises:
-        PumafuseError: The runs tell nothing, or the report is in the way.
-    """
+    """Tell how late everything is; the arguments are the options of the command."""
     found = _told(paths, sensor, report, json, force, part=part)
     if found is None:
         return
@@ -44,11 +40,7 @@ def run(
 def identify(
     paths: Sequence[Path], output: Path, sensor: str | None, report: Path | None, json: bool, force: bool
 ) -> None:
-    """Make a model of an arm from recorded motion.
-
-    Raises:
-        PumafuseError: The runs tell nothing, or the report is in the way.
-    """
+    """Make a model of an arm from recorded motion."""
     if _told(paths, sensor, report, json, force, output=output) is None:
         return
     say(f"written to {output}" + (f" and {report}" if report is not None else ""))
@@ -67,7 +59,13 @@ def _told(
     """What was found, after it is written and its answers printed; None if that was JSON, which is all then."""
     if report is not None:
         reports.check_writable(report, force)
-    found = _found(paths, sensor, part)
+    runs: list[Run] = []
+    for path in paths:
+        if path.is_dir() and not (path / "run.toml").exists():
+            raise ConfigError(f"{path}: has no run.toml; `pumafuse init {path}` looks at the log and writes one")
+        runs.append(Run.read(path).between(*part))
+    with Console(stderr=True).status("looking at how motion follows the commands"):
+        found = latency(runs, sensor=sensor)
     if output is not None:
         write_file(output, found.arm.to_toml(), replace=force)
     if report is not None:
@@ -75,24 +73,9 @@ def _told(
     if json:
         say(found.to_json().removesuffix("\n"))
         return None
-    _show(found)
-    return found
-
-
-def _show(found: Latency) -> None:
-    """Print the answers and a table on stdout."""
     for line in reports.answers(found.details):
         say(line)
     print_tables([table(*reports.lags(found.details))])
     if any(one.shared_delay for one in found.details.axes.values()):
         say("* one dead time for several axes")
-
-
-def _found(paths: Sequence[Path], sensor: str | None, part: tuple[float | None, float | None]) -> Latency:
-    runs: list[Run] = []
-    for path in paths:
-        if path.is_dir() and not (path / "run.toml").exists():
-            raise ConfigError(f"{path}: has no run.toml; `pumafuse init {path}` looks at the log and writes one")
-        runs.append(Run.read(path).between(*part))
-    with Console(stderr=True).status("looking at how motion follows the commands"):
-        return latency(runs, sensor=sensor)
+    return found

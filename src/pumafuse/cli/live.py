@@ -73,11 +73,7 @@ def run(
     allow: list[str],
     ros_args: list[str],
 ) -> None:
-    """Estimate from a stream until it ends, or a signal ends it; the arguments are the options, in s and Hz.
-
-    Raises:
-        PumafuseError: The configuration, the source, the run or a folder is wrong.
-    """
+    """Estimate from a stream until it ends, or a signal ends it; the arguments are the options, in s and Hz."""
     sources, known, start = list(map(Address.parse, given)), FusionConfig.load(config), dict[str, float]()
     alone, kinds = sources[0], [one.kind for one in sources]
     if listen and not set(LISTENERS) & set(kinds):
@@ -90,7 +86,8 @@ def run(
     if recorded is not None:
         start = dict(recorded.start)
         known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
-    files = {one: _manifest_of(Path(one.path)) for one in sources if one.kind in OF_A_RUN}
+    given_files = {one: Path(one.path) for one in sources if one.kind in OF_A_RUN}
+    files = {one: path / "run.toml" if path.is_dir() else path for one, path in given_files.items()}
     listed = {address: manifest.load(file) for address, file in files.items()}
     for address, one in listed.items():
         start |= one.command.start
@@ -150,11 +147,6 @@ def run(
         print_tables([_sensor_table(live, feeder.now)], "stderr")
 
 
-def _manifest_of(path: Path) -> Path:
-    """The ``run.toml`` that a path is, or that a folder has."""
-    return path / "run.toml" if path.is_dir() else path
-
-
 def _opened(
     address: Address,
     listed: manifest.Manifest | None,
@@ -166,21 +158,7 @@ def _opened(
     allow: list[str],
     ros_args: list[str],
 ) -> Remote:
-    """A source of the network; the stack closes what has to be.
-
-    Args:
-        address: Of the source.
-        listed: What its ``run.toml`` says, of a kind that has one.
-        config: Of the estimator.
-        stack: It.
-        notify: Takes a sentence for the log.
-        listen: The options.
-        allow: The options.
-        ros_args: The options.
-
-    Raises:
-        PumafuseError: The source cannot be opened.
-    """
+    """A source of the network; the stack closes what has to be."""
     if address.kind == POSES:
         from ..live.openigtlink import OpenIgtLinkSource
 
@@ -217,11 +195,7 @@ def _to_standard_output(lines: list[bytes]) -> None:
 
 
 def _listen(remote: Remote, feeder: _Feeder, signals: list[int]) -> int:
-    """Feed what comes from the network until a signal ends it, and then for at most 1 s what has come until then.
-
-    Returns:
-        How many lines had come and were not taken in.
-    """
+    """Feed what comes from the network until a signal ends it, and then for at most 1 s what has come until then."""
     remote.start()
     try:
         while not signals:
@@ -299,13 +273,7 @@ def _caught_signals() -> Generator[list[int]]:
 
 
 def status(stream: Stream, summaries: Sequence[Callable[[], str]] = (), now: int | None = None) -> Group:
-    """One screen: the position of each axis, and how each sensor does.
-
-    Args:
-        stream: The stream.
-        summaries: Give a sentence each on the parts beside it; empty for nothing.
-        now: What the stream's time has come to [ns] while nothing came; None: that of the newest event.
-    """
+    """One screen: the position of each axis, and how each sensor does."""
     estimate = stream.live.estimate(now)
     time = "no event yet" if stream.live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
     arm, tables = stream.live.config.arm, list[Table]()

@@ -276,7 +276,7 @@ def verify(
 
 @app.command()
 def tune(
-    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
+    runs: Runs,
     config: Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="What to start from.")],
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
     fit: Annotated[

@@ -38,20 +38,7 @@ def progress_bar(what: str, total: float = 1.0) -> Generator[Callable[[float], N
 def run_jobs(
     what: str, jobs: Mapping[str, Callable[[], R]], places: Iterable[Path]
 ) -> tuple[dict[str, R], dict[str, str]]:
-    """Run every job, several at a time.
-
-    Args:
-        what: Label of the progress bar.
-        jobs: By name; each can be pickled and leaves its work on disk when done.
-        places: The folders that the jobs write; nothing half written is left beside them.
-
-    Returns:
-        The results of the jobs, and the errors of those that failed, both in the order given.
-
-    Raises:
-        KeyboardInterrupt: Passed on, after printing how many are done.
-        PumafuseError: A worker process died.
-    """
+    """Run every job, several at a time."""
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -84,11 +71,7 @@ def run_jobs(
 
 
 def report_failures(failed: Mapping[str, str], count: int, where: Path) -> None:
-    """Print the error of each job that failed.
-
-    Raises:
-        PumafuseError: There is one.
-    """
+    """Print the error of each job that failed."""
     for name, problem in failed.items():
         say(f"pumafuse: {name}: {problem}", err=True)
     if failed:

@@ -36,12 +36,7 @@ def run(
     force: bool,
     part: tuple[float | None, float | None] = (None, None),
 ) -> None:
-    """Register sensors and write the configuration; the arguments are the options of the command.
-
-    Raises:
-        PumafuseError: No sensor can be registered, or the output folder must not be replaced.
-        Exit: With 3 where one of several sensors is not registered.
-    """
+    """Register sensors and write the configuration; the arguments are the options of the command."""
     if output is not None:
         folders.check_writable(output, force, [SUMMARY], _OURS.__contains__)
     given = None if config is None else FusionConfig.load(config)

@@ -13,11 +13,7 @@ from .screen import say
 
 
 def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
-    """Simulate a scenario, once into ``output`` or ``runs`` times into a folder each inside it.
-
-    Raises:
-        PumafuseError: The scenario is wrong, a folder is in the way, or at least one run failed.
-    """
+    """Simulate a scenario, once into ``output`` or ``runs`` times into a folder each inside it."""
     scenario = Scenario.load(path)
     if scenario.teaches:
         say(f"{scenario.name}: {scenario.teaches}")

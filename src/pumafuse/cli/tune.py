@@ -47,12 +47,7 @@ def run(
     force: bool,
     part: tuple[float | None, float | None] = (None, None),
 ) -> None:
-    """Tune a configuration on recorded runs and write the result; the arguments are the options of the command.
-
-    Raises:
-        PumafuseError: Nothing can be fitted, or the output folder must not be replaced.
-        Exit: With 3 where the result is worse on what it was validated on; with 130 after Ctrl-C.
-    """
+    """Tune a configuration on recorded runs and write the result; the arguments are the options of the command."""
     folders.check_writable(output, force, [SUMMARY], OURS.__contains__)
     try:
         kinds = kinds_of(fit)
@@ -90,11 +85,7 @@ def run(
 
 
 def end(summary: TuningSummary) -> None:
-    """Leave with the exit code of a tuning that was interrupted, or is worse on what it was validated on.
-
-    Raises:
-        Exit: With 130 or 3.
-    """
+    """Leave with the exit code of a tuning that was interrupted, or is worse on what it was validated on."""
     if summary.interrupted:
         raise typer.Exit(_INTERRUPTED)
     if summary.worse:

@@ -30,12 +30,7 @@ def run(
     json: bool,
     force: bool,
 ) -> None:
-    """Compare a model with runs that it was not made from; start levels are in mm, or degrees.
-
-    Raises:
-        PumafuseError: The arm or a run cannot be read, or they do not fit together.
-        Exit: With 3 where the model does not hold.
-    """
+    """Compare a model with runs that it was not made from; start levels are in mm, or degrees."""
     if report is not None:
         reports.check_writable(report, force)
     model = ArmModel.load(arm)

@@ -24,12 +24,7 @@ _SMALL = 1e-4  # rad, below which series replace quotients: their next terms are
 
 
 def of_quaternions(value: FloatArray, order: Order = "xyzw") -> FloatArray:
-    """Unit quaternions x, y, z, w of logged ones, (n, 4); NaN in rows that have none, as of a sensor that is lost.
-
-    Args:
-        value: As logged, (n, 4).
-        order: Where w is.
-    """
+    """Unit quaternions x, y, z, w of logged ones, (n, 4); NaN in rows that have none, as of a sensor that is lost."""
     value = value[:, [1, 2, 3, 0]] if order == "wxyz" else value
     with np.errstate(invalid="ignore", over="ignore"):
         norm = np.sqrt(np.sum(value**2, axis=1))
@@ -105,12 +100,9 @@ def cross(left: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def between(quaternion: FloatArray, row: IntArray, share: FloatArray) -> FloatArray:
-    """Orientations on the shortest turn from some rows to the ones after them, (m, 4).
+    """Orientations on the shortest turn from some rows (m,) of (n, 4) to the ones after them, (m, 4).
 
-    Args:
-        quaternion: The orientations, (n, 4).
-        row: From which of them, (m,).
-        share: How far, 0 to 1, (m,); from the last row on there is no turn.
+    The share says how far, 0 to 1, (m,); from the last row on there is no turn.
     """
     step = vectors(product(inverse(quaternion[:-1]), quaternion[1:]), np.zeros(3))
     step = np.vstack([step, np.zeros(3)])[row]

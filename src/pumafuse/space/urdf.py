@@ -21,35 +21,20 @@ _KINDS: dict[str, Kind | None] = {"revolute": "angle", "continuous": "angle", "p
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint as its file has it.
+    """A joint as its file has it."""
 
-    Attributes:
-        where: The file and the joint, for errors.
-        type: As written.
-        parent: The link that holds it.
-        child: The link that it moves.
-        at: Its origin in the parent's frame [m], (1, 3).
-        rpy: The turns of its origin about the parent's x, then y, then z [rad].
-        axis: The direction that it moves about or along, of length 1, (1, 3); some files have 0 0 0 where it is fixed.
-        mimic: The joint that drives it, a factor and an offset; None where it is driven by itself.
-    """
-
-    where: str
+    where: str  # the file and the joint, for errors
     type: str
-    parent: str
-    child: str
-    at: FloatArray
-    rpy: tuple[float, ...]
-    axis: FloatArray
-    mimic: tuple[str, float, float] | None
+    parent: str  # the link that holds it
+    child: str  # the link that it moves
+    at: FloatArray  # its origin in the parent's frame [m], (1, 3)
+    rpy: tuple[float, ...]  # the turns of its origin about the parent's x, then y, then z [rad]
+    axis: FloatArray  # that it moves about or along, of length 1, (1, 3); some files have 0 0 0 where it is fixed
+    mimic: tuple[str, float, float] | None  # the joint that drives it, a factor and an offset; None: itself
 
     @property
     def kind(self) -> Kind | None:
-        """What it moves by; None where it does not move.
-
-        Raises:
-            ConfigError: It is of another type.
-        """
+        """What it moves by; None where it does not move."""
         if self.type not in _KINDS:
             raise ConfigError(f"{self.where} is of type '{self.type}'; in a chain it must be {', '.join(_KINDS)}")
         return _KINDS[self.type]
@@ -57,25 +42,14 @@ class Joint:
 
 @dataclass(frozen=True)
 class Urdf:
-    """The links and joints of a file.
-
-    Attributes:
-        path: The file.
-        links: Names.
-        joints: By name.
-    """
+    """The links and joints of a file, by name."""
 
     path: Path
     links: list[str]
     joints: dict[str, Joint]
 
     def route(self, base: str, tip: str) -> list[str]:
-        """The joints that lead from one link to another.
-
-        Raises:
-            UnknownNameError: There is no such link.
-            ConfigError: No joints lead there, or they lead in a circle.
-        """
+        """The joints that lead from one link to another."""
         for link in (base, tip):
             if link not in self.links:
                 raise UnknownNameError(str(self.path), "link", link, self.links)
@@ -97,12 +71,7 @@ class Urdf:
         return route[::-1]
 
     def driver(self, name: str) -> tuple[str, float, float]:
-        """The joint that drives one, by itself or through others that mimic it, with a factor and an offset.
-
-        Raises:
-            UnknownNameError: A joint mimics one that does not exist.
-            ConfigError: Joints mimic one another in a circle.
-        """
+        """The joint that drives one, by itself or through others that mimic it, with a factor and an offset."""
         multiplier, offset, passed = 1.0, 0.0, [name]
         while (mimic := self.joints[passed[-1]].mimic) is not None:
             where = self.joints[passed[-1]].where
@@ -117,11 +86,7 @@ class Urdf:
 
 
 def read(path: Path) -> Urdf:
-    """The robot of a file.
-
-    Raises:
-        ConfigError: The file is absent, is no URDF or is one only in part; says where.
-    """
+    """The robot of a file; a ConfigError says where it is none."""
     robot = _root(path)
     joints: dict[str, Joint] = {}
     for element in robot.findall("joint"):

@@ -51,17 +51,7 @@ def drawing(
     sharex: Literal["none", "col"] = "none",
     projection: Literal["3d"] | None = None,
 ) -> Generator[Canvas]:
-    """A canvas of ``rows`` by ``columns`` axes; what is drawn and saved in the block is in our style.
-
-    Args:
-        columns: How many axes in a row.
-        rows: How many rows.
-        width: Width of the picture [inch]; None: 3.6 a column.
-        height: Height of a row [inch].
-        ratios: Relative widths of the columns; None: all alike.
-        sharex: Whether the axes of a column have one scale.
-        projection: ``3d`` for axes in space.
-    """
+    """A canvas of ``rows`` by ``columns`` axes; what is drawn and saved in the block is in our style."""
     with matplotlib.rc_context(
         {
             "font.size": 9,

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import NO_STAMP, FloatArray, known_rows
 from ..filter.outcome import Outcome
 from ..filter.response import response
 from ..fusion.consistency import LAGS, Consistency, consistency
@@ -73,11 +73,6 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
     """Draw results on top of each other, and below their errors, or without a reference how they differ.
 
     Left the whole run, right the busiest two seconds of the first result; differences are from the first result.
-
-    Args:
-        results: By name, of one run.
-        reference: The reference of that run, if it has one.
-        why: What to write above.
     """
     first = next(iter(results.values()))
     start = _busiest(first.time, _travelled(first), _ZOOM_S)
@@ -123,12 +118,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
 
 
 def path_figure(est: Estimates, run: Run) -> Figure | None:
-    """Draw where the tool was commanded to be and was, in the log's x, y, z; None where it has not all three.
-
-    Args:
-        est: The estimates.
-        run: The run that they were made from.
-    """
+    """Draw where the tool was commanded to be and was, in the log's x, y, z; None where it has not all three."""
     own = {name: axis.position for name, axis in est.axes.items()} if in_space(est.config.arm) == CARTESIAN else {}
     estimated, command = est.cartesian or own, run.command.values
     if not all(name in estimated for name in CARTESIAN):
@@ -229,11 +219,7 @@ def validation_figure(est: Estimates) -> Figure | None:
 
 
 def lag_figures(found: Latency) -> Markup:
-    """A row for each axis: command, measurements and model where most happens, and the lag over the run.
-
-    Args:
-        found: How late everything is; the run with the most measurements is drawn.
-    """
+    """A row for each axis: command, measurements and model where most happens, and the lag over the run."""
     summary, arm = found.details, found.config.arm
     run = max(
         found.runs, key=lambda one: len(one.sensors[summary.sensor].stamp) if summary.sensor in one.sensors else 0
@@ -243,8 +229,8 @@ def lag_figures(found: Latency) -> Markup:
     with drawing(2, len(axes), width=12.0, height=2.6, ratios=[3.0, 1.4]) as canvas:
         for axis, motion, course in zip(axes, canvas.axes[::2], canvas.axes[1::2], strict=True):
             screen, one = SCREEN[run.kinds.get(axis, "length")], summary.axes[axis]
-            given, command = _known(run.command.stamp, run.command.values[axis])
-            stamp, value = _known(source.stamp, source.values[axis])
+            given, command = known_rows(run.command.stamp, run.command.values[axis])
+            stamp, value = known_rows(source.stamp, source.values[axis])
             fine, model, start = np.union1d(given, stamp), arm.axes[axis], float(command[0])
             moved = start + response(model, arm.update_period, arm.delay_of(axis), given, command, start, fine)
             scale = found.config.sensors[summary.sensor].scale
@@ -281,13 +267,6 @@ def lag_figures(found: Latency) -> Markup:
 
 def _measured(sensor: str) -> str:
     return colours.REFERENCE if sensor == "reference" else colours.sensor_colours([sensor])[sensor]
-
-
-def _known(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
-    """Stamps and values of the rows that have both, in order, one a stamp."""
-    there = (stamp != NO_STAMP) & np.isfinite(value)
-    time, place = np.unique(stamp[there], return_index=True)
-    return time, value[there][place]
 
 
 def _busiest(time: FloatArray, value: FloatArray, length: float) -> float:

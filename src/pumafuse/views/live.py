@@ -28,7 +28,7 @@ import msgspec
 
 from ..errors import ConfigError
 from ..filter.outcome import Outcome
-from ..fusion.config import Placement, Vector
+from ..fusion.config import Sensor, Vector
 from ..live.results import COMPARED
 from ..logs.frames import CARTESIAN, in_space
 from ..space.rotations import TURNING
@@ -47,44 +47,20 @@ if TYPE_CHECKING:
 Frame: TypeAlias = dict[str, list[tuple[float | str, ...]]]
 
 
-class SensorHead(msgspec.Struct):
-    """How a sensor's measurements become positions: (z − bias) / scale, at stamp − latency.
-
-    Attributes:
-        scale: Of the position in the measurement.
-        latency: [s].
-        biased: Whether a constant bias must be found first.
-        frame: Where the sensor stands, if it has a frame of its own.
-        marker: What it sees on the tool, if that is not the tool point.
-    """
-
-    scale: float
-    latency: float
-    biased: bool
-    frame: Placement | None = None
-    marker: Placement | None = None
-
-
 class Header(msgspec.Struct):
-    """What is drawn, and where.
+    """What is drawn, and where."""
 
-    Attributes:
-        mode: ``spawn``, ``connect`` or ``web``.
-        axes: The arm's, in their order, and whether each is a length or an angle.
-        space: The three axes, or x, y, z, that are a position in space; empty without.
-        tool: Of a tool that turns the orientation at which rx, ry, rz are 0, a rotation vector [rad].
-        sensors: By name.
-        port: Where the viewer listens.
-        web_port: Where its page is served.
-    """
+    mode: str  # spawn, connect or web
+    axes: dict[str, Kind]  # the arm's, in their order
+    space: tuple[str, ...]  # the three axes, or x, y, z, that are a position in space; empty without
+    tool: Vector | None  # of a tool that turns the orientation at which rx, ry, rz are 0, a rotation vector [rad]
+    sensors: dict[str, Sensor]
+    port: int  # where the viewer listens
+    web_port: int  # where its page is served
 
-    mode: str
-    axes: dict[str, Kind]
-    space: tuple[str, ...]
-    tool: Vector | None
-    sensors: dict[str, SensorHead]
-    port: int
-    web_port: int
+    def is_biased(self, sensor: str) -> bool:
+        """Whether a constant bias must be found before a sensor's measurements are positions."""
+        return any(self.sensors[sensor].bias_sd_of(axis) > 0.0 for axis in self.axes)
 
 
 MODES = ("spawn", "connect", "web")
@@ -104,16 +80,7 @@ class LiveView:
     """
 
     def __init__(self, mode: str, config: FusionConfig, notify: Callable[[str], None]) -> None:
-        """Start to draw.
-
-        Args:
-            mode: ``spawn`` opens a viewer; ``connect`` draws into one that is open; ``web`` serves a page.
-            config: Of the estimator.
-            notify: Takes a sentence for the log.
-
-        Raises:
-            ConfigError: There is no such mode, or drawing is not possible here.
-        """
+        """Start to draw."""
         if mode not in MODES:
             raise ConfigError(f"--rerun: no mode '{mode}'; there are: {', '.join(MODES)}")
         if os.name != "posix":
@@ -122,14 +89,10 @@ class LiveView:
         self._notify = notify
         self._framed = config.frame is not None
         self._space = CARTESIAN if self._framed else in_space(config.arm)  # of a position in space
-        biased = {
-            name
-            for name, sensor in config.sensors.items()
-            if any(sensor.bias_sd_of(axis) > 0.0 for axis in config.arm.axes)
-        }
-        unbiased = {name for name, sensor in config.sensors.items() if sensor.scale == 1.0 and name not in biased}
         turns = {*CARTESIAN, *TURNING} <= config.arm.axes.keys()
         tool = config.tool.reference if turns and config.tool is not None else None
+        header = Header(mode, config.arm.kind_of, self._space, tool, config.sensors, PORT, WEB_PORT)
+        unbiased = [name for name, one in config.sensors.items() if one.scale == 1.0 and not header.is_biased(name)]
         self._in_space = {  # sources that are drawn as positions in space; of a tool that turns the drawer makes these
             "",
             *(unbiased if self._space == CARTESIAN and tool is None else ()),
@@ -143,11 +106,7 @@ class LiveView:
         self._unsent, self._notices = b"", b""
         self._child: subprocess.Popen[bytes] | None
         self._child, self._stdin, self._stdout = _start()
-        sensors = {
-            name: SensorHead(sensor.scale, sensor.latency, name in biased, sensor.frame, sensor.marker)
-            for name, sensor in config.sensors.items()
-        }
-        self._write(Header(mode, config.arm.kind_of, self._space, tool, sensors, PORT, WEB_PORT))
+        self._write(header)
 
     def event(self, event: Event, result: UpdateResult) -> None:
         """Take in an event and what became of it."""
@@ -243,7 +202,7 @@ class LiveView:
         if self._unsent:
             self.dropped += 1
         else:
-            self._unsent = msgspec.json.encode(message) + b"\n"
+            self._unsent = msgspec.json.encode(message, enc_hook=float) + b"\n"
             self._flush()
 
     def _flush(self) -> None:

@@ -21,15 +21,15 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ..arrays import BoolArray, FloatArray
-from ..fusion.config import Vector
+from ..fusion.config import Sensor, Vector
 from ..logs.frames import CARTESIAN
 from ..space import rotations
 from ..space.rotations import TURNING
 from ..units import MM, SCREEN, Screen
 from . import colours, scene, styles
-from .live import Frame, Header, SensorHead
+from .live import Frame, Header
 from .live_viewer import Viewer
-from .sink import Sink
+from .styles import Sink
 
 _WAITING = 20  # frames
 _LAST = 1.0  # s for the last frames
@@ -50,37 +50,32 @@ class Picture:
     """Drawing of frames into one stream of rerun-sdk."""
 
     def __init__(self, stream: rr.RecordingStream, header: Header) -> None:
-        """Send the layout and the colours.
-
-        Args:
-            stream: Connected.
-            header: The axes and sensors.
-        """
-        self._stream, self._header = stream, header
+        """Send the layout and the colours."""
+        self._stream, self._header, self._sink = stream, header, Sink(stream)
         self._screens = {axis: SCREEN[kind] for axis, kind in header.axes.items()}
         self._estimates = {axis: Recent(3) for axis in header.axes}
         self._residuals = {
-            (axis, name): Residuals(sensor, self._estimates[axis])
+            (axis, name): Residuals(sensor, header.is_biased(name), self._estimates[axis])
             for axis in header.axes
             for name, sensor in header.sensors.items()
         }
         self._paths: dict[str, Recent] = {}
-        self._tool = None if header.tool is None else Tool(stream, header, header.tool, self._estimates)
+        self._tool = None if header.tool is None else Tool(self._sink, header, header.tool, self._estimates)
         stream.send_blueprint(_blueprint(header))
         self._of_sensors = colours.sensor_colours(list(header.sensors))
         self._colours = {"command": colours.COMMAND, "estimate": colours.ESTIMATE, **self._of_sensors}
-        self._styled: set[str] = set()
 
     def draw(self, frame: Frame) -> None:
         """Send a frame."""
         for axis, known in self._estimates.items():
-            scale = self._screens[axis].scale
+            screen = self._screens[axis]
             time, command = _columns(frame, f"command/{axis}", 2)
-            self._plot(f"{axis}/command", styles.line(colours.COMMAND, "command", step=True), time, command * scale)
+            line = styles.line(colours.COMMAND, "command", step=True)
+            self._sink.series(f"{axis}/command", line, time, command, screen)
             time, position, sd = estimates = _columns(frame, f"estimate/{axis}", 3)
             known.add(estimates)
-            self._band(f"{axis}/estimate", "estimate ± sd", time, position * scale, sd * scale, axis)
-            self._band(f"residual/{axis}/estimate", "estimate's sd", time, np.zeros(len(time)), sd * scale, axis)
+            self._sink.band(f"{axis}/estimate", "estimate ± sd", time, position, sd, screen)
+            self._sink.band(f"residual/{axis}/estimate", "estimate's sd", time, np.zeros(len(time)), sd, screen)
         taken: dict[tuple[str, str], FloatArray] = {}
         for (axis, name), residuals in self._residuals.items():
             residuals.add(_columns(frame, f"measurement/{axis}/{name}", 3))
@@ -88,20 +83,17 @@ class Picture:
             taken[axis, name] = np.array([time, position, rejected], dtype=np.float64)
             screen, fused = self._screens[axis], ~rejected
             shown = self._estimates[axis].clip(position, screen)
-            points, crosses = (
-                styles.points(self._colours[name], name),
-                styles.points(colours.REJECTED, "rejected", "Cross"),
-            )
+            points = styles.points(self._colours[name], name)
+            crosses = styles.points(colours.REJECTED, "rejected", "Cross")
             entity = styles.entity(name)
-            self._plot(f"{axis}/{entity}", points, time[fused], position[fused] * screen.scale)
-            self._plot(f"{axis}/{entity}/rejected", crosses, time[rejected], shown[rejected] * screen.scale)
-            self._plot(f"residual/{axis}/{entity}", points, time[fused], residual[fused] * screen.scale)
+            self._sink.series(f"{axis}/{entity}", points, time[fused], position[fused], screen)
+            self._sink.series(f"{axis}/{entity}/rejected", crosses, time[rejected], shown[rejected], screen)
+            self._sink.series(f"residual/{axis}/{entity}", points, time[fused], residual[fused], screen)
         for name, colour in self._of_sensors.items():
             for path in (f"nis/{name}", f"rate/{name}"):
-                self._plot(path, styles.line(colour, name), *_columns(frame, path, 2))
+                self._sink.series(path, styles.line(colour, name), *_columns(frame, path, 2))
         for moment, level, text in frame.get("log", ()):
-            self._stream.set_time(styles.TIMELINE, duration=float(moment))
-            self._stream.log(_LOG, rr.TextLog(str(text), level=str(level)))
+            self._sink.log_at(float(moment), _LOG, rr.TextLog(str(text), level=str(level)))
         for name, colour in self._colours.items():
             self._draw_path(name, colour, _columns(frame, f"path/{name}", 4))
         if self._tool is not None:
@@ -121,51 +113,23 @@ class Picture:
         path = self._paths.setdefault(name, Recent(4))
         path.add(rows)
         strip, rgb = path.rows[1:].T * MM, colours.rgb(colour)
-        thinned = _thinned(strip)
-        self._stream.set_time(styles.TIMELINE, duration=float(rows[0, -1]))
+        thinned, now = _thinned(strip), float(rows[0, -1])
         if name in self._header.sensors:
-            self._stream.log(f"path/{name}", rr.Points3D(thinned, colors=[rgb], radii=-1.0))
+            shape = rr.Points3D(thinned, colors=[rgb], radii=-1.0)
         else:
-            width = -0.7 if name == "command" else -1.2
-            self._stream.log(f"path/{name}", rr.LineStrips3D([thinned], colors=[rgb], radii=width))
+            shape = rr.LineStrips3D([thinned], colors=[rgb], radii=-0.7 if name == "command" else -1.2)
+        self._sink.log_at(now, f"path/{name}", shape)
         if name == "estimate" and self._tool is None:
             tool = rr.Points3D(strip[-1:], colors=[colours.rgb(colours.REJECTED)], radii=-5.0)
-            self._stream.log("path/tool", tool)
-
-    def _plot(self, path: str, style: styles.Style, time: FloatArray, value: FloatArray) -> None:
-        """Send the values of an entity, with the first of them its style."""
-        there = np.isfinite(time) & np.isfinite(value)
-        self._send(path, style, time[there], rr.Scalars.columns(scalars=value[there]))
-
-    def _band(self, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, axis: str) -> None:
-        """Send values with their standard deviations, with the first of them their style."""
-        style = styles.banded(label, self._screens[axis].unit)
-        self._send(path, style, time, rr.Measurements.columns(values=value, variances=sd**2))
-
-    def _send(self, path: str, style: styles.Style, time: FloatArray, columns: rr.ComponentColumnList) -> None:
-        if not len(time):
-            return
-        if path not in self._styled:
-            self._styled.add(path)
-            self._stream.log(path, style, static=True)
-        rr.send_columns(path, styles.timeline(time), columns, recording=self._stream)
+            self._sink.log_at(now, "path/tool", tool)
 
 
 class Tool:
     """A tool that turns, what sensors see of it, and where they stand, as a recorded result has it."""
 
-    def __init__(
-        self, stream: rr.RecordingStream, header: Header, reference: Vector, estimates: Mapping[str, Recent]
-    ) -> None:
-        """Send how it looks.
-
-        Args:
-            stream: Connected.
-            header: The sensors.
-            reference: The orientation at which rx, ry, rz are 0, a rotation vector [rad].
-            estimates: Of each axis, as they are when it is drawn.
-        """
-        self._sink, self._sensors = Sink(stream), header.sensors
+    def __init__(self, sink: Sink, header: Header, reference: Vector, estimates: Mapping[str, Recent]) -> None:
+        """Send how it looks."""
+        self._sink, self._sensors = sink, header.sensors
         self._reference, self._estimates = np.array(reference), estimates
         self._seen = {name: Recent(5) for name in header.sensors}
         scene.send_look(self._sink, _AXES, _LARGER)
@@ -185,13 +149,7 @@ class Tool:
         scene.send_tool(self._sink, lengths[0][0, -1:], point, turned, root[None], _LARGER)
 
     def draw_seen(self, name: str, colour: str, taken: Sequence[FloatArray]) -> None:
-        """Send where the last seconds of a sensor's measurements put the tool.
-
-        Args:
-            name: Of the sensor.
-            colour: Of the sensor.
-            taken: Of x, y and z what is new: valid times [s], positions [m] and which were rejected, (3, n) each.
-        """
+        """Send where the last seconds of a sensor's measurements put the tool."""
         shared = scene.in_all([time for time, _, _ in taken])
         if not len(shared[0]):
             return
@@ -202,8 +160,7 @@ class Tool:
         fused, rejected = _thinned(rows[~flag]), _thinned(rows[flag])  # each by itself: few are rejected
         red = np.repeat([False, True], [len(fused), len(rejected)])
         points = scene.seen(np.concatenate([fused, rejected]) * MM, red, colour)
-        self._sink.stream.set_time(styles.TIMELINE, duration=float(seen.rows[0, -1]))
-        self._sink.stream.log(scene.measured(name), points)
+        self._sink.log_at(float(seen.rows[0, -1]), scene.measured(name), points)
 
 
 class Recent:
@@ -243,9 +200,9 @@ class Recent:
 class Residuals:
     """One sensor's measurements on one axis, which wait for the estimate at their valid times."""
 
-    def __init__(self, sensor: SensorHead, estimates: Recent) -> None:
+    def __init__(self, sensor: Sensor, biased: bool, estimates: Recent) -> None:
         """Of a sensor, against the estimates of an axis."""
-        self._sensor, self._estimates = sensor, estimates
+        self._sensor, self._biased, self._estimates = sensor, biased, estimates
         self._waiting = np.empty((3, 0))
         self._bias, self._averaged = 0.0, 0
 
@@ -263,7 +220,7 @@ class Residuals:
         (time, position, flag), self._waiting = self._waiting[:, ready], self._waiting[:, ~ready]
         rejected, residual = flag > 0.0, position - self._estimates.at(time)
         good = residual[np.isfinite(residual) & ~rejected]
-        if self._sensor.biased and len(good):
+        if self._biased and len(good):
             self._averaged = min(self._averaged + len(good), _AVERAGED)
             self._bias += min(len(good) / self._averaged, 1.0) * (float(good.mean()) - self._bias)
         return time, position - self._bias, residual - self._bias, rejected
@@ -280,12 +237,7 @@ def _columns(frame: Frame, name: str, width: int) -> FloatArray:
 
 
 def _blueprint(header: Header, first: FloatArray | None = None) -> rrb.Blueprint:
-    """Positions, residuals, the path and the sensors' health; all follow the newest.
-
-    Args:
-        header: The axes.
-        first: Where the path begins [m], (3,).
-    """
+    """Positions, residuals, the path and the sensors' health; all follow the newest."""
     units = {axis: SCREEN[kind].unit for axis, kind in header.axes.items()}
     first_axis = next(iter(units))
     positions = {axis: _plot(f"/{axis}", f"{axis} [{unit}]", legend=axis == first_axis) for axis, unit in units.items()}

@@ -148,14 +148,7 @@ def _listens(port: int) -> bool:
 
 
 def _serve(web_port: int, port: int, page: int, data: int) -> None:
-    """Serve the page and its data in the background.
-
-    Args:
-        web_port: Where the browser finds the page …
-        port: … and the data.
-        page: Where Rerun serves the page …
-        data: … and takes and gives the data.
-    """
+    """Serve the page and its data in the background."""
     for server in (_page_server(web_port, port, page), _data_server(port, data)):
         threading.Thread(target=server.serve_forever, daemon=True).start()
 

@@ -290,16 +290,7 @@ def elsewhere(found: LatencySummary) -> list[str]:
 
 
 def write_latency(found: Latency, folder: Path, force: bool) -> None:
-    """Write ``report.html`` with the answers, a picture of each axis, and what to write where.
-
-    Args:
-        found: From :func:`pumafuse.latency`.
-        folder: Where the page goes.
-        force: Whether an earlier report may be replaced.
-
-    Raises:
-        FolderError: See :func:`check_writable`, or the disk refuses.
-    """
+    """Write ``report.html`` with the answers, a picture of each axis, and what to write where."""
     content = {
         "summary": found.details,
         "answers": answers(found.details),
@@ -312,26 +303,12 @@ def write_latency(found: Latency, folder: Path, force: bool) -> None:
 
 
 def check_writable(folder: Path, force: bool) -> None:
-    """Refuse early what the writers would refuse late.
-
-    Raises:
-        FolderError: The folder exists and is not to be replaced, or holds something else than a report.
-    """
+    """Refuse early what the writers would refuse late."""
     folders.check_writable(folder, force, (PAGE,), lambda name: name == PAGE)
 
 
 def write_identification(found: Identification, trials: StepTrials, folder: Path, force: bool) -> None:
-    """Write ``report.html`` with the paper's tables and figures of an identification.
-
-    Args:
-        found: What was identified.
-        trials: From these.
-        folder: Where the page goes.
-        force: Whether an earlier report may be replaced.
-
-    Raises:
-        FolderError: See :func:`check_writable`, or the disk refuses.
-    """
+    """Write ``report.html`` with the paper's tables and figures of an identification."""
     valleys, contours = step_figures.valleys(found, trials)
     content = {
         "found": found,
@@ -365,17 +342,7 @@ def write_identification(found: Identification, trials: StepTrials, folder: Path
 def write_verification(
     verified: Sequence[tuple[AxisVerification, Trace]], arm: ArmModel, folder: Path, force: bool
 ) -> None:
-    """Write ``report.html`` with Table III and Figs. 8 and 9.
-
-    Args:
-        verified: From :func:`pumafuse.verify`, of one run or several.
-        arm: The model.
-        folder: Where the page goes.
-        force: Whether an earlier report may be replaced.
-
-    Raises:
-        FolderError: See :func:`check_writable`, or the disk refuses.
-    """
+    """Write ``report.html`` with Table III and Figs. 8 and 9."""
     every = [one for one, _ in verified]
     content = {
         "arm": arm,

@@ -31,7 +31,7 @@ from ..logs.run import Run
 from ..units import Screen, seconds
 from . import colours, styles
 from .scene import by_kind, send_scene, views
-from .sink import Sink
+from .styles import Sink
 
 _OPENING_S = 4.0
 _LEGEND = (0.35, 0.6)  # of a plot's width and height, that a legend covers
@@ -113,20 +113,20 @@ def _send(est: Estimates, run: Run, sink: Sink) -> None:
     for name, axis in est.axes.items():
         screen = est.config.arm.screen_of(name)
         line = styles.line(colours.COMMAND, "command", step=True)
-        _series(sink, f"{name}/command", line, time, command.values[name], screen)
+        sink.series(f"{name}/command", line, time, command.values[name], screen)
         if est.reference is not None and name in est.reference.position:
             line = styles.line(colours.REFERENCE_3D, "reference")
-            _series(sink, f"{name}/reference", line, est.reference.time, est.reference.position[name], screen)
+            sink.series(f"{name}/reference", line, est.reference.time, est.reference.position[name], screen)
         for sensor in est.measurements.sensors:
             _sensor(sink, est, sensor, name, by_sensor[sensor])
-        _estimate(sink, f"{name}/estimate", "estimate ± sd", est.time, axis.position, axis.position_sd, screen)
+        sink.band(f"{name}/estimate", "estimate ± sd", est.time, axis.position, axis.position_sd, screen)
         if name not in _measured(est):
             continue
         nothing = np.zeros(len(est.time))
-        _estimate(sink, f"residual/{name}/estimate", "estimate's sd", est.time, nothing, axis.position_sd, screen)
+        sink.band(f"residual/{name}/estimate", "estimate's sd", est.time, nothing, axis.position_sd, screen)
         for edge in (2.0, -2.0):
             path = f"innovation/{name}/{'upper' if edge > 0.0 else 'lower'}"
-            _series(sink, path, styles.edge(f"{edge:+.0f}"), est.time[[0, -1]], np.full(2, edge))
+            sink.series(path, styles.edge(f"{edge:+.0f}"), est.time[[0, -1]], np.full(2, edge))
     for sensor in est.measurements.sensors:
         _outcomes(sink, est, sensor)
     send_scene(sink, est, run)
@@ -144,10 +144,10 @@ def _sensor(sink: Sink, est: Estimates, sensor: str, axis: str, colour: str) -> 
     points, crosses = styles.points(colour, sensor), styles.points(colours.REJECTED, "rejected", "Cross")
     position = np.interp(measured.time, est.time, est[axis].position, left=np.nan, right=np.nan)
     for path, value in ((axis, measured.value), (f"residual/{axis}", measured.value - position)):
-        _series(sink, f"{path}/{name}", points, measured.time[fused], value[fused], screen)
-        _series(sink, f"{path}/{name}/rejected", crosses, measured.time[~fused], value[~fused], screen)
+        sink.series(f"{path}/{name}", points, measured.time[fused], value[fused], screen)
+        sink.series(f"{path}/{name}/rejected", crosses, measured.time[~fused], value[~fused], screen)
     normalised = measured.innovation / measured.innovation_sd
-    _series(sink, f"innovation/{axis}/{name}", points, measured.time, normalised)
+    sink.series(f"innovation/{axis}/{name}", points, measured.time, normalised)
 
 
 def _outcomes(sink: Sink, est: Estimates, sensor: str) -> None:
@@ -170,26 +170,6 @@ def _outcomes(sink: Sink, est: Estimates, sensor: str) -> None:
     sink.log(f"outcome/{sensor}", rr.StateConfiguration(values=words, colors=shades))
     changes = rr.StateChange.columns(state=[word for _, word in states])
     sink.columns(f"outcome/{sensor}", np.array([at for at, _ in states]), changes)
-
-
-def _estimate(
-    sink: Sink, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, screen: Screen
-) -> None:
-    """Send values [SI] with their variances."""
-    sink.log(path, styles.banded(label, screen.unit))
-    scale = screen.scale
-    sink.columns(path, time, rr.Measurements.columns(values=value * scale, variances=(sd * scale) ** 2))
-
-
-def _series(
-    sink: Sink, path: str, style: styles.Style, time: FloatArray, value: FloatArray, screen: Screen | None = None
-) -> None:
-    """Send the style and the finite values of an entity, with a screen from SI; nothing where there are none."""
-    there = np.isfinite(time) & np.isfinite(value)
-    if there.any():
-        sink.log(path, style)
-        scale = 1.0 if screen is None else screen.scale
-        sink.columns(path, time[there], rr.Scalars.columns(scalars=value[there] * scale))
 
 
 def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:

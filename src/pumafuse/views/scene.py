@@ -24,8 +24,7 @@ from ..logs.frames import CARTESIAN, in_space
 from ..space import rotations
 from ..units import KINDS, MM, Kind, seconds
 from . import colours, styles
-from .live import SensorHead
-from .sink import Sink
+from .styles import Sink
 
 if TYPE_CHECKING:  # the process of the live view begins sooner without
     from ..fusion.estimates import Estimates
@@ -83,14 +82,7 @@ def views(est: Estimates, run: Run) -> list[rrb.Spatial3DView]:
 def two_views(
     name: str, larger: float, near: rrb.EyeControls3D | None, cell: rrb.EyeControls3D | None
 ) -> list[rrb.Spatial3DView]:
-    """Views of a scene in mm: of the tool from near by, and below it of the cell, if there is an eye for that.
-
-    Args:
-        name: What is seen near by.
-        larger: By how much its ellipsoid is enlarged.
-        near: From where this is seen.
-        cell: From where the cell is.
-    """
+    """Views of a scene in mm: of the tool from near by, and below it of the cell, if there is an eye for that."""
     name = f"{name} [mm]; where it is with 95 %" + (f", {larger:.0f} times as large" if larger > 1.0 else "")
     without_sensors, without_markers = (["$origin/**", f"- /path/{other}/**"] for other in ("sensors", "tool/markers"))
     found = [rrb.Spatial3DView(origin="/path", contents=without_sensors, name=name, eye_controls=near)]
@@ -116,13 +108,7 @@ def _eye(points: FloatArray) -> rrb.EyeControls3D:
 def cell_eye(
     path: FloatArray, frames: Iterable[Placement | None], links: FloatArray | None = None
 ) -> rrb.EyeControls3D | None:
-    """An eye that sees a path, the base, the sensors and the robot; None where neither of these has its place.
-
-    Args:
-        path: [m], (n, 3).
-        frames: Where the sensors stand.
-        links: Where links of the robot are [m], (n, 3).
-    """
+    """An eye that sees a path and links [m], (n, 3), base and sensors; None without a place of sensors or links."""
     others = [np.array([frame.at]) for frame in frames if frame is not None]
     others += [] if links is None else [links]
     return _eye(np.concatenate([path, np.zeros((1, 3)), *others])) if others else None
@@ -156,15 +142,9 @@ def send_look(sink: Sink, length: float, larger: float) -> None:
 def send_tool(
     sink: Sink, time: FloatArray, point: FloatArray, quaternion: FloatArray, root: FloatArray, larger: float
 ) -> None:
-    """Send where the tool and its ellipsoid are.
+    """Send where the tool and its ellipsoid are at times [s], (n,).
 
-    Args:
-        sink: Where to.
-        time: [s since the first command], (n,).
-        point: [m], (n, 3).
-        quaternion: x, y, z, w, (n, 4).
-        root: S of the covariance S Sᵀ of x, y, z [m], (n, 3, 3).
-        larger: By how much the ellipsoid is enlarged.
+    The point is in m, (n, 3), the quaternion x, y, z, w, (n, 4), and root the S of the covariance S Sᵀ of x, y, z [m].
     """
     point = point * sink.scale
     sink.columns("path/tool", time, rr.Transform3D.columns(translation=point, quaternion=quaternion))
@@ -226,19 +206,8 @@ def seen(point: FloatArray, rejected: BoolArray, colour: str) -> rr.Points3D:
     return rr.Points3D(point, colors=shades, radii=[-0.8])
 
 
-def send_placed(
-    sink: Sink, name: str, sensor: Sensor | SensorHead, colour: str, tool: FloatArray, length: float
-) -> None:
-    """Send where a sensor stands and what it sees on the tool, as far as this is known.
-
-    Args:
-        sink: Where to.
-        name: Of the sensor.
-        sensor: Has its place and that of its marker.
-        colour: Of the sensor.
-        tool: About where the tool is [m], (3,).
-        length: Of the tool's axes [m].
-    """
+def send_placed(sink: Sink, name: str, sensor: Sensor, colour: str, tool: FloatArray, length: float) -> None:
+    """Send where a sensor stands and what it sees on the tool, as far as this is known."""
     if sensor.frame is not None:
         away = float(np.linalg.norm(tool - sensor.frame.at))
         _frame(sink, f"path/sensors/{name}", sensor.frame, _OF_SENSOR * away, colour, name)

@@ -34,12 +34,7 @@ _DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number be
 
 
 def page(found: Tuning, runs: Sequence[Run]) -> str:
-    """The text of ``report.html``: the fitted parameters, their intervals, and the validation.
-
-    Args:
-        found: The tuning.
-        runs: The runs that it was fitted on; innovations are shown on the first.
-    """
+    """The text of ``report.html``: the fitted parameters, their intervals, and the validation."""
     summary = found.details
     fitted = {one.key: one for one in summary.parameters}
     before, after = (fused(runs[0], config) for config in (found.before, found.config))
