@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -105,19 +104,26 @@ def test_many_runs_are_fused_into_one_table(scenario: Path, tmp_path: Path) -> N
 
 
 def test_many_runs_are_resumed(scenario: Path, tmp_path: Path) -> None:
-    """--resume fuses what is not there yet, to the same files; results made otherwise are refused."""
-    runs, out = tmp_path / "runs", tmp_path / "out"
-    pumafuse("simulate", scenario, "-o", runs, "--runs", 3)
-    given = [runs / f"seed-{seed}" for seed in range(3, 6)]
+    """After a kill --resume fuses what is left, to the same files; results made otherwise are refused."""
+    runs, out, once = tmp_path / "runs", tmp_path / "out", tmp_path / "once"
+    pumafuse("simulate", scenario, "-o", runs, "--runs", 4)
+    given = [runs / f"seed-{seed}" for seed in range(3, 7)]
     same = "-c", runs / "seed-3" / "fusion.toml", "--rate", 50
-    whole, once = pumafuse("fuse", *given, *same, "-o", out).stdout, digests(out / "seed-5")
-    shutil.rmtree(out / "seed-5")
+    whole = pumafuse("fuse", *given, *same, "-o", once).stdout
+    words = [str(EXECUTABLE), "fuse", *map(str, [*given, *same]), "-o", str(out)]
+    process = subprocess.Popen(words, start_new_session=True)
+    while not out.is_dir() or not any(path.name.startswith("seed-") for path in out.iterdir()):
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
     kept = {path: path.stat().st_mtime_ns for path in out.glob("seed-*/*")}
+    assert kept
     resumed = pumafuse("fuse", *given, *same, "-o", out, "--resume").stdout
-    assert f"written to {out}; 2 of 3 were there already" in resumed
+    before = len({path.parent for path in kept})
+    assert f"written to {out}; {before} of 4 were there already" in resumed
     assert resumed.splitlines()[:-1] == whole.splitlines()[:-1]
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert digests(out / "seed-5") == once
+    assert all(digests(out / folder.name) == digests(folder) for folder in once.iterdir())
     assert "there already: " in pumafuse("fuse", given[0], *same, "-o", out / "seed-3", "--resume").stdout
     for option, what in (
         (["--smooth"], "with another mode"),
