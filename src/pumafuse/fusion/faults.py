@@ -53,26 +53,18 @@ _Cause: TypeAlias = Literal["turns", "unit", "columns", "sign", "clock", "frame"
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a sensor, or all, are not where the commands lead.
+    """Why a sensor, or all, are not where the commands lead."""
 
-    Attributes:
-        sensors: Which; all that measure these axes if it is the commands that are wrong, none of their turns.
-        axes: On which they are not.
-        cause: What is wrong.
-        size: How late they are [s], by how much they are turned [rad] or off [m or rad], how many times as far they
-            move, or how often they turn.
-        sentence: What shows it, and what to write instead.
-        refused: Whether estimates would be wrong by construction.
-        lost: Whether they follow the commands so little that nothing can be fitted to them.
-    """
-
+    # which; all that measure these axes if it is the commands that are wrong, none of their turns
     sensors: tuple[str, ...]
-    axes: tuple[str, ...]
-    cause: _Cause
+    axes: tuple[str, ...]  # on which they are not
+    cause: _Cause  # what is wrong
+    # how late they are [s], by how much they are turned [rad] or off [m or rad], how many times as far they move, or
+    # how often they turn
     size: float
-    sentence: str
-    refused: bool = False
-    lost: bool = False
+    sentence: str  # what shows it, and what to write instead
+    refused: bool = False  # whether estimates would be wrong by construction
+    lost: bool = False  # whether they follow the commands so little that nothing can be fitted to them
 
     def is_like(self, other: Fault) -> bool:
         """Whether the other fault, also of another sensor, may come from the same commands."""

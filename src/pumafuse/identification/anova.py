@@ -37,15 +37,12 @@ class Level(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Dependence(msgspec.Struct, frozen=True, kw_only=True):
-    """Whether one coefficient depends on one factor.
-
-    Attributes:
-        i_ratio: F over the 95 % point of its distribution; above 1 is dependent. Null where it cannot be computed.
-    """
+    """Whether one coefficient depends on one factor."""
 
     coefficient: str  # with its unit
     factor: str  # what was varied
     levels: list[Level]  # the coefficient at each level
+    # F over the 95 % point of its distribution; above 1 is dependent. Null where it cannot be computed
     i_ratio: float | None
     p: float | None  # of that F
     welch_p: float | None  # of Welch's test, which does not assume equal variances
@@ -54,15 +51,12 @@ class Dependence(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Scatter(msgspec.Struct, frozen=True, kw_only=True):
-    """Scatter of one coefficient on one axis, in its unit.
-
-    Attributes:
-        normal_p: Of a Shapiro-Wilk test; small: not normally distributed, so do not trust means and i-ratios alone.
-    """
+    """Scatter of one coefficient on one axis, in its unit."""
 
     coefficient: str  # with its unit
     axis: str  # of the trials
     median: float  # over the trials
+    # of a Shapiro-Wilk test; small: not normally distributed, so do not trust means and i-ratios alone
     normal_p: float | None
     outlying: list[str]  # trials further from the median than eight robust standard deviations
     replicate_sd: float | None  # between trials of the same settings; null where none were repeated

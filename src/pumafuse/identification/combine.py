@@ -38,32 +38,26 @@ class Fitted:
 
 
 class OrderChoice(msgspec.Struct, frozen=True, kw_only=True):
-    """First or second order.
-
-    Attributes:
-        first_rms: Root mean square residual of first order over all trials [m or rad].
-        inverse_square: 1/ω² [s²] with its interval by trials; 0 is first order.
-    """
+    """First or second order."""
 
     order: Order
+    # root mean square residual of first order over all trials [m or rad]
     first_rms: float = msgspec.field(name="first_rms_mm")
     second_rms: float = msgspec.field(name="second_rms_mm")  # of second order [m or rad]
     f: float  # of the F-test of the additional parameters of second order
     p: float  # of that F
     aicc_gain: float | None  # by how much second order lowers AICc; negative: it raises it. Null: too few samples.
+    # 1/ω² [s²] with its interval by trials; 0 is first order
     inverse_square: Estimate = msgspec.field(name="inverse_square_s2")
     why: str
 
 
 class Delays(msgspec.Struct, frozen=True, kw_only=True):
-    """Three delays [s].
-
-    Attributes:
-        onset: When the arm is first seen to move: above 3 standard deviations and 2 % of the step; null: never.
-    """
+    """Three delays [s]."""
 
     lag: Estimate = msgspec.field(name="lag_ms")  # behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω
     fitted: Estimate = msgspec.field(name="fitted_ms")  # Td of the model
+    # when the arm is first seen to move: above 3 standard deviations and 2 % of the step; null: never
     onset: Estimate | None = msgspec.field(name="onset_ms")
 
 

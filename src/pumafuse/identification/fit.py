@@ -54,11 +54,7 @@ class Intervals(NamedTuple):
 
 @dataclass(frozen=True)
 class StepFit:
-    """The best response of one order.
-
-    Attributes:
-        covariance: Of delay, q, p, K and z₀, (5, 5); 0 for what was not fitted, infinite where it is not identifiable.
-    """
+    """The best response of one order."""
 
     order: Order  # 1 or 2
     shape: Shape  # delay, q and p
@@ -66,6 +62,7 @@ class StepFit:
     zero: float  # z₀ [m]
     rms: float  # of the residuals [m], eq. 10
     samples: int  # how many were fitted
+    # of delay, q, p, K and z₀, (5, 5); 0 for what was not fitted, infinite where it is not identifiable
     covariance: FloatArray
     reached: float  # share of its final value that the response has reached with the last sample
     parameters: int  # how many were fitted

@@ -31,11 +31,7 @@ _PLAUSIBLE_LAG = (1e-3, 10.0)  # s
 
 
 class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
-    """One trial's fit of one order; plant parameters of the other order are null, as are infinite ends of intervals.
-
-    Attributes:
-        natural_frequency_ci95: Its interval.
-    """
+    """One trial's fit of one order; plant parameters of the other order are null, as are infinite ends of intervals."""
 
     lag: float = msgspec.field(name="lag_ms")  # Td + τ, or Td + 2ζ/ω [s]: behind the held command at constant velocity
     lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
@@ -46,6 +42,7 @@ class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
     time_constant: float | None = msgspec.field(name="time_constant_ms", default=None)  # τ [s]
     time_constant_ci95: Interval | None = msgspec.field(name="time_constant_ms_ci95", default=None)
     natural_frequency: float | None = msgspec.field(name="natural_frequency_rad_s", default=None)  # ω [rad/s]
+    # its interval
     natural_frequency_ci95: Interval | None = msgspec.field(name="natural_frequency_rad_s_ci95", default=None)
     damping: float | None = None  # ζ
     damping_ci95: Interval | None = None

@@ -23,11 +23,7 @@ _NOISELESS = 1e-6  # of the step: less noise than this is none
 
 @dataclass(frozen=True)
 class JointFit:
-    """The plant that fits all trials best. Arrays are in the order of the trials, (n,), or (n, 2) for q and p.
-
-    Attributes:
-        influence: Of each trial on q and p (0 of first order), times n: their mean is the error. HC2-corrected.
-    """
+    """The plant that fits all trials best. Arrays are in the order of the trials, (n,), or (n, 2) for q and p."""
 
     q: float  # 2ζ/ω, or τ [s]
     p: float  # 1/ω² [s²]; 0 of first order
@@ -37,6 +33,7 @@ class JointFit:
     count: FloatArray  # samples of each
     cost: float  # sum of squared residuals, each trial's over its own noise
     residual: FloatArray  # of each trial, over its noise, (n, m)
+    # of each trial on q and p (0 of first order), times n: their mean is the error. HC2-corrected
     influence: FloatArray
     expected: FloatArray  # covariance of each influence by the noise within the trial, (n, 2, 2)
     delay_sd: FloatArray  # of each Td by the trial's noise [s], infinite where it is not identifiable

@@ -44,23 +44,16 @@ class Reading(enum.Enum):
 
 
 class Found(msgspec.Struct, frozen=True, kw_only=True):
-    """A finding with its numbers.
+    """A finding with its numbers."""
 
-    Attributes:
-        finding: What it is.
-        size: SHORT: how long [s]; AHEAD: by how much [s]; UNRELATED: correlation of speeds; UNEXPLAINED: share of the
-            motion; SCALE: the base's lengths over the sensor's; ATTITUDE: the angle between the frames [rad].
-        axis: LINE: in the base; ONE_AXIS: on the tool.
-        source: READING: whose, command or sensor.
-        reading: READING: how it follows.
-        unit: SCALE: the units of sensor and base that it looks like; UNEXPLAINED, ATTITUDE_UNRELATED: those of angles.
-    """
-
-    finding: Finding
+    finding: Finding  # what it is
+    # SHORT: how long [s]; AHEAD: by how much [s]; UNRELATED: correlation of speeds; UNEXPLAINED: share of the motion;
+    # SCALE: the base's lengths over the sensor's; ATTITUDE: the angle between the frames [rad]
     size: float | None = None
-    axis: Vector | None = None
-    source: str | None = None
-    reading: Reading | None = None
+    axis: Vector | None = None  # LINE: in the base; ONE_AXIS: on the tool
+    source: str | None = None  # READING: whose, command or sensor
+    reading: Reading | None = None  # READING: how it follows
+    # SCALE: the units of sensor and base that it looks like; UNEXPLAINED, ATTITUDE_UNRELATED: those of angles
     unit: str | None = None
 
     @property

@@ -22,15 +22,10 @@ _SINGULAR = 1e-11  # of the largest eigenvalue: what is smaller is not told by t
 
 
 class Blocks(NamedTuple):
-    """What the blocks of rows tell at the least squares.
+    """What the blocks of rows tell at the least squares."""
 
-    Attributes:
-        information: Of the numbers of a step, (b, k, k).
-        score: The slope of half the sum of squares, (b, k): all together 0.
-    """
-
-    information: FloatArray
-    score: FloatArray
+    information: FloatArray  # of the numbers of a step, (b, k, k)
+    score: FloatArray  # the slope of half the sum of squares, (b, k): all together 0
 
     def half_widths(self, numbers: FloatArray) -> FloatArray:
         """Half the 95 % interval of numbers that change so with a step, (q, k) → (q,)."""

@@ -32,17 +32,11 @@ _PAYS = 0.95  # of the noise that is left where all joints answer alike: what ga
 
 
 class _Step(NamedTuple):
-    """A step of the regression.
+    """A step of the regression."""
 
-    Attributes:
-        later: By how much more each joint is to be told later [s], (J,).
-        half: Half the 95 % intervals [s], (J,).
-        noise: What the registration left before it, of each block [m, rad].
-    """
-
-    later: FloatArray
-    half: FloatArray
-    noise: FloatArray
+    later: FloatArray  # by how much more each joint is to be told later [s], (J,)
+    half: FloatArray  # half the 95 % intervals [s], (J,)
+    noise: FloatArray  # what the registration left before it, of each block [m, rad]
 
 
 def joint_lags(

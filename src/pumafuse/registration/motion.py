@@ -23,17 +23,11 @@ _STEP = 1e-5  # s, by which dead times and time constants are varied for slopes
 
 
 class Motion(NamedTuple):
-    """What one source tells of the tool in one run.
+    """What one source tells of the tool in one run."""
 
-    Attributes:
-        time: When [s], ascending, (n,).
-        position: Where [m], (n, 3); a row with NaN tells nothing.
-        quaternion: How it is turned, as x, y, z, w, (n, 4); None where the source does not tell.
-    """
-
-    time: FloatArray
-    position: FloatArray
-    quaternion: FloatArray | None = None
+    time: FloatArray  # when [s], ascending, (n,)
+    position: FloatArray  # where [m], (n, 3); a row with NaN tells nothing
+    quaternion: FloatArray | None = None  # how it is turned, as x, y, z, w, (n, 4); None where the source does not tell
 
     def valid(self) -> Motion:
         """The rows in which all is known, in the order of time, the first of each instant."""

@@ -86,43 +86,25 @@ class Registered(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Response(msgspec.Struct, frozen=True, kw_only=True):
-    """How what a sensor tells answers to commands.
+    """How what a sensor tells answers to commands."""
 
-    Attributes:
-        lag: The arm's and the sensor's latency together, at constant velocity [s].
-        delay: The dead time in it [s].
-        time_constant: τ of a first-order plant [s]; dead time and τ make up for each other.
-    """
-
-    lag: Quantity
-    delay: Quantity
-    time_constant: Quantity
+    lag: Quantity  # the arm's and the sensor's latency together, at constant velocity [s]
+    delay: Quantity  # the dead time in it [s]
+    time_constant: Quantity  # τ of a first-order plant [s]; dead time and τ make up for each other
 
 
 class Registration(msgspec.Struct, frozen=True, kw_only=True):
-    """What :func:`registered` finds.
+    """What :func:`registered` finds."""
 
-    Attributes:
-        frame: Base from sensor; None where a finding prevents it.
-        marker: Tool from marker; likewise.
-        position: The response of positions.
-        rotation: That of orientations; None where it was taken to be that of positions.
-        rms: What is left of positions [m].
-        noise: White noise of a coordinate, by second differences [m].
-        rms_rotation: What is left of orientations [rad]; None where they were not used.
-        rows: How many measurements were looked at.
-        findings: What is wrong or not told.
-    """
-
-    frame: Registered | None = None
-    marker: Registered | None = None
-    position: Response | None = None
-    rotation: Response | None = None
-    rms: float | None = None
-    noise: float = 0.0
-    rms_rotation: float | None = None
-    rows: int = 0
-    findings: tuple[Found, ...] = ()
+    frame: Registered | None = None  # base from sensor; None where a finding prevents it
+    marker: Registered | None = None  # tool from marker; likewise
+    position: Response | None = None  # the response of positions
+    rotation: Response | None = None  # that of orientations; None where it was taken to be that of positions
+    rms: float | None = None  # what is left of positions [m]
+    noise: float = 0.0  # white noise of a coordinate, by second differences [m]
+    rms_rotation: float | None = None  # what is left of orientations [rad]; None where they were not used
+    rows: int = 0  # how many measurements were looked at
+    findings: tuple[Found, ...] = ()  # what is wrong or not told
 
     @property
     def read_otherwise(self) -> bool:
@@ -224,25 +206,15 @@ def rows_of(command: Sequence[Motion], sensor: Sequence[Motion], mean: FloatArra
 
 
 class _Begin(NamedTuple):
-    """Where the least squares begin.
+    """Where the least squares begin."""
 
-    Attributes:
-        command: Of all runs, read so that orientations follow.
-        sensor: Likewise, in the base's units.
-        mean: A point in the middle of what the sensor measures [m].
-        attitude: Whether its orientations are used.
-        either: Whether a mirrored sensor would do as well.
-        state: The start.
-        findings: What was found on the way.
-    """
-
-    command: list[Motion]
-    sensor: list[Motion]
-    mean: FloatArray
-    attitude: bool
-    either: bool
-    state: State
-    findings: list[Found]
+    command: list[Motion]  # of all runs, read so that orientations follow
+    sensor: list[Motion]  # likewise, in the base's units
+    mean: FloatArray  # A point in the middle of what the sensor measures [m]
+    attitude: bool  # whether its orientations are used
+    either: bool  # whether a mirrored sensor would do as well
+    state: State  # the start
+    findings: list[Found]  # what was found on the way
 
 
 def _begun(
@@ -458,19 +430,12 @@ def _read_as(
 
 
 class _Aligned(NamedTuple):
-    """One rotation for positions and orientations.
+    """One rotation for positions and orientations."""
 
-    Attributes:
-        frame: Base from sensor, (3, 3).
-        left: What it leaves, of 1.
-        excess: What it leaves beyond what two rotations would, one of each: 1 is a radian.
-        attitude: That of orientations, and what it leaves of them.
-    """
-
-    frame: FloatArray
-    left: float
-    excess: float
-    attitude: tuple[FloatArray, float]
+    frame: FloatArray  # base from sensor, (3, 3)
+    left: float  # what it leaves, of 1
+    excess: float  # what it leaves beyond what two rotations would, one of each: 1 is a radian
+    attitude: tuple[FloatArray, float]  # that of orientations, and what it leaves of them
 
 
 def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) -> _Aligned:

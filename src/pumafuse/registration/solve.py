@@ -34,25 +34,15 @@ _FASTEST = 0.3  # s, by which a dead time changes in a step at most; τ and scal
 
 
 class State(NamedTuple):
-    """What is looked for.
+    """What is looked for."""
 
-    Attributes:
-        rotation: S, base from sensor, (3, 3).
-        centre: Where the mean of what the sensor measures lies in the base [m], (3,).
-        marker: Its place on the tool [m], (3,).
-        turn: Q, tool from marker, (3, 3).
-        scale: Of the base's lengths over the sensor's.
-        position: The plant of positions.
-        angle: The plant of orientations.
-    """
-
-    rotation: FloatArray
-    centre: FloatArray
-    marker: FloatArray
-    turn: FloatArray
-    scale: float
-    position: Plant
-    angle: Plant
+    rotation: FloatArray  # S, base from sensor, (3, 3)
+    centre: FloatArray  # where the mean of what the sensor measures lies in the base [m], (3,)
+    marker: FloatArray  # its place on the tool [m], (3,)
+    turn: FloatArray  # Q, tool from marker, (3, 3)
+    scale: float  # of the base's lengths over the sensor's
+    position: Plant  # the plant of positions
+    angle: Plant  # the plant of orientations
 
     def moved(self, step: FloatArray) -> State:
         """After a step, (17,)."""
@@ -74,29 +64,18 @@ class State(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What a sensor measured, the rows of all runs after one another.
+    """What a sensor measured, the rows of all runs after one another."""
 
-    Attributes:
-        answer: Where the tool is by its commands.
-        centred: z − z̄ [m], (n, 3); z̄ is any point in the middle.
-        turned: R_sensor, (n, 3, 3); None where it is not told.
-    """
-
-    answer: Answer
-    centred: FloatArray
-    turned: FloatArray | None
+    answer: Answer  # where the tool is by its commands
+    centred: FloatArray  # z − z̄ [m], (n, 3); z̄ is any point in the middle
+    turned: FloatArray | None  # r_sensor, (n, 3, 3); None where it is not told
 
 
 class Off(NamedTuple):
-    """How far rows are off.
+    """How far rows are off."""
 
-    Attributes:
-        blocks: Lengths [m], (n, 3), and angles [rad] where the sensor tells orientation, (n, 3).
-        poses: Where the tool is.
-    """
-
-    blocks: list[FloatArray]
-    poses: Poses
+    blocks: list[FloatArray]  # lengths [m], (n, 3), and angles [rad] where the sensor tells orientation, (n, 3)
+    poses: Poses  # where the tool is
 
     def noise(self) -> FloatArray:
         """The standard deviation of each block, by the median."""
@@ -115,19 +94,12 @@ class Off(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """The least squares that were found.
+    """The least squares that were found."""
 
-    Attributes:
-        state: What was looked for.
-        off: How far each row is off.
-        free: The steps that are allowed, as columns, (17, k).
-        told: What blocks of rows tell of them.
-    """
-
-    state: State
-    off: Off
-    free: FloatArray
-    told: Blocks
+    state: State  # what was looked for
+    off: Off  # how far each row is off
+    free: FloatArray  # the steps that are allowed, as columns, (17, k)
+    told: Blocks  # what blocks of rows tell of them
 
     def left(self) -> float:
         """The standard deviation of positions [m]."""

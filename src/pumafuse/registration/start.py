@@ -31,17 +31,11 @@ _HALF_TURN = 2.6  # rad, beyond which the axis of a rotation may point either wa
 
 
 class Rough(NamedTuple):
-    """How a sensor follows by its speeds.
+    """How a sensor follows by its speeds."""
 
-    Attributes:
-        lag: Behind the commands [s].
-        scale: Of the base's lengths over the sensor's; NaN where the tool keeps its place.
-        correlation: Of the speeds.
-    """
-
-    lag: float
-    scale: float
-    correlation: float
+    lag: float  # behind the commands [s]
+    scale: float  # of the base's lengths over the sensor's; NaN where the tool keeps its place
+    correlation: float  # of the speeds
 
 
 def rough(command: Sequence[Motion], sensor: Sequence[Motion]) -> Rough:

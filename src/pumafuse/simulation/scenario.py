@@ -41,35 +41,26 @@ _SMALLEST, _LARGEST_LENGTH, _LARGEST = 1e-12, 1e5, 4e9  # SI; 100 km, 127 years
 
 
 class CommandLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How the commands are logged.
+    """How the commands are logged."""
 
-    Attributes:
-        stamp_jitter: Standard deviation of the logger's stamps around the true ticks [s].
-    """
-
+    # standard deviation of the logger's stamps around the true ticks [s]
     stamp_jitter: NotNegative = msgspec.field(name="stamp_jitter_ms", default=0.0)
     clock: Clock = "stamps"  # what ``run.toml`` says of the stamps
 
 
 class ReferenceLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How the reference is recorded.
+    """How the reference is recorded."""
 
-    Attributes:
-        rows_per_command: Rows in each update period, the first at the command's own instant.
-        sd: Standard deviation of its noise [m or rad], of all axes or of each.
-    """
-
+    # rows in each update period, the first at the command's own instant
     rows_per_command: Annotated[int, msgspec.Meta(gt=0, le=POINTS)] = 5
+    # standard deviation of its noise [m or rad], of all axes or of each
     sd: PerAxis = msgspec.field(name="sd_mm", default=0.0)
 
 
 class TrueStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the arm rests before the first command.
+    """Where the arm rests before the first command."""
 
-    Attributes:
-        offset_sd: Standard deviation of the offset there, drawn for each run and axis [m or rad].
-    """
-
+    # standard deviation of the offset there, drawn for each run and axis [m or rad]
     offset_sd: PerAxis = msgspec.field(name="offset_sd_mm", default=0.0)
     level: dict[str, float] = msgspec.field(default_factory=dict[str, float])  # by axis [m or rad]; 0 where absent
 

@@ -29,22 +29,19 @@ class GainCurve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class Imperfections(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a true axis does that no arm model has, but for play.
+    """What a true axis does that no arm model has, but for play."""
 
-    Attributes:
-        delay_jitter: Standard deviation of each command's own Td [s]; commands do not overtake one another.
-        extra_pole: Time constant of a lag in series with the plant [s].
-        backlash: Width of the play between plant and tool [m]; None: the model's.
-        stiction: When a command acts, the drive goes to its input (command and gain error) if that is farther away
-            than this [m]; it holds its place until the next command.
-        slow_drift: Amplitude of a slow sine on the position, as of warming up [m].
-    """
-
+    # standard deviation of each command's own Td [s]; commands do not overtake one another
     delay_jitter: NotNegative = msgspec.field(name="delay_jitter_ms", default=0.0)
     gain_curve: GainCurve | None = None  # K as a curve over speed, instead of the gain's line
+    # time constant of a lag in series with the plant [s]
     extra_pole: Positive | None = msgspec.field(name="extra_pole_ms", default=None)
+    # width of the play between plant and tool [m]; None: the model's
     backlash: NotNegative | None = msgspec.field(name="backlash_mm", default=None)
+    # when a command acts, the drive goes to its input (command and gain error) if that is farther away than this [m];
+    # it holds its place until the next command
     stiction: NotNegative = msgspec.field(name="stiction_mm", default=0.0)
+    # amplitude of a slow sine on the position, as of warming up [m]
     slow_drift: NotNegative = msgspec.field(name="slow_drift_mm", default=0.0)
     slow_drift_period: Positive = msgspec.field(name="slow_drift_period_s", default=600.0)  # its period [s]
 
@@ -76,22 +73,19 @@ class TrueAxis(Imperfections, frozen=True, kw_only=True):
 
 
 class TrueArm(Imperfections, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How the true arm differs on one axis or on all; what is absent is as in the filter's model.
-
-    Attributes:
-        time_constant: τ of a first-order plant [s].
-        natural_frequency: ω of a second-order plant [rad/s].
-        gain_recovery: Time constant [s], or "never".
-        max_speed: The fastest that the plant goes [m/s or rad/s], or "none".
-    """
+    """How the true arm differs on one axis or on all; what is absent is as in the filter's model."""
 
     plant: Literal["first-order", "second-order"] | None = None  # order of the plant
+    # τ of a first-order plant [s]
     time_constant: Positive | None = msgspec.field(name="time_constant_ms", default=None)
+    # ω of a second-order plant [rad/s]
     natural_frequency: Positive | None = msgspec.field(name="natural_frequency_rad_s", default=None)
     damping: Positive | None = None  # ζ of a second-order plant
     delay: NotNegative | None = msgspec.field(name="delay_ms", default=None)  # Td [s]
     gain: Gain | None = None  # K as a line over speed
+    # time constant [s], or "never"
     gain_recovery: Positive | Literal["never"] | None = msgspec.field(name="gain_recovery_ms", default=None)
+    # the fastest that the plant goes [m/s or rad/s], or "none"
     max_speed: Positive | Literal["none"] | None = msgspec.field(name="max_speed_mm_s", default=None)
     sag: Sag | None = None  # how far a static load holds the tool off
 

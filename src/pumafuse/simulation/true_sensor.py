@@ -34,39 +34,36 @@ class Outliers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How a sensor measures: z = scale · p(stamp − latency) + bias + noise.
-
-    Attributes:
-        rate_jitter: Standard deviation of each row's instant around an even grid [s].
-        axes: What it measures. Absent: everything, in x, y, z if the scenario has a frame; a sensor that names its
-            axes is logged in them.
-        sd: Standard deviation of the noise [m or rad], one number or one for each axis; likewise all in that unit.
-        latency_sd: Standard deviation of each row's own latency [s].
-        bias_sd: Standard deviation of one more bias, drawn for each run and axis [m or rad].
-        bias_drift_sd: Standard deviation of one more bias, which drifts and reverts to 0 [m or rad]; 0: none.
-        quantisation: Step between two values [m or rad]; 0: none.
-        outages: From and to, since the first command [s].
-        clock_offset: Of the sensor's clock against the commands' [s].
-        clock_drift: Of the sensor's clock against the commands' [parts per million].
-    """
+    """How a sensor measures: z = scale · p(stamp − latency) + bias + noise."""
 
     rate: Positive = msgspec.field(name="rate_hz")  # rows a second [Hz]
+    # standard deviation of each row's instant around an even grid [s]
     rate_jitter: NotNegative = msgspec.field(name="rate_jitter_ms", default=0.0)
+    # what it measures. Absent: everything, in x, y, z if the scenario has a frame; a sensor that names its axes is
+    # logged in them
     axes: Annotated[list[str], msgspec.Meta(min_length=1)] | None = None
+    # standard deviation of the noise [m or rad], one number or one for each axis; likewise all in that unit
     sd: Positive | dict[str, Positive] = msgspec.field(name="sd_mm")
     latency: float = msgspec.field(name="latency_ms", default=0.0)  # from the valid time to the stamp [s]
+    # standard deviation of each row's own latency [s]
     latency_sd: NotNegative = msgspec.field(name="latency_sd_ms", default=0.0)
     scale: float = 1.0  # factor on the position
     bias: float | dict[str, float] = msgspec.field(name="bias_mm", default=0.0)  # constant [m or rad]
+    # standard deviation of one more bias, drawn for each run and axis [m or rad]
     bias_sd: PerAxis = msgspec.field(name="bias_sd_mm", default=0.0)
+    # standard deviation of one more bias, which drifts and reverts to 0 [m or rad]; 0: none
     bias_drift_sd: PerAxis = msgspec.field(name="bias_drift_sd_mm", default=0.0)
     bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)  # how long such a drift lasts [s]
+    # step between two values [m or rad]; 0: none
     quantisation: PerAxis = msgspec.field(name="quantisation_mm", default=0.0)
     dropouts: Share = 0.0  # share of rows lost, one by one
     bursts: Bursts | None = None  # rows lost together
     outliers: Outliers | None = None  # rows with a large error
+    # from and to, since the first command [s]
     outages: list[tuple[float, float]] = msgspec.field(name="outages_s", default=[])
+    # of the sensor's clock against the commands' [s]
     clock_offset: float = msgspec.field(name="clock_offset_ms", default=0.0)
+    # of the sensor's clock against the commands' [parts per million]
     clock_drift: float = msgspec.field(name="clock_drift_ppm", default=0.0)
 
     def to_config(self) -> dict[str, Any]:

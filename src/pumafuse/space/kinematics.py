@@ -35,15 +35,11 @@ class _Motion:
 
 @dataclass(frozen=True)
 class Chain:
-    """A serial chain of links and joints, from a base to a tip.
+    """A serial chain of links and joints, from a base to a tip."""
 
-    Attributes:
-        links: The links, from the base to the tip.
-        kinds: What each joint moves by that must be known, in the order of the chain. A joint that mimics another is
-            not among them; the one that it mimics is, also where it is outside of the chain.
-    """
-
-    links: tuple[str, ...]
+    links: tuple[str, ...]  # the links, from the base to the tip
+    # what each joint moves by that must be known, in the order of the chain. A joint that mimics another is not among
+    # them; the one that it mimics is, also where it is outside of the chain
     kinds: dict[str, Kind]
     _motions: tuple[_Motion, ...]
 

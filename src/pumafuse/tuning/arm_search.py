@@ -64,19 +64,13 @@ _SLOPE = 1e-5  # of a coordinate, by which quantities are varied
 
 
 class Freedom(NamedTuple):
-    """What of an arm is to be found; the rest stays as given.
+    """What of an arm is to be found; the rest stays as given."""
 
-    Attributes:
-        given: The arm as it is known.
-        free: The coordinates that may vary.
-        orders: The orders of the plant to try.
-        gains: The kinds of gain to try.
-    """
-
-    given: Arm
+    given: Arm  # the arm as it is known
+    # the coordinates that may vary
     free: Collection[str] = ("delay", "lag", "damping", "recovery", "gain", *BENDS, "sag")
-    orders: Sequence[int] = (1, 2)
-    gains: Sequence[GainKind] = GAINS
+    orders: Sequence[int] = (1, 2)  # the orders of the plant to try
+    gains: Sequence[GainKind] = GAINS  # the kinds of gain to try
 
     @property
     def models(self) -> list[Model]:
@@ -412,19 +406,12 @@ class ArmSearch:
 
 
 class Chosen(NamedTuple):
-    """The likeliest arm of an axis, beside those of the others.
+    """The likeliest arm of an axis, beside those of the others."""
 
-    Attributes:
-        arm: The arm.
-        model: Of which order and kind of gain it is.
-        mixture: All that the axis may be, with what others say of a dead time that it shares.
-        shares: Whether it shares that.
-    """
-
-    arm: Arm
-    model: Model
-    mixture: Mixture
-    shares: bool
+    arm: Arm  # the arm
+    model: Model  # of which order and kind of gain it is
+    mixture: Mixture  # all that the axis may be, with what others say of a dead time that it shares
+    shares: bool  # whether it shares that
 
 
 def chosen_arms(

@@ -62,25 +62,15 @@ BEYOND = (-0.98, 1.0)  # bounds of the slope of another: no load moves a tool mo
 
 
 class Recording(NamedTuple):
-    """What was commanded on an axis, and what was measured of it, in one piece.
+    """What was commanded on an axis, and what was measured of it, in one piece."""
 
-    Attributes:
-        given: When each command was given, int64 ns, (k,).
-        command: u [m], (k,).
-        start: The level [m] at which the axis rests before its first command.
-        time: When each measurement is valid, int64 ns, ascending, (m,).
-        value: Where the axis was then, relative to ``start``; the sensor's scale is taken out [m], (m,).
-        source: The number of its sensor, (m,).
-        weight: 1, or 0 where a measurement does not count, (m,).
-    """
-
-    given: TimeArray
-    command: FloatArray
-    start: float
-    time: TimeArray
-    value: FloatArray
-    source: IntArray
-    weight: FloatArray
+    given: TimeArray  # when each command was given, int64 ns, (k,)
+    command: FloatArray  # u [m], (k,)
+    start: float  # the level [m] at which the axis rests before its first command
+    time: TimeArray  # when each measurement is valid, int64 ns, ascending, (m,)
+    value: FloatArray  # where the axis was then, relative to 'start'; the sensor's scale is taken out [m], (m,)
+    source: IntArray  # the number of its sensor, (m,)
+    weight: FloatArray  # 1, or 0 where a measurement does not count, (m,)
 
     def of(self, rows: Any) -> Recording:
         """With some of the measurements."""
@@ -90,21 +80,13 @@ class Recording(NamedTuple):
 
 @dataclass(frozen=True)
 class Rest:
-    """What an arm leaves of the measurements.
+    """What an arm leaves of the measurements."""
 
-    Attributes:
-        sd: White noise of each sensor [m], (s,).
-        walk: Density of a random walk [m/√s].
-        disturbance_sd: [m]; 0: there is none.
-        disturbance_time: [s].
-        smoothness: 1.5 (Matérn) or 0.5 (Ornstein-Uhlenbeck).
-    """
-
-    sd: FloatArray
-    walk: float = 0.0
-    disturbance_sd: float = 0.0
-    disturbance_time: float = _TIME
-    smoothness: float = 0.5
+    sd: FloatArray  # white noise of each sensor [m], (s,)
+    walk: float = 0.0  # density of a random walk [m/√s]
+    disturbance_sd: float = 0.0  # [m]; 0: there is none
+    disturbance_time: float = _TIME  # [s]
+    smoothness: float = 0.5  # 1.5 (Matérn) or 0.5 (Ornstein-Uhlenbeck)
 
 
 def longest_delay(period: float) -> float:
@@ -113,32 +95,18 @@ def longest_delay(period: float) -> float:
 
 
 class Arm(NamedTuple):
-    """An arm of an axis: what is varied of it.
+    """An arm of an axis: what is varied of it."""
 
-    Attributes:
-        delay: Dead time [s].
-        lag: Of the plant, behind an input of constant velocity: τ or 2 ζ / ω [s].
-        damping: ζ; 0: the plant is of first order.
-        recovery: Time constant with which the gain recovers [s]; 0: it stays.
-        gain: K of slow motion.
-        slope: What it gains with speed [s/m].
-        play: Width of the backlash between drive and tool [m]; 0: it has none.
-        max_speed: The fastest that the drive goes [m/s]; 0: as fast as it is asked to.
-        knee: Level above which a load holds the tool off [m], as logged.
-        beyond: What each 1 above it adds; 0: none does.
-        knee_below, below: Likewise below a level.
-    """
-
-    delay: float
-    lag: float
-    damping: float = 0.0
-    recovery: float = 0.0
-    gain: float = 1.0
-    slope: float = 0.0
-    play: float = 0.0
-    max_speed: float = 0.0
-    knee: float = 0.0
-    beyond: float = 0.0
+    delay: float  # dead time [s]
+    lag: float  # of the plant, behind an input of constant velocity: τ or 2 ζ / ω [s]
+    damping: float = 0.0  # ζ; 0: the plant is of first order
+    recovery: float = 0.0  # time constant with which the gain recovers [s]; 0: it stays
+    gain: float = 1.0  # K of slow motion
+    slope: float = 0.0  # what it gains with speed [s/m]
+    play: float = 0.0  # width of the backlash between drive and tool [m]; 0: it has none
+    max_speed: float = 0.0  # the fastest that the drive goes [m/s]; 0: as fast as it is asked to
+    knee: float = 0.0  # level above which a load holds the tool off [m], as logged
+    beyond: float = 0.0  # what each 1 above it adds; 0: none does. knee_below, below: Likewise below a level
     knee_below: float = 0.0
     below: float = 0.0
 
@@ -216,17 +184,11 @@ class Limits(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """An arm that was fitted.
+    """An arm that was fitted."""
 
-    Attributes:
-        arm: The arm.
-        log_posterior: With the biases at their best.
-        information: Of the coordinates that were varied, the biases being at their best, (k, k).
-    """
-
-    arm: Arm
-    log_posterior: float
-    information: FloatArray
+    arm: Arm  # the arm
+    log_posterior: float  # with the biases at their best
+    information: FloatArray  # of the coordinates that were varied, the biases being at their best, (k, k)
 
 
 class Measured:

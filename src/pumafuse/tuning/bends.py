@@ -37,17 +37,11 @@ _SAGS = ("sag", "stops")
 
 
 class Bent(NamedTuple):
-    """An arm with play, a fastest speed, a sag, or several of these.
+    """An arm with play, a fastest speed, a sag, or several of these."""
 
-    Attributes:
-        arm: The arm, fitted to all of the motion.
-        off: How far it is off where it was not fitted [m].
-        linear_off: How far the linear arm is off there [m].
-    """
-
-    arm: Arm
-    off: float
-    linear_off: float
+    arm: Arm  # the arm, fitted to all of the motion
+    off: float  # how far it is off where it was not fitted [m]
+    linear_off: float  # how far the linear arm is off there [m]
 
     def sentences(self, screen: Screen) -> list[str]:
         """What it has, and what that is worth, in the units of its axis."""

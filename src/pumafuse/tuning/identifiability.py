@@ -39,15 +39,10 @@ class Correlation(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class NotIdentifiable:
-    """A combination of parameters that the measurements do not determine.
+    """A combination of parameters that the measurements do not determine."""
 
-    Attributes:
-        members: Their keys, those that change most first.
-        fixed: Which of them was fixed for that reason.
-    """
-
-    members: tuple[str, ...]
-    fixed: str
+    members: tuple[str, ...]  # their keys, those that change most first
+    fixed: str  # which of them was fixed for that reason
 
     def __str__(self) -> str:
         """A sentence for notes."""

@@ -63,39 +63,24 @@ class Profile:
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """The 95 % confidence interval of a parameter.
+    """The 95 % confidence interval of a parameter."""
 
-    Attributes:
-        ci95: The 95 % interval [SI]; an end at the parameter's bound is open.
-        profiled: Whether the profile of the likelihood was computed, not only its curvature.
-        at: The bound at which the value lies, else None.
-        open: Which ends of the interval are open: the measurements do not limit them.
-        profile: The likelihood along it: drawn, to one and a half times the interval each way.
-    """
-
-    ci95: Interval
-    profiled: bool
-    at: Literal["lower", "upper"] | None
-    open: tuple[bool, bool]
-    profile: Profile
+    ci95: Interval  # the 95 % interval [SI]; an end at the parameter's bound is open
+    profiled: bool  # whether the profile of the likelihood was computed, not only its curvature
+    at: Literal["lower", "upper"] | None  # the bound at which the value lies, else None
+    open: tuple[bool, bool]  # which ends of the interval are open: the measurements do not limit them
+    profile: Profile  # the likelihood along it: drawn, to one and a half times the interval each way
 
 
 class _View(NamedTuple):
-    """The likelihood that the parameters of one axis, or of all, depend on.
+    """The likelihood that the parameters of one axis, or of all, depend on."""
 
-    Attributes:
-        likelihood: The likelihood.
-        outcomes: The outcomes of its components, which are repeated.
-        free: The free parameters that are not at a bound. The prior of a shared one is the information of other axes.
-        covariance: Of their coordinates, (k, k).
-        top: The log-posterior of the maximum.
-    """
-
-    likelihood: Likelihood
-    outcomes: Sequence[CodeArray]
+    likelihood: Likelihood  # the likelihood
+    outcomes: Sequence[CodeArray]  # the outcomes of its components, which are repeated
+    # the free parameters that are not at a bound. The prior of a shared one is the information of other axes
     free: Sequence[Parameter]
-    covariance: FloatArray
-    top: float
+    covariance: FloatArray  # of their coordinates, (k, k)
+    top: float  # the log-posterior of the maximum
 
 
 def confidence_intervals(

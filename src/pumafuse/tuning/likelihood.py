@@ -62,15 +62,10 @@ def in_threads(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
 
 @dataclass(frozen=True)
 class LogLikelihood:
-    """The log-likelihood of a configuration.
+    """The log-likelihood of a configuration."""
 
-    Attributes:
-        axes: Of each axis's components, with positions in mm or mrad, (A,).
-        results: What became of each measurement on each axis, for each segment.
-    """
-
-    axes: FloatArray
-    results: Sequence[Results]
+    axes: FloatArray  # of each axis's components, with positions in mm or mrad, (A,)
+    results: Sequence[Results]  # what became of each measurement on each axis, for each segment
 
     @property
     def outcomes(self) -> list[CodeArray]:
@@ -84,59 +79,35 @@ class LogLikelihood:
 
 
 class Derivatives(NamedTuple):
-    """Score and information of k parameters.
+    """Score and information of k parameters."""
 
-    Attributes:
-        score: ∂L/∂a, (k,).
-        information: The expected −∂²L/∂a², (k, k).
-        scatter: What it is by the scatter of the score over pieces of the runs; the same where the model is right,
-            (k, k).
-    """
-
-    score: FloatArray
-    information: FloatArray
+    score: FloatArray  # ∂L/∂a, (k,)
+    information: FloatArray  # the expected −∂²L/∂a², (k, k)
+    # what it is by the scatter of the score over pieces of the runs; the same where the model is right, (k, k)
     scatter: FloatArray
 
 
 class _Linear(NamedTuple):
-    """Innovations and variances of one axis of one segment, to first order.
+    """Innovations and variances of one axis of one segment, to first order."""
 
-    Attributes:
-        whole: The index of the segment.
-        mine: Which parameters they depend on, (p,).
-        fused: Which measurements were fused, (m,).
-        nu: ν, (m,).
-        S: Their variances, (m,).
-        d_nu: ∂ν/∂a, (p, m).
-        d_s: ∂S/∂a, (p, m).
-    """
-
-    whole: int
-    mine: list[int]
-    fused: BoolArray
-    nu: FloatArray
-    S: FloatArray
-    d_nu: FloatArray
-    d_s: FloatArray
+    whole: int  # the index of the segment
+    mine: list[int]  # which parameters they depend on, (p,)
+    fused: BoolArray  # which measurements were fused, (m,)
+    nu: FloatArray  # ν, (m,)
+    S: FloatArray  # their variances, (m,)
+    d_nu: FloatArray  # ∂ν/∂a, (p, m)
+    d_s: FloatArray  # ∂S/∂a, (p, m)
 
 
 @dataclass(frozen=True)
 class _Part:
-    """One axis of one segment.
+    """One axis of one segment."""
 
-    Attributes:
-        whole: The index of the segment.
-        axis: The index of the axis in :attr:`Likelihood.axes`.
-        segment: Only this axis and its measurements.
-        rows: The rows of these among the whole segment's measurements, (m,).
-        column: The column of the axis there.
-    """
-
-    whole: int
-    axis: int
-    segment: Segment
-    rows: IntArray
-    column: int
+    whole: int  # the index of the segment
+    axis: int  # the index of the axis in :attr:`Likelihood.axes`
+    segment: Segment  # only this axis and its measurements
+    rows: IntArray  # the rows of these among the whole segment's measurements, (m,)
+    column: int  # the column of the axis there
 
 
 class Likelihood:

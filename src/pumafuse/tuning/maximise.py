@@ -37,19 +37,13 @@ _REACH = 1.5  # longest step of a coordinate, in its scale
 
 @dataclass(frozen=True)
 class Point:
-    """A configuration with its log-likelihood and its log-posterior.
+    """A configuration with its log-likelihood and its log-posterior."""
 
-    Attributes:
-        config: The configuration.
-        log_likelihood: Its log-likelihood.
-        axes: The log-posterior of each axis but for a constant (shared parameters' priors count for the first), (A,).
-        results: What became of each component, for each segment.
-    """
-
-    config: FusionConfig
-    log_likelihood: float
+    config: FusionConfig  # the configuration
+    log_likelihood: float  # its log-likelihood
+    # the log-posterior of each axis but for a constant (shared parameters' priors count for the first), (A,)
     axes: FloatArray
-    results: Sequence[Results]
+    results: Sequence[Results]  # what became of each component, for each segment
 
     @property
     def outcomes(self) -> list[CodeArray]:

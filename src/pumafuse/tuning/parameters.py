@@ -66,29 +66,18 @@ def _changed(node: Any, path: Path, value: object, root: Any) -> Any:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that can be fitted.
+    """A number that can be fitted."""
 
-    Attributes:
-        fit: Which kind of fitting it belongs to.
-        key: Its name: table, axis or sensor, and key as in ``fusion.toml`` or ``arm.toml``.
-        path: Where it is in a configuration: fields and keys.
-        bounds: Lower and upper bound [SI].
-        log: Whether it is searched on a log scale: the coordinate is then the number's logarithm.
-        scale: A large change of the coordinate.
-        prior: Mean and standard deviation of the coordinate a priori; None: uniform within the bounds.
-        axis: Its axis; None where it belongs to all.
-        sensor: Its sensor, if it has one.
-    """
-
-    fit: Fit
-    key: str
-    path: Path
-    bounds: tuple[float, float]
-    log: bool = True
-    scale: float = 1.0
+    fit: Fit  # which kind of fitting it belongs to
+    key: str  # its name: table, axis or sensor, and key as in 'fusion.toml' or 'arm.toml'
+    path: Path  # where it is in a configuration: fields and keys
+    bounds: tuple[float, float]  # lower and upper bound [SI]
+    log: bool = True  # whether it is searched on a log scale: the coordinate is then the number's logarithm
+    scale: float = 1.0  # A large change of the coordinate
+    # mean and standard deviation of the coordinate a priori; None: uniform within the bounds
     prior: tuple[float, float] | None = None
-    axis: str | None = None
-    sensor: str | None = None
+    axis: str | None = None  # its axis; None where it belongs to all
+    sensor: str | None = None  # its sensor, if it has one
 
     @property
     def unit(self) -> float:

@@ -56,26 +56,17 @@ class LagStep(NamedTuple):
 
 
 class PlainArm(NamedTuple):
-    """The first-order arm with a gain that leaves the least squares.
+    """The first-order arm with a gain that leaves the least squares."""
 
-    Attributes:
-        arm: The arm.
-        lag_ci95: The lags [s] that leave no more than chance beyond the least, of so many measurements as have errors
-            of their own.
-        delayed: By how much the command alone is to be delayed to leave the least [s].
-        delayed_off: How far that is off where the axis moves [m]; four fifths of the measurements are nearer.
-        measured: What was looked at, without outliers.
-        whole: With them.
-        step: That it is another one in the second part of the run, where that leaves much less.
-    """
-
-    arm: Arm
+    arm: Arm  # the arm
+    # the lags [s] that leave no more than chance beyond the least, of so many measurements as have errors of their
+    # own
     lag_ci95: tuple[float, float]
-    delayed: float
-    delayed_off: float
-    measured: Measured
-    whole: Measured
-    step: LagStep | None = None
+    delayed: float  # by how much the command alone is to be delayed to leave the least [s]
+    delayed_off: float  # how far that is off where the axis moves [m]; four fifths of the measurements are nearer
+    measured: Measured  # what was looked at, without outliers
+    whole: Measured  # with them
+    step: LagStep | None = None  # that it is another one in the second part of the run, where that leaves much less
 
 
 def delays(measured: Measured) -> FloatArray:
@@ -162,18 +153,12 @@ def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list
 
 
 class Doubt(NamedTuple):
-    """That an axis's arm predicts worse than the commands do when they are delayed, or is of a lag that they exclude.
+    """An arm that predicts worse than the commands do when they are delayed, or is of a lag that they exclude."""
 
-    Attributes:
-        plain: That of least squares.
-        off: How far the axis's own is off where it moves [m]; four fifths of the measurements are nearer.
-        lag: Its own [s].
-        is_beaten: Whether a filter predicts the next measurement better with the arm of least squares in its place.
-    """
-
-    plain: PlainArm
-    off: float
-    lag: float
+    plain: PlainArm  # that of least squares
+    off: float  # how far the axis's own is off where it moves [m]; four fifths of the measurements are nearer
+    lag: float  # its own [s]
+    # whether a filter predicts the next measurement better with the arm of least squares in its place
     is_beaten: bool = False
 
     @property

@@ -51,21 +51,13 @@ MODELS = tuple(Model(*one) for one in product((1, 2), GAINS))
 
 @dataclass(frozen=True)
 class Entry:
-    """The most likely arm of a model with one delay.
+    """The most likely arm of a model with one delay."""
 
-    Attributes:
-        delay: The delay [s].
-        arm: The arm.
-        log_density: Of the delay and the model, with Laplace's approximation for the other numbers.
-        means: Of each quantity that the model has.
-        sds: Their standard deviations at this delay.
-    """
-
-    delay: float
-    arm: Arm
-    log_density: float
-    means: Mapping[Quantity, float]
-    sds: Mapping[Quantity, float]
+    delay: float  # the delay [s]
+    arm: Arm  # the arm
+    log_density: float  # of the delay and the model, with Laplace's approximation for the other numbers
+    means: Mapping[Quantity, float]  # of each quantity that the model has
+    sds: Mapping[Quantity, float]  # their standard deviations at this delay
 
 
 @dataclass(frozen=True)
@@ -98,21 +90,13 @@ class Branch:
 
 
 class Mixture(NamedTuple):
-    """Points of all branches between their entries, (n,).
+    """Points of all branches between their entries, (n,)."""
 
-    Attributes:
-        weight: Their probabilities.
-        model: Numbers in :data:`MODELS`.
-        delay: Their delays [s].
-        mean: Of each quantity there; NaN where the model does not have it.
-        sd: Its standard deviation there.
-    """
-
-    weight: FloatArray
-    model: FloatArray
-    delay: FloatArray
-    mean: Mapping[Quantity, FloatArray]
-    sd: Mapping[Quantity, FloatArray]
+    weight: FloatArray  # their probabilities
+    model: FloatArray  # numbers in :data:`MODELS`
+    delay: FloatArray  # their delays [s]
+    mean: Mapping[Quantity, FloatArray]  # of each quantity there; NaN where the model does not have it
+    sd: Mapping[Quantity, FloatArray]  # its standard deviation there
 
     def log_odds(self, chosen: Callable[[Model], bool]) -> float:
         """The logarithm of how much likelier the models that are chosen are than the others."""
@@ -137,13 +121,9 @@ class Mixture(NamedTuple):
 
 @dataclass(frozen=True)
 class AxisPosterior:
-    """The posterior of one axis.
+    """The posterior of one axis."""
 
-    Attributes:
-        branches: Of all models that count.
-    """
-
-    branches: Sequence[Branch]
+    branches: Sequence[Branch]  # of all models that count
 
     def log_density(self, delays: FloatArray) -> FloatArray:
         """The log-density of the delay, all models together, (m,)."""

@@ -52,46 +52,30 @@ _ROOM = 3.0  # width of the prior over the gap that was found
 
 @dataclass(frozen=True)
 class Plan:
-    """What a stage fits.
+    """What a stage fits."""
 
-    Attributes:
-        fit: The kinds of parameters.
-        fixed: Names of parameters to leave as they are.
-        sensors: The sensors to use; None: all.
-        trusted: The sensor that the arm was fitted on: only parameters of other sensors are free; None: all.
-        sd_prior: Whether a sensor's noise is believed to be what second differences show.
-        one_delay: Whether all axes share one delay whatever the measurements say.
-    """
-
-    fit: Sequence[Fit]
-    fixed: Sequence[str]
-    sensors: Sequence[str] | None = None
+    fit: Sequence[Fit]  # the kinds of parameters
+    fixed: Sequence[str]  # names of parameters to leave as they are
+    sensors: Sequence[str] | None = None  # the sensors to use; None: all
+    # the sensor that the arm was fitted on: only parameters of other sensors are free; None: all
     trusted: str | None = None
-    sd_prior: bool = True
-    one_delay: bool = False
+    sd_prior: bool = True  # whether a sensor's noise is believed to be what second differences show
+    one_delay: bool = False  # whether all axes share one delay whatever the measurements say
 
 
 @dataclass(frozen=True)
 class Stage:
-    """The result of a stage.
+    """The result of a stage."""
 
-    Attributes:
-        likelihood: The likelihood of the measurements it was fitted on.
-        best: The most likely point.
-        free: The parameters that were fitted.
-        not_identifiable: What the measurements do not determine, so that one parameter of each was fixed.
-        orders: The reasons for the order of each axis's plant, for its gain and for its disturbance, where chosen.
-        notes: Everything else noticed.
-        arms: The arms that were looked for, by axis.
-    """
-
-    likelihood: Likelihood
-    best: Point
-    free: Sequence[Parameter]
+    likelihood: Likelihood  # the likelihood of the measurements it was fitted on
+    best: Point  # the most likely point
+    free: Sequence[Parameter]  # the parameters that were fitted
+    # what the measurements do not determine, so that one parameter of each was fixed
     not_identifiable: Sequence[NotIdentifiable]
+    # the reasons for the order of each axis's plant, for its gain and for its disturbance, where chosen
     orders: dict[str, str]
-    notes: Sequence[str]
-    arms: Mapping[str, ArmSearch]
+    notes: Sequence[str]  # everything else noticed
+    arms: Mapping[str, ArmSearch]  # the arms that were looked for, by axis
 
 
 def run_stage(

@@ -61,37 +61,22 @@ class FittedLag(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FoundBias(toml.Reported, frozen=True, kw_only=True):
-    """The bias of a sensor on an axis in a run, in the log's coordinates.
+    """The bias of a sensor on an axis in a run, in the log's coordinates."""
 
-    Attributes:
-        run: The run's name.
-        sensor: The sensor.
-        axis: The axis.
-        kind: Whether that is a length or an angle.
-        bias: The bias [m or rad].
-        sd: Its standard deviation [m or rad].
-    """
-
-    run: str
-    sensor: str
-    axis: str
-    kind: Kind
-    bias: float = msgspec.field(name="bias_mm")
-    sd: float = msgspec.field(name="sd_mm")
+    run: str  # the run's name
+    sensor: str  # the sensor
+    axis: str  # the axis
+    kind: Kind  # whether that is a length or an angle
+    bias: float = msgspec.field(name="bias_mm")  # the bias [m or rad]
+    sd: float = msgspec.field(name="sd_mm")  # its standard deviation [m or rad]
 
 
 class AxisLikelihood(msgspec.Struct, frozen=True, kw_only=True):
-    """Log-likelihood of an axis's components in the runs fitted on, with positions in mm or mrad.
+    """Log-likelihood of an axis's components in the runs fitted on, with positions in mm or mrad."""
 
-    Attributes:
-        components: The number of components.
-        before: Under the configuration as given.
-        after: Under the tuned one.
-    """
-
-    components: int
-    before: float
-    after: float
+    components: int  # the number of components
+    before: float  # under the configuration as given
+    after: float  # under the tuned one
 
 
 class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):

@@ -31,67 +31,40 @@ _BATCHES = 20
 
 
 class SensorCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """One sensor's innovations on one axis.
+    """One sensor's innovations on one axis."""
 
-    Attributes:
-        count: Its fused components.
-        nis: Mean ν²/S; 1 for a consistent filter.
-        whiteness_p: Ljung-Box p-value; small: the innovations are not white.
-        correlation: Autocorrelation of the innovations at lag 1.
-        skill: Error of predicting its next measurement, over that of the best simpler way; null where there is none.
-    """
-
-    count: int
-    nis: float
-    whiteness_p: float
-    correlation: float
+    count: int  # its fused components
+    nis: float  # mean ν²/S; 1 for a consistent filter
+    whiteness_p: float  # ljung-Box p-value; small: the innovations are not white
+    correlation: float  # autocorrelation of the innovations at lag 1
+    # error of predicting its next measurement, over that of the best simpler way; null where there is none
     skill: float | None
 
 
 class State(toml.Reported, frozen=True, kw_only=True):
-    """One axis under one configuration.
+    """One axis under one configuration."""
 
-    Attributes:
-        log_likelihood: Of its components, with positions in mm or mrad.
-        rejected: Components that were rejected.
-        sensors: By name.
-        rmse: Root mean square error on the reference [m or rad]; null without one.
-        coverage: Share of errors within 1.96 standard deviations.
-    """
-
-    log_likelihood: float
-    rejected: int
-    sensors: dict[str, SensorCheck]
+    log_likelihood: float  # of its components, with positions in mm or mrad
+    rejected: int  # components that were rejected
+    sensors: dict[str, SensorCheck]  # by name
+    # root mean square error on the reference [m or rad]; null without one
     rmse: float | None = msgspec.field(name="rmse_mm", default=None)
-    coverage: float | None = None
+    coverage: float | None = None  # share of errors within 1.96 standard deviations
 
 
 class Check(toml.Reported, frozen=True, kw_only=True):
-    """One axis of one run before and after.
+    """One axis of one run before and after."""
 
-    Attributes:
-        run: The run's name.
-        axis: The axis.
-        kind: Whether that is a length or an angle.
-        since_s: Where the part to validate on begins; 0: at the run's begin.
-        components: The number of components compared.
-        before: Under the configuration as given.
-        after: Under the tuned one.
-        worse: Whether it got worse.
-        holds: Whether the error bars of the tuned one do: by the reference's coverage, else by NIS.
-        verdict: In words.
-    """
-
-    run: str
-    axis: str
-    kind: Kind
-    since_s: float
-    components: int
-    before: State
-    after: State
-    worse: bool
-    holds: bool
-    verdict: str
+    run: str  # the run's name
+    axis: str  # the axis
+    kind: Kind  # whether that is a length or an angle
+    since_s: float  # where the part to validate on begins; 0: at the run's begin
+    components: int  # the number of components compared
+    before: State  # under the configuration as given
+    after: State  # under the tuned one
+    worse: bool  # whether it got worse
+    holds: bool  # whether the error bars of the tuned one do: by the reference's coverage, else by NIS
+    verdict: str  # in words
 
 
 def fused(run: Run, config: FusionConfig) -> Estimates:
