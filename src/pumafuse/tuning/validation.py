@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Literal, TypeAlias
 
 import msgspec
 import numpy as np
@@ -28,6 +29,9 @@ _COVERAGE = 0.90  # of errors within 95 % error bars, below which these do not h
 _NIS = (0.71, 1.42)  # likewise: normal errors of which 98 and 90 % lie within
 _FARTHEST = 5.0  # sd that a component counts as at most
 _BATCHES = 20
+
+
+Change: TypeAlias = Literal["worse", "no different", "better"]
 
 
 class SensorCheck(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,6 +67,7 @@ class Check(toml.Reported, frozen=True, kw_only=True):
     before: State  # under the configuration as given
     after: State  # under the tuned one
     worse: bool  # whether it got worse
+    change: Change
     holds: bool  # whether the error bars of the tuned one do: by the reference's coverage, else by NIS
     verdict: str  # in words
 
@@ -111,13 +116,13 @@ def _check(run: str, axis: str, since: float, before: Estimates, after: Estimate
     farther = closer is not None and (
         closer > _FAR_WORSE or (closer > _WORSE and _beyond_chance(_squares(after, axis) - _squares(before, axis)))
     )
-    worse = gained < -chance or farther
+    change: Change = "worse" if gained < -chance or farther else "better" if gained > chance else "no different"
     verdict = f"log-likelihood {gained:+.1f} (chance: ± {chance:.1f})"
     if closer is not None:
         verdict += f", RMSE {100.0 * (closer - 1.0):+.1f} %"
     doubts = _doubts(after, axis, new)
-    head = "worse" if worse else "better" if gained > chance else "no different"
-    if doubts and head == "better":
+    head: str = change
+    if doubts and change == "better":
         head += f", but its error bars do not hold ({', '.join(doubts)})"
     simple = [f"{name} {one.skill:.2f}" for name, one in new.sensors.items() if (one.skill or 0.0) > _WORSE]
     if simple:
@@ -130,7 +135,8 @@ def _check(run: str, axis: str, since: float, before: Estimates, after: Estimate
         components=len(gains),
         before=old,
         after=new,
-        worse=worse,
+        worse=change == "worse",
+        change=change,
         holds=not doubts,
         verdict=f"{head}: {verdict}",
     )

@@ -84,12 +84,17 @@ def _answer(summary: TuningSummary) -> str:
     if not checks:
         gain = sum(one.after - one.before for one in summary.likelihood.values())
         return f"Not validated: the log-likelihood of what it was fitted on rose by {gain:.1f}."
-    better, worse = ([one for one in checks if one.verdict.startswith(word)] for word in ("better", "worse"))
+    better, worse = ([one for one in checks if one.change == change] for change in ("better", "worse"))
     holding = sum(one.holds for one in checks)
     axes = "axis" if len(checks) == 1 else "axes"
     found = f"Better on {len(better)} of {len(checks)} {axes}, on measurements that nothing had been fitted on"
     found += f", worse on {len(worse)}" if worse else ""
     return f"{found}. The error bars hold on {holding} of {len(checks)}."
+
+
+def _short(check: Check) -> str:
+    """What became of an axis, in a few words."""
+    return check.change if check.holds or check.change != "better" else "better, but its error bars do not hold"
 
 
 def _axis(summary: TuningSummary, axis: str) -> Mapping[str, Any]:
@@ -98,7 +103,7 @@ def _axis(summary: TuningSummary, axis: str) -> Mapping[str, Any]:
     lag = summary.lags.get(axis)
     error, verdict = "–", "not validated"
     if check is not None:
-        pair, verdict = (check.before, check.after), check.verdict.partition(":")[0]
+        pair, verdict = (check.before, check.after), _short(check)
         names = [name for name, one in check.after.sensors.items() if one.skill is not None]
         if check.after.rmse is not None:
             error = formatting.change_of_positions([one.rmse for one in pair], check.kind)
