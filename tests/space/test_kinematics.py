@@ -1,7 +1,8 @@
-"""Forward kinematics of a URDF's chain, against Denavit-Hartenberg, products of 4x4 matrices, and differences."""
+"""Forward kinematics of a URDF's chain, against Denavit-Hartenberg, products of 4x4 matrices, and recorded commands."""
 
 from __future__ import annotations
 
+import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from pumafuse.space.kinematics import Chain
 from refusals import one_line
 
 PUMA = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"
+COMMANDS = Path(__file__).with_name("commands.csv")
 # d [m], a [m], alpha [rad] of each link: what the controller of the recorded PUMA 560 computes with
 DENAVIT_HARTENBERG = [
     (0.0, 0.0, math.pi / 2),
@@ -122,6 +124,11 @@ def configurations(chain: Chain, count: int, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-3.0, 3.0, (count, len(chain.joints)))
 
 
+def turned(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The angle [rad] between orientations, which quaternions of either sign may be."""
+    return (Rotation.from_quat(left).inv() * Rotation.from_quat(right)).magnitude()
+
+
 def test_the_puma_is_that_of_denavit_and_hartenberg() -> None:
     """Position and orientation are the product Rz(q) Tz(d) Tx(a) Rx(alpha) over its links, at random configurations."""
     chain = Chain.load(PUMA, "base_link", "tool0")
@@ -138,6 +145,24 @@ def test_the_puma_is_that_of_denavit_and_hartenberg() -> None:
         pose = pose @ transform(Rotation.identity(), (0.0, 0.0, TOOL))
         np.testing.assert_allclose(position[row], pose[:3, 3], atol=EXACT)
         np.testing.assert_allclose(Rotation.from_quat(quaternion[row]).as_matrix(), pose[:3, :3], atol=EXACT)
+
+
+@pytest.mark.parametrize("run", ["inspect1", "wander1"])
+def test_recorded_joints_are_recorded_poses(run: str) -> None:
+    """What a controller told the joints is, through the kinematics, the pose that it told the tool.
+
+    The file rounds joints to 1e-5°, positions to 1e-4 mm, quaternions to 1e-7. The six joints' roundings, at most 1 m
+    from the tool, are together at most 5.2e-7 m and rad; those of a quaternion's parts at most 2e-7 rad.
+    """
+    with COMMANDS.open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["run"] == run]
+    chain = Chain.load(PUMA, "base_link", "tool0")
+    q = np.radians([[float(row[f"{joint}_deg"]) for joint in chain.joints] for row in rows])
+    position, quaternion = chain.pose(q)
+    told = np.array([[float(row[f"{axis}_mm"]) / 1e3 for axis in "xyz"] for row in rows])
+    assert np.ptp(told, axis=0).max() > 0.05, "the tool must move"
+    np.testing.assert_allclose(position, told, atol=5.2e-7 + 0.5e-7)
+    assert turned(quaternion, np.array([[float(row[f"q{part}"]) for part in "xyzw"] for row in rows])).max() < 7.2e-7
 
 
 @settings(max_examples=100)
