@@ -214,17 +214,21 @@ def test_an_arm_that_takes_the_place_of_another_is_kept_and_others_are_not_searc
     assert replaced_arm.lag_of("vertical") == pytest.approx(first.result().arm.lag_of("vertical"), abs=2e-3)
 
 
-def test_a_lag_that_steps_is_said_of_one_sensor_alone() -> None:
-    """60 ms more from 0.7 of the run on, of which a plant of second order and a gain might make up: both, and when."""
-    one = motion(0.08, 0.06, 1.0)
-    later = motion(0.14, 0.06, 1.0)
+@pytest.mark.parametrize("commands", [1500, 30_000])
+def test_a_lag_that_steps_is_said_of_one_sensor_alone(commands: int) -> None:
+    """60 ms more from 0.7 of the run on, of which a plant of second order and a gain might make up: both, and when.
+
+    Also of a run so long that least squares look at a fifth of it.
+    """
+    one = motion(0.08, 0.06, 1.0, commands=commands)
+    later = motion(0.14, 0.06, 1.0, commands=commands)
     edge = one.time[int(0.7 * len(one.time))]
     found = found_in(one._replace(value=np.where(one.time < edge, one.value, later.value)))
     assert found is not None and found.step is not None
     assert found.step.time == pytest.approx((edge - one.given[0]) / 1e9, abs=0.05 * (one.time[-1] - one.time[0]) / 1e9)
     assert (found.step.before, found.step.after) == pytest.approx((0.14, 0.20), abs=0.01)
-    assert f"{1e3 * found.step.before:.0f} ms until about 21 s" in str(found.step)
-    for steady in (one, later, motion(0.02, 0.3, 0.9)):
+    assert f"{1e3 * found.step.before:.0f} ms until about {found.step.time:.0f} s" in str(found.step)
+    for steady in (one, later, motion(0.02, 0.3, 0.9, commands=commands)):
         plain = found_in(steady)
         assert plain is not None and plain.step is None
 

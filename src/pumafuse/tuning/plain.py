@@ -35,7 +35,7 @@ _MOST = 0.8  # of the measurements: how far these are off is not decided by sing
 _DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced,
 _NOTHING = 1e-3  # of the range that is measured: nothing is said of what is off by less
 _NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow, or steps: it is said
-_SPLITS, _HALVED = np.linspace(0.1, 0.9, 9), 0.5  # of a run; of the squares, which two lags must leave less than
+_SPLITS, _HALVED = np.linspace(0.1, 0.9, 17), 0.5  # of a run; of the squares, which two lags must leave less than
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
 
 
@@ -89,6 +89,7 @@ def independent(left: FloatArray) -> float:
 def plain_arm(measured: Measured) -> PlainArm | None:
     """The arm that leaves the least squares, without outliers; None where nothing follows the commands."""
     begin = min((int(one.given[0]) for one in measured.recordings), default=0)
+    quarters = measured.liveliest(COMMANDS)
     measured = whole = measured.excerpt(COMMANDS, ROWS)
     if measured.count < 2 * _FEWEST or not any(np.ptp(one.command) > 0.0 for one in measured.recordings):
         return None
@@ -117,7 +118,10 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     commands = [Arm(delay, float(LAGS[0])) for delay in late]
     delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
     between = float(min(allowed)), float(max(allowed))
-    step = _lag_step(measured, arm, begin)
+    step = None
+    if len(whole.recordings) == 1:  # of several nothing is told
+        long = len(quarters.recordings) > 1
+        step = _lag_step(quarters.without_far_from(arm, _OUTLIER) if long else measured, arm, begin)
     return PlainArm(arm, between, delayed.total, off(measured, delayed), measured, whole, step)
 
 
@@ -125,18 +129,21 @@ def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
     """Where another lag in the second part of a run leaves much less than one for all of it; None where none does.
 
     Args:
-        measured: Of one recording; of several nothing is told.
-        arm: Of all of it.
+        measured: One recording, or parts of one.
+        arm: Of all of it, or near that.
         begin: When the first command was given [ns].
     """
-    if len(measured.recordings) != 1:
-        return None
-    (one,), rest, whole = measured.recordings, measured.white(arm), measured.left(arm)
+    rest = measured.white(arm)
+    arm = measured.fitted(arm, ["delay", "gain"], rest, _ANY).arm
+    whole = measured.left(arm)
     least, found = _HALVED * float(whole @ whole), None
-    for edge in np.quantile(one.time, _SPLITS).tolist():
+    time = np.sort(np.concatenate([one.time for one in measured.recordings]))
+    for place in np.rint(_SPLITS * (len(time) - 1)).astype(int).tolist():
+        edge = 0.5 * float(time[place - 1] + time[place])  # between parts of a recording it may be anywhere
         squares, lags = 0.0, list[float]()
-        for mine in (one.time < edge, one.time >= edge):
-            part = measured.of([one._replace(weight=np.where(mine, one.weight, 0.0))])
+        for later in (False, True):
+            mine = [one._replace(weight=one.weight * ((one.time >= edge) == later)) for one in measured.recordings]
+            part = measured.of(mine)
             fitted = part.fitted(arm, ["delay", "gain"], rest, _ANY).arm
             left = part.left(fitted)
             squares, lags = squares + float(left @ left), [*lags, fitted.total]
