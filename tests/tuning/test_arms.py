@@ -109,23 +109,24 @@ def test_a_measurement_that_does_not_count_is_as_if_it_were_not_there() -> None:
     assert masked.weighed(ARMS, rest)[0] == pytest.approx(without.weighed(ARMS, rest)[0], rel=1e-9)
 
 
-@pytest.mark.parametrize("rows", [3_000, 30_000])
-def test_a_long_recording_is_known_by_where_each_quarter_of_it_moves_most(rows: int) -> None:
+@pytest.mark.parametrize(("rows", "period"), [(3_000, 0.02), (30_000, 0.02), (10_000, 0.001)])
+def test_a_long_recording_is_known_by_where_each_quarter_of_it_moves_most(rows: int, period: float) -> None:
     """What moved the arm before a part is not seen in it; the noise of neighbours is still that of neighbours."""
     rng, count, most = np.random.default_rng(6), 10_000, 6_000
-    given = np.arange(count) * round(T * 1e9)
+    given = np.arange(count) * round(period * 1e9)
     lively = np.isin(np.arange(count) // 250, [3, 13, 24, 37])  # one stretch in each quarter
     command = np.cumsum(rng.normal(0.0, np.where(lively, 0.01, 0.001)))
     time = np.sort(rng.integers(0, given[-1], rows))
     one = Recording(given, command, 0.0, time, np.zeros(rows), np.zeros(rows, dtype=int), np.ones(rows))
     arm = Arm(0.05, 0.08)
-    whole = Measured([one._replace(value=Measured([one], T, ["a"]).responses(arm)[0])], T, ["a"])
+    whole = Measured([one._replace(value=Measured([one], period, ["a"]).responses(arm)[0])], period, ["a"])
     parts = whole.liveliest(most)
-    assert 0.2 * most < parts.count <= most
+    assert 0.2 * most < parts.count <= 1.05 * most  # times are random
     for part, stretch in zip(parts.recordings, [3, 13, 24, 37], strict=True):
         seen = part.time[:, None] == time
         assert seen.any(axis=1).all() and (np.diff(np.argmax(seen, axis=1)) == 1).all()
-        assert part.time[0] < (stretch * 250 + 200) * T * 1e9 and part.time[-1] > (stretch * 250 + 50) * T * 1e9
+        assert part.time[0] < (stretch * 250 + 200) * period * 1e9
+        assert part.time[-1] > (stretch * 250 + 50) * period * 1e9
     assert np.abs(np.concatenate(parts.residuals(arm))).max() < 1e-9
     assert whole.liveliest(rows + count).recordings == whole.recordings
 

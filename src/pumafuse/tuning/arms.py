@@ -498,17 +498,18 @@ def lonely(far: BoolArray) -> BoolArray:
 
 
 def _liveliest(one: Recording, most: int, begin: int, end: int) -> Recording:
-    """The part of the commands between two with the most motion, without what the commands before it still do."""
+    """What was measured while so many commands moved most, of those between two; with commands that still act then."""
     if len(one.given) <= most:
         return one
     most = min(most, end - begin)
     firsts = np.append(np.arange(begin, end - most, max(most // 2, 1)), end - most)
     way = np.append(0.0, np.cumsum(np.abs(np.diff(one.command))))
     first = int(max(firsts, key=lambda place: way[place + most - 1] - way[place]))
-    given, command = one.given[first : first + most], one.command[first : first + most]
-    since = given[0] + round(_SETTLED * 1e9) * (first > 0)
-    part = one.of((one.time >= since) & (one.time <= given[-1]))
-    start = float(command[0]) if first else one.start
+    last = first + most - 1
+    part = one.of((one.time >= one.given[first]) & (one.time <= one.given[last]))
+    act = int(np.searchsorted(one.given, int(one.given[first]) - round(_SETTLED * 1e9)))
+    start = float(one.command[act]) if act else one.start
+    given, command = one.given[act : last + 1], one.command[act : last + 1]
     return part._replace(given=given, command=command, start=start, value=part.value + one.start - start)
 
 
