@@ -29,11 +29,11 @@ _ROLES: dict[Role, frozenset[str]] = {
     "sensor": _DEVICES
     | words_in(
         "state states measured measurement measurements meas msr actual present real ist istwert pv process current"
-        " encoder encoders feedback fbk fb observed observation estimate estimated recorded reported odom"
+        " cur encoder encoders feedback fbk fb observed observation estimate estimated recorded reported odom"
     ),
 }
 # In the name of a topic or file these are something else.
-_OF_COLUMNS = words_in("set sp pv process fb current present real control ctrl input inputs")
+_OF_COLUMNS = words_in("set sp pv process fb current cur present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
@@ -50,7 +50,7 @@ _SILENT = (
 _NO_POSITIONS = words_in(
     "velocity velocities vel speed speeds rate rates omega gyro dq qvel dot acceleration accelerations acc accel"
     " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tor tq tau moment moments force forces"
-    " wrench thrust thrusts momentum current currents curr amp amps amperes voltage volt volts power pwm duty load"
+    " wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts power pwm duty load"
     " pressure kp ki kd mode scaling bits temperature temperatures temp quality confidence covariance orientation"
     " rotation quaternion quat twist index id seq sequence count status valid std sd sigma latency duration error"
     " header stamp nanosec layout frame done reward task episode tick time timestamp reset lat lon latitude"
@@ -62,7 +62,8 @@ _CHANGES = words_in("delta relative rel incremental increment diff")
 # Words that are something else only without a number and without a unit: ax1 and az_deg are axes.
 _WHOLE = {**dict.fromkeys(words_in("vx vy vz ax ay az"), "a rate"), **dict.fromkeys(words_in("qx qy qz qw"), "turning")}
 _TRANSLATIONS = {"tx": "x", "ty": "y", "tz": "z"}
-_POSITIONS = words_in("position positions pos pose")  # current_position is one
+_NOW = words_in("current cur")  # of motors, but of the present beside
+_POSITIONS = words_in("position positions pos pose angle theta x y z roll pitch yaw")
 _TIME_UNITS = {
     **dict.fromkeys(words_in("seconds secs sec s"), "s"),
     **dict.fromkeys(words_in("milliseconds millis msecs msec ms"), "ms"),
@@ -174,7 +175,7 @@ def no_position(column: str) -> str | None:
         return whole
     found = [one.rstrip(_DIGITS) for one in found]
     whats = [one for one in found if one in (_SPREADS if known else _NO_POSITIONS)]
-    if whats == ["current"] and not _POSITIONS.isdisjoint(found):
+    if len(whats) == 1 and whats[0] in _NOW and not _POSITIONS.isdisjoint(found):
         return None
     if len(whats) == 1 and found[-1] in _FINGERS and role_words(column):
         return None
