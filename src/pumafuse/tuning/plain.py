@@ -35,7 +35,9 @@ _MOST = 0.8  # of the measurements: how far these are off is not decided by sing
 _DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced,
 _NOTHING = 1e-3  # of the range that is measured: nothing is said of what is off by less
 _NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow, or steps: it is said
-_SPLITS, _HALVED = np.linspace(0.1, 0.9, 17), 0.5  # of a run; of the squares, which two lags must leave less than
+_SPLITS = np.linspace(0.1, 0.9, 9)  # of a run, where its lag may step: sooner is its start
+_OF_QUARTERS = np.linspace(0.125, 0.875, 7)  # likewise, of a long one of which parts of its quarters are looked at
+_HALVED = 0.5  # of the squares, which two lags must leave less than
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
 
 
@@ -138,7 +140,8 @@ def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
     whole = measured.left(arm)
     least, found = _HALVED * float(whole @ whole), None
     time = np.sort(np.concatenate([one.time for one in measured.recordings]))
-    for place in np.rint(_SPLITS * (len(time) - 1)).astype(int).tolist():
+    splits = _SPLITS if len(measured.recordings) == 1 else _OF_QUARTERS
+    for place in np.rint(splits * (len(time) - 1)).astype(int).tolist():
         edge = 0.5 * float(time[place - 1] + time[place])  # between parts of a recording it may be anywhere
         squares, lags = 0.0, list[float]()
         for later in (False, True):
