@@ -127,10 +127,13 @@ def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path
 
 @pytest.mark.parametrize("described", [False, True])
 def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(described: bool, tmp_path: Path) -> None:
-    """It is left out, and said to be; where run.toml describes it, it goes by its commands, and has no lag."""
+    """It is left out, and said to be; where run.toml describes it, it goes by its commands, and has no lag.
+
+    Neither has it the lag of the delay that the others share.
+    """
     time, rng = np.arange(0.0, 15.0, 0.02), np.random.default_rng(6)
     columns = {"t_s": time}
-    for axis, late, slower in (("a", 0.09, 1.0), ("b", -0.12, 0.83)):
+    for axis, late, slower in (("a", 0.09, 1.0), ("b", -0.12, 0.83), ("c", 0.09, 1.21)):
         columns |= {f"goal_{axis}_deg": swings(slower * time)}
         columns |= {f"encoder_{axis}_deg": swings(slower * (time - late)) + rng.normal(0.0, 0.02, len(time))}
     log = tmp_path / "two.csv"
@@ -138,7 +141,7 @@ def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(descr
     if described:
         log = tmp_path / "run.toml"
         sources = [
-            f'[{table}]\nfile = "two.csv"\ntime = "t_s"\na = "{name}_a_deg"\nb = "{name}_b_deg"\n'
+            f'[{table}]\nfile = "two.csv"\ntime = "t_s"\na = "{name}_a_deg"\nb = "{name}_b_deg"\nc = "{name}_c_deg"\n'
             for table, name in (("command", "goal"), ("sensors.encoder", "encoder"))
         ]
         log.write_text('name = "two"\n' + "".join(sources), encoding="utf-8")
@@ -146,7 +149,7 @@ def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(descr
     assert "b: it moves 120 ms before its commands" in " ".join(done.stdout.split())
     axes = json.loads((tmp_path / "fused/summary.json").read_text(encoding="utf-8"))["axes"]
     assert axes["a"]["sensors"]["encoder"]["outcomes"]["fused"] == len(time)
-    assert set(axes) == ({"a", "b"} if described else {"a"})
+    assert set(axes) == ({"a", "b", "c"} if described else {"a", "c"})
     assert "lag of b" not in done.stdout and (
         not described or axes["b"]["sensors"]["encoder"]["outcomes"].get("fused", 0) == 0
     )

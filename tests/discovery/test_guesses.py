@@ -133,3 +133,18 @@ def test_chance_makes_no_sensor_the_earliest(seed: int, tmp_path: Path) -> None:
     folder = mount(tmp_path / "mount", t, command=(u, 1), encoder=(encoder, 1), camera=(camera, 6))
     _, sensors = guess(survey(folder))
     assert sensors["encoder"].latency == 0.0
+
+
+def test_an_axis_that_a_sensor_never_tells_does_not_refuse_the_others(tmp_path: Path) -> None:
+    """A run.toml may name a column that has no number in any row."""
+    t, command, position = swings()
+    rows = {"time_s": t, "u_mm": command, "v_mm": command, "x_mm": position.round(6), "y_mm": np.full(len(t), np.nan)}
+    write(tmp_path / "log.csv", rows)
+    tables = [
+        f'[{table}]\nfile = "log.csv"\ntime = "time_s"\nx = "{x}_mm"\ny = "{y}_mm"\n'
+        for table, x, y in (("command", "u", "v"), ("sensors.eye", "x", "y"))
+    ]
+    (tmp_path / "run.toml").write_text("".join(tables), encoding="utf-8")
+    arm, sensors = guess(survey(tmp_path))
+    assert arm.axes["x"].follows == "eye" and arm.axes["y"].follows == ""
+    assert sensors["eye"].gate == 0.0

@@ -243,6 +243,7 @@ def test_stamps_written_in_two_ways_are_refused(cells: list[str]) -> None:
         ("12:34:56:789", 45_296_789_000_000),  # LabVIEW
         ("1:02:03.5 pm", 46_923_500_000_000),
         ("12:00:00 AM", 0),
+        ("13:00:00 PM", 46_800_000_000_000),  # hours of a day, marked all the same
         ("12:00:01:250PM", 43_201_250_000_000),
         ("0.02 sec", 20_000_000),  # MATLAB
         ("12 sec", 12 * GIGA),

@@ -24,6 +24,7 @@ from tuning_runs import quietly, replaced, scenario
 DEAD_BAND = Path(__file__).parent / "data" / "dead-band.csv"
 T = 0.02
 NOISE = 1e-4  # m
+EPOCH = 1_764_000_000_000_000_000  # ns, when a log of today begins
 
 
 def motion(delay: float, time_constant: float, gain: float, seed: int = 0, commands: int = 1500) -> Recording:
@@ -220,8 +221,8 @@ def test_a_lag_that_steps_is_said_of_one_sensor_alone(commands: int) -> None:
 
     Also of a run so long that least squares look at a fifth of it.
     """
-    one = motion(0.08, 0.06, 1.0, commands=commands)
-    later = motion(0.14, 0.06, 1.0, commands=commands)
+    one, later = (motion(delay, 0.06, 1.0, commands=commands) for delay in (0.08, 0.14))
+    one = one._replace(given=one.given + EPOCH, time=one.time + EPOCH)
     edge = one.time[int(0.7 * len(one.time))]
     found = found_in(one._replace(value=np.where(one.time < edge, one.value, later.value)))
     assert found is not None and found.step is not None

@@ -201,6 +201,8 @@ def _start(found: Survey, axis: str, name: str, one: Following, misfit: float, t
 def _gate(value: FloatArray) -> float:
     """The gate for a sensor with such values: narrow for many outliers, wide for a few glitches, none for jerks."""
     value = value[np.isfinite(value)]
+    if not len(value):
+        return 0.0
     found = isolated(value)
     if found.sum() >= _FEWEST_OUTLIERS and found.mean() > _OUTLIERS:
         return _GATE

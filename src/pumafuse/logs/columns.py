@@ -382,11 +382,11 @@ def _durations(text: pa.ChunkedArray) -> pa.ChunkedArray:
         digits = pc.struct_field(found, part)
         digits = pc.utf8_rpad(digits, 9, "0") if part == "fraction" else digits
         number = pc.if_else(pc.equal(digits, ""), "0", digits).cast(pa.int64())
-        if part == "hours":  # 12:30 AM is half past midnight
+        if part == "hours":  # 12:30 AM is half past midnight; 13:00 PM is as some programs write 13:00
             half = pc.struct_field(found, "half")
-            noon = pc.multiply(12, pc.equal(half, "PM").cast(pa.int64()))
-            clock = pc.subtract(number, pc.multiply(12, pc.equal(number, 12).cast(pa.int64())))
-            number = pc.if_else(pc.equal(half, ""), number, pc.add(clock, noon))
+            afternoon = pc.and_(pc.equal(half, "PM"), pc.less(number, 12))
+            midnight = pc.and_(pc.equal(half, "AM"), pc.equal(number, 12))
+            number = pc.if_else(afternoon, pc.add(number, 12), pc.if_else(midnight, 0, number))
         total = pc.add(pc.multiply(total, factor), number)
     return total.cast(pa.duration("ns"))
 
