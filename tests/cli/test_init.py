@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 import shutil
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -85,6 +86,21 @@ def test_one_command_looks_fits_and_fuses(tmp_path: Path) -> None:
     again = tmp_path / "again"
     pumafuse("fuse", tmp_path / "fused", "-c", tmp_path / "fused" / "fusion.toml", "-o", again)
     assert (again / "estimates.parquet").read_bytes() == (tmp_path / "fused" / "estimates.parquet").read_bytes()
+
+
+def test_every_command_says_how_a_table_of_other_names_is_described(tmp_path: Path) -> None:
+    """And that works, word for word."""
+    time = 0.02 * np.arange(500)
+    target = 30.0 * np.sin(2.0 * np.pi * 0.4 * time) * np.sin(0.9 * time)
+    noise = np.random.default_rng(5).normal(0.0, 0.1, 492)
+    rows = zip(time[8:].tolist(), target[8:].tolist(), (target[:-8] + noise).tolist(), strict=True)
+    table = ["stamp_s,target_deg,actual_deg", *(",".join(f"{one:.6f}" for one in row) for row in rows)]
+    log = tmp_path / "mine's.csv"
+    log.write_text("\n".join(table) + "\n")
+    said = refused("latency", log)
+    (advice,) = re.findall("`pumafuse (.*?)`", said)
+    pumafuse(*shlex.split(advice), "-o", tmp_path / "mine")
+    assert "ms late" in pumafuse("latency", tmp_path / "mine").stdout
 
 
 def test_a_result_with_a_run_toml_stays_unless_it_is_made_anew(tmp_path: Path) -> None:

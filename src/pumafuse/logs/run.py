@@ -7,6 +7,7 @@ they are. Each measurement gets its outcome when the run is fused.
 from __future__ import annotations
 
 import os
+import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -661,8 +662,15 @@ def clock_of(table: tables.Table) -> str:
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
         listed = ", ".join(table.columns)
-        raise RunError(f"{table.path}: a single table needs one time column, 'time_s'; it has: {listed}")
+        raise RunError(
+            f"{table.path}: a single table needs one time column, 'time_s'; it has: {listed}; {_described(table)}"
+        )
     return clocks[0]
+
+
+def _described(table: tables.Table) -> str:
+    """What to do with a table of other names."""
+    return f"`pumafuse init {shlex.quote(str(table.path))}` finds out what its columns are and writes a run.toml"
 
 
 def of_table(table: tables.Table) -> Run:
@@ -676,7 +684,7 @@ def of_table(table: tables.Table) -> Run:
             raise RunError(f"{path}: two columns for {source}.{axis}; give one")
         groups[source][axis] = [manifest.Column(column)]
     if "command" not in groups:
-        raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
+        raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}; {_described(table)}")
     notes, sources, units = list(table.notes), dict[str, Source](), dict[str, Kind]()
     for name, axes in groups.items():
         source = _source(table, manifest.Time(clock), axes, name, notes, units)
