@@ -259,10 +259,33 @@ def test_times_as_programs_write_them(cell: str, ns: int) -> None:
     assert table.is_dated("t")
 
 
-def test_a_date_that_can_be_read_in_two_ways_is_refused() -> None:
-    """The fourth of March, or the third of April? It is said how to write it."""
-    text = one_line(RunError, lambda: one_column(["", "3/4/2026 10:00:00"]).stamps("t"))
-    assert "column 't', row 2: '3/4/2026 10:00:00' is no number and no ISO 8601 date (2026-" in text
+@pytest.mark.parametrize(
+    ("cells", "first", "last", "leading"),
+    [
+        (["25/12/2026 9:05:03", "26/12/2026 0:00:01"], "2026-12-25T09:05:03", "2026-12-26T00:00:01", None),
+        (["1/2/2026 9:00:00", "1/13/2026 9:00:00"], "2026-01-02T09:00:00", "2026-01-13T09:00:00", None),
+        (["12/31/2026, 1:05:03.5 PM"], "2026-12-31T13:05:03.500", "2026-12-31T13:05:03.500", None),
+        (["3/4/2026 10:00:00", "3/4/2026 10:00:01"], "2026-03-04T10:00:00", "2026-03-04T10:00:01", "month"),
+        (["3/4/2026 11:59:59 PM", "3/5/2026 12:00:01 am"], "2026-03-04T23:59:59", "2026-03-05T00:00:01", "month"),
+        (["3/4/2026 23:59:59", "4/4/2026 0:00:01"], "2026-04-03T23:59:59", "2026-04-04T00:00:01", "day"),
+        (["2026-03-04 9:00:00 PM"], "2026-03-04T21:00:00", "2026-03-04T21:00:00", None),
+    ],
+)
+def test_all_of_a_column_tells_which_number_of_a_date_is_the_day(
+    cells: list[str], first: str, last: str, leading: str | None
+) -> None:
+    """A number above 12 is one; else the log is short; else it is said that the month was taken to come first."""
+    found, note = one_column(["", *cells]).stamps("t")
+    assert found[1:].astype("datetime64[ns]")[[0, -1]].tolist() == np.array([first, last], "datetime64[ns]").tolist()
+    said = f"log: column 't': dates like {cells[0].split()[0]} are read with the {leading} first"
+    assert note == (said if leading else None)
+
+
+@pytest.mark.parametrize("cell", ["13/13/2026 1:00:00", "2/30/2026 1:00:00", "3/4/26 10:00:00", "3/4/2026"])
+def test_what_is_no_date_with_slashes_is_refused(cell: str) -> None:
+    """It is said how to write one."""
+    text = one_line(RunError, lambda: one_column(["", cell]).stamps("t"))
+    assert f"column 't', row 2: '{cell}' is no number and no ISO 8601 date (2026-" in text
 
 
 NINES = st.sampled_from([999.0, -9999.0, 99999.0, 32767.0, -32768.0, 2147483647.0])

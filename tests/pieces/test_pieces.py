@@ -322,6 +322,17 @@ def test_the_command_line_takes_the_way_by_the_rows(tmp_path: Path, monkeypatch:
     assert rows_of(path) == 0  # how many are chosen is not known
 
 
+@pytest.mark.parametrize("single", [True, False])
+def test_dates_as_text_are_read_as_a_whole(single: bool, tmp_path: Path) -> None:
+    """All of a column tells which number of 11/12/2026 is the day."""
+    path = written(tmp_path / "log", single=single)
+    file = path if single else path / "command.parquet"
+    table = pq.read_table(file)
+    dates = pa.array(["11/12/2026 10:00:00"] * len(table))
+    pq.write_table(table.set_column(table.schema.get_field_index("time_ns"), "time_ns", dates), file)
+    assert rows_of(path) == 0
+
+
 BIG = """
 import resource, sys, warnings
 from pathlib import Path

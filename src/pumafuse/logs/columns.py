@@ -23,6 +23,7 @@ import pyarrow.compute as pc
 from .. import units
 from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError, counted, reason, shortened
+from . import dates
 
 Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
 
@@ -37,23 +38,6 @@ _GIGA = 10**9
 _WHOLE = r"^[+-]?\d{1,19}$"
 NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
 _GROUPED = r"^[+-]?\d{1,3}(,\d{3})+(\.\d*)?$"  # 1,000.123
-_DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([Zz]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
-_ZONE = r"\d([Zz]|[+-]\d\d(:?\d\d)?)$"  # behind a time
-# Other ways to write a time that cannot be read in two ways, and what stands for them here. With points the day comes
-# first everywhere; with slashes that depends on the country, but where the year is first. MATLAB writes 1.5 sec.
-_REWRITTEN = (
-    (r"^(\d\d?)\.(\d)\.", r"\1.0\2."),
-    (r"^(\d)\.(\d\d)\.", r"0\1.\2."),
-    (r"^(\d\d)\.(\d\d)\.(\d{4})[ T]", r"\3-\2-\1 "),
-    (r"^(\d{4})/(\d\d)/(\d\d)[ T]", r"\1-\2-\3 "),
-    (r"^(\d{1,9}(?:\.\d{1,9})?) SEC$", r"0:00:\1"),
-    (r"^(\d\d?:\d\d:\d\d):(\d{3,9})( ?[AP]M)?$", r"\1.\2\3"),
-)
-# A time of day, or since the start: 12:34:56.789, 12:34:56:789 PM; of pandas 0 days 00:00:01.5.
-_ELAPSED = (
-    r"^(?:(?P<days>\d{1,4}) DAYS?,? )?(?P<hours>\d{1,4}):(?P<minutes>\d\d):(?P<seconds>\d{1,9})"
-    r"(?:[.,](?P<fraction>\d{1,9}))? ?(?P<half>[AP]M)?$"
-)
 BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
 _NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
 _NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested, pa.types.is_union)
@@ -129,8 +113,8 @@ class Table:
             return self._of_two(name, nanoseconds)
         if _is_any(column.type, (pa.types.is_timestamp, pa.types.is_duration)):
             return self._within_reach(name, self._of_clock(name, column)), None
-        if (dates := self._dates(name, column)) is not None:
-            return self._within_reach(name, self._of_clock(name, dates[0])), dates[1]
+        if (dated := self._dates(name, column)) is not None:
+            return self._within_reach(name, self._of_clock(name, dated[0])), dated[1]
         self._refuse_words(name, self._plain_column(name))
         if unit == DAYS:
             days, note = self.plain(name)
@@ -160,8 +144,9 @@ class Table:
             return column.type.tz is not None
         if not _is_any(column.type, _TEXTS):
             return None
-        text = _rewritten(column)
-        return pc.any(pc.match_substring_regex(text.filter(pc.match_substring_regex(text, _DATE)), _ZONE)).as_py()
+        text, _ = dates.iso(column)
+        dated = text.filter(pc.match_substring_regex(text, dates.DATE))
+        return pc.any(pc.match_substring_regex(dated, dates.ZONE)).as_py()
 
     def nanoseconds_beside(self, name: str) -> str | None:
         """A column beside one of seconds that by its name has their nanoseconds; None without one."""
@@ -229,12 +214,12 @@ class Table:
         """A column of dates or times as text, as Arrow's, and a note on other text; None for a column without any."""
         if not _is_any(column.type, _TEXTS):
             return None
-        text = _rewritten(column)
-        dated, elapsed = pc.match_substring_regex(text, _DATE), pc.match_substring_regex(text, _ELAPSED)
+        text, order = dates.iso(column)
+        dated, elapsed = pc.match_substring_regex(text, dates.DATE), pc.match_substring_regex(text, dates.ELAPSED)
         good = pc.or_(dated, elapsed)
         if not pc.any(good).as_py():
             return None
-        zoned = pc.and_(dated, pc.match_substring_regex(text, _ZONE))
+        zoned = pc.and_(dated, pc.match_substring_regex(text, dates.ZONE))
         kinds = {
             "a date with a time zone": zoned,
             "a date without one": pc.and_(dated, pc.invert(zoned)),
@@ -247,10 +232,12 @@ class Table:
             raise RunError(f"{self.path}: column '{shortened(name)}' mixes stamps: {found}; write all in one way")
         note = self._words(name, column, good, "a date" if "a time without a date" not in rows else "a time")
         if "a time without a date" in rows:
-            return _durations(text), note
+            return dates.durations(text), note
         text = pc.replace_substring(pc.if_else(dated, text, pa.scalar(None, text.type)), ",", ".")
         kind = pa.timestamp("ns", "UTC" if "a date with a time zone" in rows else None)
-        return self._cast(name, text, kind), note
+        if order is not None:
+            order = f"{self.path.name}: column '{shortened(name)}': {order}"
+        return self._cast(name, text, kind), "; ".join(filter(None, (note, order))) or None
 
     def _refuse_words(self, name: str, column: pa.ChunkedArray) -> None:
         """Refuse a column of text without any number: perhaps it has dates that could be read in two ways."""
@@ -365,30 +352,6 @@ def sentinel_among(sizes: FloatArray) -> float | None:
 def without(values: FloatArray, size: float) -> FloatArray:
     """Numbers with NaN for those of a size."""
     return np.where(np.abs(values) == size, np.nan, values)
-
-
-def _rewritten(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """A column of text with its dates as ISO 8601 writes them, in capital letters."""
-    text = pc.utf8_upper(pc.utf8_trim_whitespace(column))
-    for written, meant in _REWRITTEN:
-        text = pc.replace_substring_regex(text, written, meant)
-    return text
-
-
-def _durations(text: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Times without a date as durations [ns]; null where a cell has none."""
-    found, total = pc.extract_regex(text, _ELAPSED), pa.scalar(0)
-    for factor, part in ((1, "days"), (24, "hours"), (60, "minutes"), (60, "seconds"), (_GIGA, "fraction")):
-        digits = pc.struct_field(found, part)
-        digits = pc.utf8_rpad(digits, 9, "0") if part == "fraction" else digits
-        number = pc.if_else(pc.equal(digits, ""), "0", digits).cast(pa.int64())
-        if part == "hours":  # 12:30 AM is half past midnight; 13:00 PM is as some programs write 13:00
-            half = pc.struct_field(found, "half")
-            afternoon = pc.and_(pc.equal(half, "PM"), pc.less(number, 12))
-            midnight = pc.and_(pc.equal(half, "AM"), pc.equal(number, 12))
-            number = pc.if_else(afternoon, pc.add(number, 12), pc.if_else(midnight, 0, number))
-        total = pc.add(pc.multiply(total, factor), number)
-    return total.cast(pa.duration("ns"))
 
 
 def prefixes(paths: Sequence[str]) -> list[str]:

@@ -171,6 +171,12 @@ def row_count(path: Path) -> int:
         return 0
 
 
+def of_text(path: Path) -> set[str]:
+    """The columns of a Parquet table that are text."""
+    schema = papq.read_schema(str(path))
+    return {field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)}
+
+
 def refuse_endless(path: Path) -> None:
     """Refuse a pipe, a socket or a device, which a reader may wait for for ever and cannot go back in."""
     try:

@@ -87,10 +87,12 @@ class Log:
 def rows_of(path: Path) -> int:
     """How many rows a run has that can be read piece by piece; 0 for one that cannot.
 
-    It can if all its tables are Parquet, each with one column of stamps, and no rows are chosen by ``where``.
+    It can if all its tables are Parquet, each with one column of stamps, and no rows are chosen by ``where``. How dates
+    are written is told by all of a column.
     """
     if path.suffix == ".parquet":
-        return tables.row_count(path)
+        count = tables.row_count(path)
+        return 0 if count and any(name.startswith("time_") for name in tables.of_text(path)) else count
     if not (listed := _manifest(path)).is_file() or listed.suffix != ".toml":
         return 0
     entries = list(manifest.load(listed).entries.values())
@@ -100,7 +102,9 @@ def rows_of(path: Path) -> int:
     if len(clocks) > len(files) or chosen:
         return 0
     counts = [tables.row_count(file) for file in files.values()]
-    return sum(counts) if all(counts) else 0
+    if not all(counts) or any(entry.time.column in tables.of_text(files[entry.rows]) for entry in entries):
+        return 0
+    return sum(counts)
 
 
 def needs_whole(path: Path, config: FusionConfig) -> str | None:
