@@ -55,7 +55,7 @@ def recorded(seed: int, later: np.ndarray, *, attitude: bool, marker: np.ndarray
     return Run("arm", command, {"camera": camera}, source(fine[seen], point, "truth", quaternion))
 
 
-@pytest.mark.parametrize("attitude", [True, False])
+@pytest.mark.parametrize("attitude", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_the_tool_tells_how_late_each_joint_is(attitude: bool) -> None:
     """Of an arm of which joints lag up to 60 ms apart: to 1 ms beside the earliest, and within the intervals.
 
@@ -75,6 +75,7 @@ def test_the_tool_tells_how_late_each_joint_is(attitude: bool) -> None:
         assert abs(by) < 0.75 * (high - low)  # one and a half intervals: all at once
 
 
+@pytest.mark.long
 def test_joints_that_answer_alike_are_not_told_apart() -> None:
     """Then the arm has no [joints], and the registration is that of the poses."""
     run = recorded(4, np.zeros(6), attitude=True)
@@ -84,6 +85,7 @@ def test_joints_that_answer_alike_are_not_told_apart() -> None:
     assert alike.to_json() == posed.to_json()
 
 
+@pytest.mark.long
 def test_the_estimate_follows_joints_that_lag_apart(tmp_path: Path) -> None:
     """On another motion, without a sensor: half of what one lag for all joints leaves, by the file that was written."""
     run, other = recorded(3, LATER, attitude=True), recorded(5, LATER, attitude=True)

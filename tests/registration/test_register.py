@@ -231,6 +231,7 @@ def test_a_unit_is_named(unit: str | None) -> None:
         assert degrees(found.frame, setup.frame) < 0.1
 
 
+@pytest.mark.long
 def test_commands_in_another_unit_are_named() -> None:
     """In m and read as mm they hardly move: what no frame explains then is said with the unit."""
     command, sensor = Setup(1, seconds=15.0).run()
@@ -319,6 +320,7 @@ def test_a_short_time_constant_is_not_begun_with() -> None:
     assert found.position.time_constant.value == pytest.approx(setup.plants[0][1], abs=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("orientation", [True, False])
 def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None:
     """Of an arm that errs by 0.5 mm and 0.2 degrees; not one that is turned by a degree, or stands 5 mm beside it."""
@@ -439,6 +441,7 @@ def rests_and_moves(period: float, late: float) -> tuple[Motion, Motion]:
     return Motion(told, where, turned.as_quat()), Motion(time, point, (frame.inv() * seen * marker).as_quat())
 
 
+@pytest.mark.long
 def test_rests_do_not_decide_the_lag() -> None:
     """Of a motion that mostly rests the lag holds to 2 ms; a sensor as early as samples of a path allow is named."""
     late = registered(*([one] for one in rests_and_moves(0.02, 0.06)))

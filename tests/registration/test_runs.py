@@ -80,6 +80,7 @@ def each() -> list[dict[str, RegisteredSensor]]:
     return [pf.register(pf.Run.read(RUNS / name)).details.sensors for name in ("inspect1", "wander1")]
 
 
+@pytest.mark.long
 def test_the_latency_beside_another_sensor_is_that_of_the_set_up(each: list[dict[str, RegisteredSensor]]) -> None:
     """Whatever the arm errs, which both see: 12 − 5 ms to 0.1 ms, and the interval holds it."""
     for sensors in each:
@@ -90,6 +91,7 @@ def test_the_latency_beside_another_sensor_is_that_of_the_set_up(each: list[dict
         assert between[0] < 0.007 < between[1]
 
 
+@pytest.mark.long
 def test_two_runs_agree_within_their_intervals(each: list[dict[str, RegisteredSensor]]) -> None:
     """Of all numbers of frames, markers and latencies 90 % differ by less than their joint 95 % intervals."""
     numbers, halves = zip(*(placed(sensors) for sensors in each), strict=True)
@@ -141,6 +143,7 @@ def test_a_marker_that_is_fixed_stays(tmp_path: Path, registered: Path) -> None:
     assert before["mocap"] == after["mocap"]
 
 
+@pytest.mark.long
 def test_latencies_that_are_known_leave_the_delay_of_the_arm(tmp_path: Path, registered: Path) -> None:
     """With ``--fix latency`` sensors stay as late as configured, and the arm is as much earlier as they are later."""
     before = pf.FusionConfig.load(registered / "fusion.toml")
@@ -213,6 +216,7 @@ def held(position: np.ndarray) -> np.ndarray:
     return position[np.arange(len(position)) // 3 * 3]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("change", [lost, held])
 def test_rows_that_are_no_news_change_no_frame(change: Callable[[np.ndarray], np.ndarray]) -> None:
     """Zeros of a lost sensor are missing, and a value that is repeated counts once: within 1 mm and 0.1°."""
@@ -267,6 +271,7 @@ def test_a_sensor_along_the_axes_of_the_base_gets_no_frame() -> None:
     np.testing.assert_allclose(camera.marker.at, Setup(3).marker, atol=2e-3)
 
 
+@pytest.mark.long
 def test_a_sensor_that_lacks_an_axis_is_named() -> None:
     """What it lacks, and what becomes of it; where it is the only one nothing is registered, in a line."""
     run = recorded(as_it_is)
@@ -350,6 +355,7 @@ def test_poses_of_a_bag_are_registered(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(found.rotation, alone.rotation, atol=1e-6)
 
 
+@pytest.mark.long
 def test_what_no_frame_explains_is_refused() -> None:
     """Commands without an orientation, of a tool that turns with a marker far from its point: said, not guessed."""
     with pytest.raises(pf.RunError, match=r"no frame explains how: .* the commands tell no orientation"):
@@ -395,6 +401,7 @@ def both() -> Registrations:
     return pf.register(two_sensors())
 
 
+@pytest.mark.long
 def test_the_arm_answers_as_the_earliest_sensor_saw_it(both: Registrations) -> None:
     """In position; in orientation as the later one saw it, less what that is later. Its latency is 30 ms, to 0.1 ms."""
     (of_points, of_turns), arm = SETUP().lags, both.config.arm
@@ -404,6 +411,7 @@ def test_the_arm_answers_as_the_earliest_sensor_saw_it(both: Registrations) -> N
     assert both.config.sensors["late"].latency == pytest.approx(0.03, abs=1e-4)
 
 
+@pytest.mark.long
 def test_white_noise_is_no_error_of_the_arm(both: Registrations) -> None:
     """It errs by 0.5 mm and 0.2 degrees, of which each of two sensors has √2 times as much: the noise is left out.
 
@@ -419,6 +427,7 @@ def test_white_noise_is_no_error_of_the_arm(both: Registrations) -> None:
             assert config.start.offset_sd_of(axis) == pytest.approx(3.0 * told.angular_rms, rel=1e-3)
 
 
+@pytest.mark.long
 def test_the_delay_that_latencies_leave_is_that_of_the_surer_sensor(both: Registrations) -> None:
     """Where fixed latencies contradict each other each counts as its lag is sure; on axes with own delays, too."""
     latencies = {"early": 0.01, "late": 0.06}  # s; as they are one is 30 ms later
@@ -437,6 +446,7 @@ def test_the_delay_that_latencies_leave_is_that_of_the_surer_sensor(both: Regist
     assert moved == pytest.approx([found.config.arm.delay_of("x") - given.arm.delay_of("x")], abs=2e-6)
 
 
+@pytest.mark.long
 def test_an_arm_that_is_configured_leaves_the_latencies(both: Registrations) -> None:
     """One that is 20 ms earlier than the earliest sensor saw it: its latency is these, and the other's 30 ms more."""
     earlier = msgspec.structs.replace(both.config.arm, delay=both.config.arm.delay - 0.02)
