@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from pumafuse.arrays import FloatArray, TimeArray
 from pumafuse.discovery.following import _at_span, following, resolution
@@ -159,3 +160,17 @@ def test_a_command_that_is_constant_but_for_rounding_leads_nothing() -> None:
         constant, noise = np.full(len(time), level), level + rng.normal(0.0, 1e-4, len(time))
         assert following((time, constant), (time, noise)) is None
         assert following((time, noise), (time, constant)) is None
+
+
+def test_of_a_run_that_mostly_rests_the_motion_tells_the_gain() -> None:
+    """Steps of a third of the time, in whole counts, 0.3 s late with a lag of 0.1 s: at rest any gain would do."""
+    t = 0.1 * np.arange(400)
+    told = np.where(t % 3.0 < 1.0, 500.0, 0.0)
+    fine = 0.001 * np.arange(40_000)
+    held = told[np.maximum(np.arange(40_000) // 100 - 2, 0)]
+    moved = lfilter([0.01], [1.0, -0.99], held)
+    found = following((stamped(t), told), (stamped(t), np.rint(np.interp(t, fine, moved))))
+    assert found is not None
+    assert found.slope == pytest.approx(1.0, abs=0.1)
+    assert found.correlation > 0.95
+    assert found.misfit > 1.0

@@ -1332,3 +1332,80 @@ def test_files_that_each_are_a_whole_run_are_not_one(tmp_path: Path) -> None:
     assert sorted(one.part.label for one in found.roles.sensors) == ["take_0.csv", "tracker.csv"]
     (note,) = [note for part in found.parts for note in part.notes if "a run each" in note]
     assert note.startswith("2 other files of the same columns") and "take_1.csv" in note
+
+
+def test_a_clock_may_be_any_column_that_alone_goes_on(log: Path) -> None:
+    """Two tables without a header, the clock in the last column, rows of one are missing; it is asked."""
+    t, u, s, z = recorded()
+    kept = np.random.default_rng(2).random(len(t)) > 0.02
+    for name, time, values in (("command", t[kept], u[kept]), ("camera", s, z)):
+        rows = np.column_stack([values, time + 400.0])
+        (log / f"{name}.csv").write_text("\n".join(",".join(f"{one:.6f}" for one in row) for row in rows) + "\n")
+    found = survey(log)
+    assert "is column 4 the clock of camera.csv? It alone rises from row to row" in asked(found)
+    lags = [one.lag for one in found.relations.values()]
+    assert len(lags) == 3 and lags == pytest.approx([LAG] * 3, abs=0.005)
+    both = log / "command.csv"
+    both.write_text("\n".join(f"{n},{n + 0.5 * (n % 2)}" for n in np.arange(0.0, 300.0, 0.3)))
+    (part,) = parts_of(both)
+    assert part.clock is not None and part.clock.time.column == "column 1"  # the first is one before any is looked for
+
+
+def test_a_sensor_beside_the_commands_is_not_called_after_the_file(tmp_path: Path) -> None:
+    """So what is fitted to one log is a configuration of another."""
+    t, u, z = recorded_at_once()
+    for name in ("monday", "tuesday"):
+        write(tmp_path / f"{name}.csv", {"t_s": t, "target x_mm": 1e3 * u[:, 0], "x_mm": 1e3 * z[:, 0]})
+        assert [*survey(tmp_path / f"{name}.csv").run.sensors] == ["measured"]
+
+
+def test_columns_without_words_are_what_their_file_is_called(log: Path) -> None:
+    """A torque follows, too. A file of commands, of a sensor or of times is none of these."""
+    t, u, s, z = recorded()
+    write(log / "command.csv", {"time": t, "value": u[:, 0]})
+    for name, sign in (("torque", 0.5), ("reward", -1.0), ("encoder", 1.0), ("time_series", 1.0)):
+        write(log / f"{name}.csv", {"time": s, "value": sign * z[:, 0]})
+    left_out = {part.file.stem: [*part.left_out.values()] for part in parts_of(log)}
+    assert left_out["torque"] == ["torque, as torque.csv is called"]
+    assert left_out["reward"] == ["reward, as reward.csv is called"]
+    assert left_out["encoder"] == left_out["time_series"] == left_out["command"] == []
+    for name in ("encoder", "time_series"):
+        (log / f"{name}.csv").unlink()
+    said = one_line(RunError, lambda: survey(log))
+    assert "nothing that measures where they lead: reward.csv: reward, as reward.csv is called; torque.csv: " in said
+
+
+def test_the_best_pairs_of_axes_come_first(tmp_path: Path) -> None:
+    """Joints and their rates, called otherwise than the commands: no rate takes the place of a joint."""
+    t = 0.01 * np.arange(1500)
+    joints = [a * np.sin(1.9 * t + p) + 0.3 * a * np.sin(4.5 * t + 2.0 * p) for a, p in ((0.5, 0), (0.8, 1), (0.4, 2))]
+    columns: dict[str, Any] = {"t": t}
+    for place, joint in enumerate(joints):
+        columns[f"cmd_q{place}"] = joint
+        columns |= {f"cmd_qd{place}": np.gradient(joint, t), f"was_qd{place}": np.gradient(np.roll(joint, 5), t)}
+        columns[f"was_q{place}"] = np.interp(t - 0.05, t, joint)
+    write(tmp_path / "log.csv", columns)
+    found = survey(tmp_path / "log.csv")
+    assert found.roles is not None
+    (sensor,) = found.roles.sensors
+    assert {axis: one[0].column for axis, one in sensor.axes.items()} == {f"q{n}": f"was_q{n}" for n in range(3)}
+    assert found.parts[0].left_out == {f"cmd_qd{place}": "velocity" for place in range(3)}
+
+
+def test_a_sensor_whose_command_rests_is_said_to_be_that(tmp_path: Path) -> None:
+    t, u, z = recorded_at_once()
+    columns = {"target_x_mm": 1e3 * u[:, 0], "target_z_mm": np.full(len(t), 15.0)}
+    write(tmp_path / "log.csv", {"t_s": t, **columns, "actual_x_mm": 1e3 * z[:, 0], "actual_z_mm": 1e3 * z[:, 2]})
+    assert "actual is not used on z: its command never moves" in asked(survey(tmp_path / "log.csv"))
+
+
+@pytest.mark.parametrize("form", ["{:02d}:{:02d}:{:02d}", "2026-03-04T{:02d}:{:02d}:{:02d}"])
+def test_a_clock_of_whole_seconds_says_how_many_rows_a_second_has(form: str, tmp_path: Path) -> None:
+    """Which is what --rate asks for."""
+    _, u, z = recorded_at_once()
+    time = [form.format(17, 22, 25 + n // 50) for n in range(1000)]
+    write(tmp_path / "log.csv", {"x_cmd_mm": 1e3 * u[:, 0], "x_meas_mm": 1e3 * z[:, 0], "time": time})
+    said = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    assert "time is no clock: 20 distinct stamps, one every 1 s, in 1000 rows with x_" in said
+    assert "stands still: 50 rows a second); if rows come at a constant rate, give it to init as --rate HZ" in said
+    assert survey(tmp_path / "log.csv", rate=50.0).run.sensors

@@ -19,6 +19,7 @@ from scipy.io import savemat
 import pumafuse as pf
 from discovery.test_survey import written
 from pumafuse.arrays import FloatArray
+from pumafuse.discovery.contents import parts_of
 from pumafuse.discovery.survey import survey
 from pumafuse.errors import PumafuseError, RunError
 from pumafuse.logs import formats, tables
@@ -196,3 +197,17 @@ def test_a_file_is_read_again_when_it_was_written_again(tmp_path: Path) -> None:
     assert len(formats.names(npz(tmp_path))) == 2
     np.savez(tmp_path / "log.npz", time_s=TIME)
     assert formats.names(tmp_path / "log.npz") == [""]
+
+
+def test_each_of_a_list_of_trials_is_a_table(tmp_path: Path) -> None:
+    """Records with longer lists than there are records are runs; with the joints of an arm they are rows."""
+    told = np.sin(0.3 * np.arange(60))
+    trials = [{"kind": "prbs", "actions": told.tolist(), "sensor": (0.9 * told).tolist(), "notes": []}] * 20
+    path = tmp_path / "log.json"
+    path.write_text(json.dumps({"config": {"limits": [-1.0, 1.0]}, "data": trials}))
+    assert formats.names(path)[:20] == [f"data[{place}]" for place in range(20)]
+    assert tables.read(path, topic="data[3]").plain("sensor")[0].tolist() == (0.9 * told).tolist()
+    first = next(part for part in parts_of(path, 50.0) if part.signals)
+    assert first.notes == ("19 other tables of the same columns left out, a run each: data[1] …",)
+    path.write_text(json.dumps([{"t": 0.1 * place, "q": told[:26].tolist()} for place in range(300)]))
+    assert formats.names(path) == [""] and tables.read(path).rows == 300

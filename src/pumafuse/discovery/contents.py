@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -45,7 +45,7 @@ _TEXTS = (".txt", ".dat", ".lvm")  # tables, too; in a folder they may be anythi
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
 _MOST_READ = 2_000  # columns of one of them
-_FEWEST_ROWS = 10
+_FEWEST_ROWS, _MANY_ROWS = 10, 100  # so many tell a clock by nothing but that they rise
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows, or of blocks, of a clock that are not before the row or block above
 _BLOCK = 20  # rows; who writes from several threads writes some of them out of order
@@ -77,6 +77,7 @@ _OTHER_TYPES = names.words_in(
     " ParameterEvent Joy OccupancyGrid MarkerArray"
 )
 _VELOCITIES = names.words_in("Twist TwistStamped TwistWithCovariance TwistWithCovarianceStamped")
+RESTS = "always"  # what a column is that never changes
 _SPEEDS = names.words_in("velocity velocities vel speed twist")  # why columns are no positions
 _ARE_VELOCITIES, _UNDECODED = "velocities, no positions", "its messages cannot be decoded"
 _OF_FRAME = ["header", "child_frame_id", "transform"]  # of a transform
@@ -181,18 +182,23 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
 
 
 def _of_one_run(parts: Sequence[Part]) -> list[Part]:
-    """The parts of a log; of files of the same columns that each hold a whole run the first alone."""
+    """The parts of a log; of files or tables of the same columns that each hold a whole run the first alone."""
 
     def columns(part: Part) -> set[str]:
         return {*part.left_out, *(one.column for one in part.signals)}
 
     whole = [one for one in parts if {names.column_role(signal.name) for signal in one.signals} >= _WHOLE]
-    again = [one for one in whole if one.file != whole[0].file and columns(one) == columns(whole[0])]
+    again = [one for one in whole if _place(one) != _place(whole[0]) and columns(one) == columns(whole[0])]
     if not again:
         return list(parts)
-    others = f"{counted(len(again), 'other file')} of the same columns left out, a run each: {again[0].label} …"
+    what = "other file" if any(one.file != whole[0].file for one in again) else "other table"
+    others = f"{counted(len(again), what)} of the same columns left out, a run each: {again[0].label} …"
     kept = [one for one in parts if one not in again]
     return [replace(one, notes=(*one.notes, others)) if one is whole[0] else one for one in kept]
+
+
+def _place(part: Part) -> tuple[Path, str, str]:
+    return part.file, part.topic, part.entity
 
 
 def _files(log: Path) -> list[Path]:
@@ -241,6 +247,9 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
         elif found:
             left_out[name] = found
     signals = [_placed(one, told) for one in _without_quaternions(signals, left_out)]
+    if signals and (why := names.no_position_by_place(place.stem, [one.column for one in signals])):
+        left_out |= {one.name: f"{why}, as {place.label} is called" for one in signals}
+        signals = []
     notes = list[str]()
     if len(table.names) > _MOST_READ:
         read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
@@ -248,8 +257,8 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
     beside = [names.role_words(one.column) for one in signals if one.axis in CARTESIAN]
     left_out |= {path: "turning" for one in attitudes if one.role_words not in beside for path in one.columns.columns}
     clock, why_none = _clock(table, signals, sorted(counts))
-    if clock is None and rate:
-        clock = _counted(table, rate)
+    if clock is None:
+        clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts)
     used = () if clock is None else tuple(clock.time.columns)
     left_out |= {path: "another clock" if clock else _no_clock(table, path) for path in times}
     mine = {path for path in left_out if path in used or path.startswith(tuple(f"{one}." for one in used))}
@@ -354,7 +363,7 @@ def _signal(
     if len(known) < _FEWEST_ROWS:
         return "hardly any number" if len(known) else ""
     if known.min() == known.max() and not names.has_word(path, names.PARTS):
-        return f"always {known[0]:g}"
+        return f"{RESTS} {known[0]:g}"
     kind = _RADIANS[0] if joint else place.type.rpartition("/")[2]
     sliding = kind in _RADIANS and names.has_word(joint or path, names.SLIDING)
     metres = kind in _METRES or sliding or _ECHOED.match(path)
@@ -576,6 +585,19 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
     steps = np.diff(numbers)
     rises = len(steps) and (steps > 0.0).mean() >= _IN_ORDER and (steps != 1.0).any()
     return _clock_of(table, first, stroke) if rises or _ticks(steps) else None
+
+
+def _rising(table: Table, stroke: float, counts: Container[str]) -> Clock | None:
+    """The one column but counts that goes on from row to row, whatever it is called; None of none or several."""
+    found = list[str]()
+    for name in (one for one in table.columns if one not in counts):
+        with suppress(RunError):
+            steps = np.diff(table.plain(name)[0])
+            if len(steps) >= _MANY_ROWS and (steps >= 0.0).all() and (steps > 0.0).mean() >= _IN_ORDER:
+                found.append(name)
+    clock = _clock_of(table, found[0], stroke) if len(found) == 1 else None
+    what = f"is {found[0]} the clock of {table.path.name}? It alone rises from row to row" if clock else ""
+    return clock and replace(clock, doubt=clock.doubt or what)
 
 
 def _ticks(steps: FloatArray) -> bool:

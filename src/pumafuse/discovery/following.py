@@ -24,6 +24,8 @@ _OUTLYING = 8.0  # sds
 _APART = 5.0  # times as far off as its neighbours are: at the start or the turn of a motion it is three times
 _ROUNDING = 1e-12  # of a value
 _MOST_OUTLYING = 0.05  # of the changes: each outlier is in two, and of few measurements some are more than a clip takes
+_SLOW, _FASTEST = 0.1, 0.99  # of the way that so many rows do not exceed: less is rest
+_MOSTLY = 0.5  # share of the rows in motion, from which the median is one of them
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
 
@@ -51,17 +53,25 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
         return None
     found, noise, steps, outliers = list[Following](), scatter(z), _resolution(z), float(isolated(z).mean())
+    moves = _in_motion(z)
     for lag, correlation, slope in filter(None, (_at_span(t, u, s, z, span) for span in _SPANS)):
         led = np.interp(s - lag, t, u)
         offset, rest = float(np.median(z - math.copysign(1.0, slope) * led)), z - slope * led
         left = max(min(noise, scatter(rest)), steps)
-        found.append(Following(lag, correlation, slope, offset, left, steps, robust_sd(rest), outliers))
+        found.append(Following(lag, correlation, slope, offset, left, steps, robust_sd(rest[moves]), outliers))
     return min(found, key=lambda one: one.misfit, default=None)
 
 
 def _stands(value: FloatArray) -> bool:
     """Whether a signal moves by no more than what rounding makes of its mean."""
     return float(np.ptp(value)) <= _ROUNDING * float(np.abs(value).max())
+
+
+def _in_motion(value: FloatArray) -> BoolArray:
+    """Rows that tell a lag: those in motion, where most are at rest and any lag and any gain would do, (n,)."""
+    way = np.abs(np.gradient(value))
+    found = way >= _SLOW * np.quantile(way, _FASTEST)
+    return found if _FEWEST <= found.sum() < _MOSTLY * len(value) else np.ones(len(value), dtype=np.bool_)
 
 
 def known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:

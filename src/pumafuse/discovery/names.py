@@ -60,7 +60,10 @@ _FINGERS = words_in("index rotation")  # of a hand: beside words of roles, at th
 _SPREADS = words_in("std sd sigma error covariance")  # in the unit of a position, and none
 _CHANGES = words_in("delta relative rel incremental increment diff")
 # Words that are something else only without a number and without a unit: ax1 and az_deg are axes.
-_WHOLE = {**dict.fromkeys(words_in("vx vy vz ax ay az"), "a rate"), **dict.fromkeys(words_in("qx qy qz qw"), "turning")}
+_WHOLE = {
+    **dict.fromkeys(words_in("vx vy vz vrx vry vrz ax ay az"), "a rate"),
+    **dict.fromkeys(words_in("qx qy qz qw"), "turning"),
+}
 _TRANSLATIONS = {"tx": "x", "ty": "y", "tz": "z"}
 _NOW = words_in("current cur")  # of motors, but of the present beside
 _POSITIONS = words_in("position positions pos pose angle theta x y z roll pitch yaw")
@@ -169,8 +172,8 @@ def no_position(column: str) -> str | None:
     if not _CHANGES.isdisjoint(found):
         return "relative: a change, no position"
     known = kind is not None or _BRACKETED.search(column) is not None
-    if not known and "qd" in found and role_words(column):  # as UR calls it: target_qd_0 beside target_q_0
-        return "velocity"
+    if not known and role_words(column) and any(one.rstrip(_DIGITS) == "qd" for one in found):
+        return "velocity"  # as UR calls it: target_qd_0 beside target_q_0
     if whole := None if known else next((_WHOLE[one] for one in found if one in _WHOLE), None):
         return whole
     found = [one.rstrip(_DIGITS) for one in found]
@@ -181,6 +184,13 @@ def no_position(column: str) -> str | None:
         return None
     of_unit = f"in {unit.strip('_').replace('_', '/')}" if unit is not None and kind is None else None
     return next(iter(whats), "in °C or °/s" if "°" in column and not known else of_unit)
+
+
+def no_position_by_place(place: str, columns: Iterable[str]) -> str | None:
+    """What the columns of a file or topic are by its name, if they have no words of their own and are no positions."""
+    silent = all(axis_of(column, []) == "position" and not role_words(column) for column in columns)
+    why = no_position(place) if silent and role_of(place) is None else None
+    return None if why is None or why in _TELLING or has_word(place, _POSITIONS) else why
 
 
 def family(column: str, columns: Container[str]) -> tuple[str, str, str]:

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from itertools import count, permutations
+from itertools import count, permutations, product
 from typing import TypeAlias
 
 import numpy as np
@@ -22,7 +22,7 @@ from ..logs.run import REFERENCE, Run, Source
 from ..logs.tables import FIRST
 from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
-from .contents import RANGES, Part, Signal, no_commands, without_clock
+from .contents import RANGES, RESTS, Part, Signal, no_commands, without_clock
 from .following import LATEST, Following, following
 from .matching import far_shift
 from .names import Role
@@ -41,7 +41,7 @@ _MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that an arm is late where its clock is s
 _FEWEST = 20  # rows
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
 _MOST_APART = 40  # axes of a table that is taken apart by their names
-_MOST_LISTED = 8  # columns in an error
+_MOST_LISTED, _LONGEST = 8, 200  # columns in an error, letters of each
 _NUMBERED = re.compile(r"joint\d+|position")
 _AXIS_WORD = re.compile(r"[xyz]|\d+|")
 _Group: TypeAlias = tuple[str, str, str, bool]  # words of roles, list, copy, whether they are desired values
@@ -145,7 +145,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     if not streams:
         others = [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
         clockless = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
-        there = ", ".join(map(printable, [*clockless, *others][:_MOST_LISTED]))
+        there = ", ".join(printable(one, _LONGEST) for one in [*clockless, *others][:_MOST_LISTED])
         at_a_rate = " if rows come at a constant rate, give it to init as --rate HZ, else" if clockless else ""
         why = f"no columns of positions with a clock beside them{', but ' if there else ''}{there}"
         advice = f"{at_a_rate} {no_commands(parts)}say in run.toml where they are"
@@ -163,6 +163,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         advice = f"{no_commands(parts)}say it in run.toml"
         raise UndecidedError(log, f"which numbers are the commands? {called} ({what}); {advice}", parts)
     command, why = known
+    resting = {names.axis_of(column, []) for column, what in command.part.left_out.items() if what.startswith(RESTS)}
     left_out: list[tuple[Stream, str]] = []
     kept: list[Stream] = []
     for stream in streams:
@@ -187,8 +188,11 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         if axes and matched.role:
             kept.append(matched)
             used = {id(some) for some in axes.values()}
-            if others := {axis: some for axis, some in stream.axes.items() if id(some) not in used}:
-                left_out.append((replace(stream, axes=others), "no command is called so, and none moves alike"))
+            others = {axis: some for axis, some in stream.axes.items() if id(some) not in used}
+            for held in (True, False):
+                why_not = "its command never moves" if held else "no command is called so, and none moves alike"
+                if some := {axis: columns for axis, columns in others.items() if (axis in resting) == held}:
+                    left_out.append((replace(stream, axes=some), why_not))
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
     command, *kept = _in_order([command, *kept], left_out)
@@ -321,7 +325,9 @@ def streams_of(part: Part) -> list[Stream]:
         typed, order = (by_type, f"its messages are {part.type}"), (own, file) if len(groups) > 1 else (file, own)
         role, why = next((one for one in (wanted, *order, clock, typed) if one[0]), (None, ""))
         name = key if roles[key] == 1 else names.plain(f"{listed or key or part.stem}{copy}")
-        name = name if len(groups) > 1 and name else names.plain(part.stem)
+        # What has no word of its own beside commands is not called after the file: another of its kind fits then.
+        rest = "measured" if roles.keys() > {""} and "command" in of_columns else names.plain(part.stem)
+        name = name if len(groups) > 1 and name else rest
         axes, attitude = _axes(signals), None
         if any(axis in CARTESIAN for axis in axes):
             attitude = next((one for one in part.attitudes if key == _joined(one.role_words)), None)
@@ -564,28 +570,24 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     """Axes of a stream by the names that the commands give them, by name or else by how they move; or why none is."""
     fits = {axis: signals for axis, signals in stream.axes.items() if axis in command.axes}
     fits = {axis: signals for axis, signals in fits.items() if _same_kind(command, axis, stream, axis)}
-    best = ("", 0.0)
-    for own, signals in stream.axes.items():
-        if own in fits or own in command.axes or len(command.axes) * len(stream.axes) > _MOST_PAIRS:
-            continue
-        found = {
-            axis: abs(one.correlation)
-            for axis in command.axes
-            if axis not in fits and _same_kind(command, axis, stream, own)
-            if (one := _relation(command, axis, stream, own)) is not None
-        }
-        axis = max(found, key=found.__getitem__, default="")
-        named = own.rpartition("_")[2]  # p_RS_R_x is x, if that moves alike
-        if found.get(named, 0.0) >= _SAME:
-            axis = named
-        if axis and found[axis] >= _SAME:
-            fits[axis] = signals
-        elif axis:
-            best = max(best, (axis, found[axis]), key=lambda one: one[1])
-    if fits or not best[0]:
+    few = len(command.axes) * len(stream.axes) <= _MOST_PAIRS
+    others = [own for own in stream.axes if few and own not in fits and own not in command.axes]
+    pairs = {
+        (own, axis): abs(one.correlation)
+        for own, axis in product(others, [axis for axis in command.axes if axis not in fits])
+        if _same_kind(command, axis, stream, own) and (one := _relation(command, axis, stream, own)) is not None
+    }
+    named = {pair for pair in pairs if pair[0].rpartition("_")[2] == pair[1]}  # p_RS_R_x is x, if that moves alike
+    for own, axis in sorted(pairs, key=lambda pair: (pair in named, pairs[pair]), reverse=True):
+        if pairs[own, axis] >= _SAME and axis not in fits and own in others:
+            fits[axis] = stream.axes[own]
+            others.remove(own)
+    if fits or not pairs:
         kinds = sorted({AN[stream.kind(axis)] for axis in stream.axes})
         return fits, f"no command moves {', '.join(stream.axes)} ({' or '.join(kinds)}) at the same time"
-    return fits, f"its axes are called otherwise than the commands', and follow none (at most {best[1]:.2f}, {best[0]})"
+    most = max(pairs, key=pairs.__getitem__)
+    alike = f"at most {pairs[most]:.2f}, {most[1]}"
+    return fits, f"its axes are called otherwise than the commands', and follow none ({alike})"
 
 
 def _same_kind(command: Stream, axis: str, stream: Stream, own: str) -> bool:

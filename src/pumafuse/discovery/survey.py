@@ -26,6 +26,7 @@ from .roles import GUESSED_LAG, Roles, UndecidedError, relations, roles_of
 
 FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
+_MOST_REASONS = 12  # in a refusal
 _SURELY = 0.9  # correlation of changes from which a lag is known well
 SOONER = 2e-3  # s: lags are known to 1 ms
 _Relations: TypeAlias = dict[tuple[str, str], Following]  # by the name of a source and the axis
@@ -218,4 +219,5 @@ def soonest(found: Survey) -> float:
 def _reasons(roles: Roles, parts: Sequence[Part]) -> str:
     reasons = [f"{stream.name}: {why}" for stream, why in roles.left_out]
     reasons += [f"{part.label}: {without_clock(part)}" for part in parts if part.signals and part.clock is None]
-    return "; ".join(dict.fromkeys(reasons)) or "nothing else is in the log"
+    reasons += [f"{part.label}: {why}" for part in parts if not part.signals for why in part.left_out.values()]
+    return "; ".join([*dict.fromkeys(reasons)][:_MOST_REASONS]) or "nothing else is in the log"

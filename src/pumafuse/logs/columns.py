@@ -111,7 +111,7 @@ class Table:
                 return self.stamps(f"{name}.{split[0]}", f"{name}.{split[1]}")
         if nanoseconds:
             return self._of_two(name, nanoseconds)
-        if _is_any(column.type, (pa.types.is_timestamp, pa.types.is_duration)):
+        if pa.types.is_temporal(column.type):
             return self._within_reach(name, self._of_clock(name, column)), None
         if (dated := self._dates(name, column)) is not None:
             return self._within_reach(name, self._of_clock(name, dated[0])), dated[1]
@@ -132,9 +132,10 @@ class Table:
         return units.nanoseconds(time), note
 
     def is_dated(self, name: str) -> bool:
-        """Whether a column of text has dates, or times of day, and nothing else."""
+        """Whether a column has dates, or times of day, and nothing else."""
         with suppress(RunError):  # dates mixed with numbers
-            return self._dates(name, self.column(name)) is not None
+            column = self.column(name)
+            return pa.types.is_temporal(column.type) or self._dates(name, column) is not None
         return False
 
     def zoned(self, name: str) -> bool | None:
@@ -206,8 +207,9 @@ class Table:
         return _filled(self._cast(name, column, pa.int64()), NO_STAMP), note
 
     def _of_clock(self, name: str, column: pa.ChunkedArray) -> TimeArray:
-        """Int64 ns of Arrow's timestamps, in any unit and zone, and durations."""
-        kind = pa.duration("ns") if pa.types.is_duration(column.type) else pa.timestamp("ns", column.type.tz)
+        """Int64 ns of Arrow's timestamps, in any unit and zone, times of day, and durations."""
+        kind = pa.duration("ns") if pa.types.is_duration(column.type) else pa.timestamp("ns", "UTC")
+        kind = pa.time64("ns") if pa.types.is_time(column.type) else kind
         return _filled(self._cast(name, column, kind).cast(pa.int64()), NO_STAMP)
 
     def _dates(self, name: str, column: pa.ChunkedArray) -> tuple[pa.ChunkedArray, str | None] | None:

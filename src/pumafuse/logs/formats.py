@@ -110,7 +110,11 @@ def _matlab(path: Path, file: BinaryIO) -> Any:
 
 
 def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Values that are tables of their own: those of a struct that has no arrays beside them."""
+    """Values that are tables of their own: each of a list of trials; those of a struct without arrays beside them."""
+    if _are_trials(value):
+        for place, one in enumerate(value):
+            yield from _apart(one, f"{name}[{place}]")
+        return
     struct = cast(Mapping[str, Any], value) if isinstance(value, Mapping) else dict[str, Any]()
     inside = {
         key: struct[key]
@@ -123,7 +127,22 @@ def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
     elif len(inside) == 1 and not isinstance(only := next(iter(inside.values())), np.ndarray):
         yield from _apart(only, name)
     else:
-        yield name, value
+        lists = {key: one for key, one in inside.items() if _are_trials(one)}
+        for key, one in lists.items():
+            yield from _apart(one, f"{name}.{key}" if name else key)
+        yield name, {key: one for key, one in struct.items() if key not in lists} if lists else value
+
+
+def _are_trials(value: Any) -> bool:
+    """Whether a list is of records each of which has longer lists: runs, and no rows with the joints of an arm."""
+    records = cast(Sequence[Any], value if isinstance(value, list) else [])
+    return len(records) > 1 and all(isinstance(one, Mapping) for one in records) and _longest(records) > len(records)
+
+
+def _longest(records: Sequence[Mapping[str, Any]]) -> int:
+    """How long the longest list of each record is at least."""
+    lists = [[cast(list[Any], one) for one in record.values() if isinstance(one, list)] for record in records]
+    return min(max(map(len, some), default=0) for some in lists)
 
 
 def _is_column(value: Any) -> bool:

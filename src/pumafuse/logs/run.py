@@ -485,9 +485,11 @@ def standing_clock(source: Source) -> str:
     if most <= ticks or most < _FEW_ROWS or period < _LONGEST_TICK or not going_on:
         return ""
     every = f", one every {period:.3g} s" if np.isfinite(period) else ""
+    each = np.median(np.diff(np.flatnonzero(tick))) if ticks > 2 else np.nan
+    rate = f": {each / period:.4g} rows a second" if np.isfinite(each / period) else ""
     return (
         f"{counted(ticks, 'distinct stamp')}{every}, in {len(step) + 1} rows with {axis}, which goes on while the clock"
-        " stands still"
+        f" stands still{rate}"
     )
 
 
