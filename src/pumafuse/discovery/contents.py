@@ -69,6 +69,7 @@ _OF_STEP = 0.01  # by which no step of a clock that was counted differs from the
 _METRES = names.words_in(
     "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage tfMessage"
 )
+_TRIAL = re.compile(r"(.*)\[(\d+)\]")  # of a list of trials
 _ECHO = re.compile(r"^field\.(transforms0\.)?")
 _ECHOED = re.compile(r"field\..*(position|translation|point)\.[xyz]$")  # of a message by `rostopic echo -p`: in m, too
 _RADIANS = ("JointState", "JointTrajectory", "JointTrajectoryControllerState")
@@ -182,7 +183,7 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
 
 
 def _of_one_run(parts: Sequence[Part]) -> list[Part]:
-    """The parts of a log; of files or tables of the same columns that each hold a whole run the first alone."""
+    """The parts of a log; of files of the same columns, or of trials, that each hold a whole run the first alone."""
 
     def columns(part: Part) -> set[str]:
         return {*part.left_out, *(one.column for one in part.signals)}
@@ -191,10 +192,15 @@ def _of_one_run(parts: Sequence[Part]) -> list[Part]:
     again = [one for one in whole if _place(one) != _place(whole[0]) and columns(one) == columns(whole[0])]
     if not again:
         return list(parts)
-    what = "other file" if any(one.file != whole[0].file for one in again) else "other table"
-    others = f"{counted(len(again), what)} of the same columns left out, a run each: {again[0].label} …"
+    if trial := _TRIAL.match(whole[0].topic):  # others may have other columns
+        listed = [(one, _TRIAL.match(one.topic)) for one in parts if one.file == whole[0].file]
+        again = [one for one, other in listed if other and other[1] == trial[1] and other[2] != trial[2]]
+        what = f"{counted(len(again), 'table')} of other trials left out"
+    else:
+        what = f"{counted(len(again), 'other file')} of the same columns left out, a run each"
     kept = [one for one in parts if one not in again]
-    return [replace(one, notes=(*one.notes, others)) if one is whole[0] else one for one in kept]
+    notes = (*whole[0].notes, f"{what}: {again[0].label} …")
+    return [replace(one, notes=notes) if one is whole[0] else one for one in kept]
 
 
 def _place(part: Part) -> tuple[Path, str, str]:

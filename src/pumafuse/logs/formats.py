@@ -134,15 +134,13 @@ def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _are_trials(value: Any) -> bool:
-    """Whether a list is of records each of which has longer lists: runs, and no rows with the joints of an arm."""
+    """Whether a list is of records with lists, some of them longer: runs, and no rows with the joints of an arm."""
     records = cast(Sequence[Any], value if isinstance(value, list) else [])
-    return len(records) > 1 and all(isinstance(one, Mapping) for one in records) and _longest(records) > len(records)
-
-
-def _longest(records: Sequence[Mapping[str, Any]]) -> int:
-    """How long the longest list of each record is at least."""
+    if len(records) < 2 or not all(isinstance(one, Mapping) for one in records):
+        return False
     lists = [[cast(list[Any], one) for one in record.values() if isinstance(one, list)] for record in records]
-    return min(max(map(len, some), default=0) for some in lists)
+    longest = [max(map(len, some), default=0) for some in lists]
+    return min(longest) >= _FEWEST and max(longest) > len(records)
 
 
 def _is_column(value: Any) -> bool:
