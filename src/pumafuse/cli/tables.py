@@ -18,7 +18,7 @@ from ..errors import printable
 from ..fusion.score import Z95, OrientationScore
 from ..fusion.segments import NOT_SELECTED
 from ..fusion.skill import PredictionError
-from ..fusion.summary import ScoreSummary, SensorSummary, Summary
+from ..fusion.summary import ScoreSummary, SensorSummary, Summary, pooled, weighted_mean
 from ..units import DEG, SCREEN, Kind
 
 # By heading: an attribute, its format, and what it is multiplied by; None: what positions are on the screen.
@@ -240,24 +240,16 @@ def _pooled(summaries: Sequence[Summary], axis: str, kind: Kind) -> list[str]:
     scores = [part.score for part in parts if part.score is not None]
     sensors = [sensor for part in parts for sensor in part.sensors.values()]
     fused, rejected = ([sensor.outcomes.get(word, 0) for sensor in sensors] for word in ("fused", "rejected"))
-    rows = [score.rows for score in scores]
+    score = pooled(scores, [one.rows for one in scores])
     skills = [sensor.skill for sensor in sensors if sensor.skill is not None]
-    square = _mean([score.rmse**2 for score in scores], rows)
     return [
-        position(None if square is None else square**0.5, kind),
-        position(max((score.rmse for score in scores), default=None), kind),
-        number(_mean([score.coverage for score in scores], rows), ".1%"),
-        number(_mean([score.nees_mean for score in scores], rows), ".2f"),
-        number(_mean([sensor.nis_mean for sensor in sensors], fused), ".2f"),
-        number(_mean([one.of_best_other for one in skills], [one.predictions for one in skills]), ".2f"),
+        position(score and score.rmse, kind),
+        position(max((one.rmse for one in scores), default=None), kind),
+        number(score and score.coverage, ".1%"),
+        number(score and score.nees_mean, ".2f"),
+        number(weighted_mean([sensor.nis_mean for sensor in sensors], fused), ".2f"),
+        number(weighted_mean([one.of_best_other for one in skills], [one.predictions for one in skills]), ".2f"),
         str(sum(fused)),
         str(sum(rejected)),
         str(sum(len(summary.notes) for summary in summaries)),
     ]
-
-
-def _mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
-    """The weighted mean of the values that there are; None without any."""
-    known = [(value, weight) for value, weight in zip(values, weights, strict=True) if value is not None]
-    total = sum(weight for _, weight in known)
-    return sum(value * weight for value, weight in known) / total if total else None
