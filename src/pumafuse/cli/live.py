@@ -12,7 +12,6 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 from rich.console import Group
@@ -27,7 +26,6 @@ from ..fusion.placing import with_tool
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, OF_A_RUN, POSES, Address
 from ..live.estimator import LiveEstimator
-from ..live.health import Health
 from ..live.network import Remote, Several, UdpSender
 from ..live.record import Recorder
 from ..live.results import LiveEstimate
@@ -117,14 +115,14 @@ def run(
         live = estimator(event_log=recorder)
         if recorder is not None:
             stack.callback(lambda: recorder.close(live.sure))
-        views = list[_View]()
+        views = list[Watcher]()
         if rerun:
             from ..views.live import LiveView
 
             views.append(stack.enter_context(contextlib.closing(LiveView(rerun, known, notify))))
         if ros is not None:
             views.append(Ros2Estimates(ros, live))
-        write = sender or (_nowhere if ros is not None else _output(status))
+        write = sender or _output(published=ros is not None, status=status)
         stream = Stream(live, write, notify, rate, views)
         screen = None
         if status and errors.is_terminal:
@@ -170,12 +168,10 @@ def _opened(
     return stack.enter_context(contextlib.closing(Ros2Source(listed, ros_args, notify)))
 
 
-def _nowhere(_: list[bytes]) -> None:
-    """Estimates that are published need no other place."""
-
-
-def _output(status: bool) -> Callable[[list[bytes]], None]:
-    """Writer to standard output; not to the screen that shows the status, as both would write over each other."""
+def _output(*, published: bool, status: bool) -> Callable[[list[bytes]], None]:
+    """Writer to standard output; not of what is published, nor to the screen that shows the status."""
+    if published:
+        return lambda _: None
     if sys.stdout is None:  # pyright: ignore[reportUnnecessaryComparison]
         raise RunError("standard output is closed; send the estimates elsewhere with --out udp://HOST:PORT")
     if status and sys.stdout.isatty():
@@ -210,13 +206,6 @@ def _listen(remote: Remote, feeder: _Feeder, signals: list[int]) -> int:
     return 0
 
 
-class _View(Watcher, Protocol):
-    """A watcher that has a turn of its own."""
-
-    def tick(self, health: Callable[[], Health]) -> None:
-        """Do what is due."""
-
-
 @dataclass
 class _Feeder:
     """Feeds a stream, and gives the recorder, the views and the screen their turn."""
@@ -225,7 +214,7 @@ class _Feeder:
     summaries: Sequence[Callable[[], str]]
     speed: float
     recorder: Recorder | None
-    views: Sequence[_View]
+    views: Sequence[Watcher]
     screen: Live | None
     sure: int | None = None
     now: int | None = None
