@@ -84,8 +84,7 @@ def run(
     if recorded is not None:
         start = dict(recorded.start)
         known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
-    given_files = {one: Path(one.path) for one in sources if one.kind in OF_A_RUN}
-    files = {one: path / "run.toml" if path.is_dir() else path for one, path in given_files.items()}
+    files = {one: manifest.file_of(Path(one.path)) for one in sources if one.kind in OF_A_RUN}
     listed = {address: manifest.load(file) for address, file in files.items()}
     for address, one in listed.items():
         start |= one.command.start
