@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.resources import as_file, files
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 
 from ..errors import RunError, printable, warn
@@ -174,16 +174,10 @@ def show(summary: Summary) -> None:
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
     """A folder for each run, named after its path; equal names get a number."""
-    found, free = dict[str, None](), dict[str, Iterator[str]]()
+    found = dict[str, None]()
     for path in map(Path.resolve, runs):
         named = path.parent if path.name == "run.toml" else path
         name = named.name if named.is_dir() else re.sub(r"(\.(csv|jsonl|ndjson|parquet))?(\.gz)?$", "", named.name)
-        names = free.setdefault(name, _numbered(name or "run"))
+        names = (f"{name or 'run'}{number}" for number in chain([""], map("_{}".format, count(2))))
         found[next(one for one in names if one not in found)] = None
     return [output / name for name in found]
-
-
-def _numbered(name: str) -> Iterator[str]:
-    """A name, and the same with a number."""
-    yield name
-    yield from (f"{name}_{number}" for number in count(2))

@@ -28,7 +28,6 @@ from ..live.address import LISTENERS, NETWORK, OF_A_RUN, POSES, Address
 from ..live.estimator import LiveEstimator
 from ..live.network import Remote, Several, UdpSender
 from ..live.record import Recorder
-from ..live.results import LiveEstimate
 from ..live.ros2 import Ros2Estimates, Ros2Source
 from ..live.rtde import RtdeSource
 from ..live.sources import QUIET, replayed, standard_input
@@ -264,20 +263,16 @@ def status(stream: Stream, summaries: Sequence[Callable[[], str]] = (), now: int
     """One screen: the position of each axis, and how each sensor does."""
     estimate = stream.live.estimate(now)
     time = "no event yet" if stream.live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
+    doubts = {"stale": estimate.stale, "doubtful": estimate.doubtful}
     arm, tables = stream.live.config.arm, list[Table]()
     for kind in arm.kinds:
         rows = [
-            [name, *cells(axis, _AXIS, kind), _doubts(estimate, name)]
+            [name, *cells(axis, _AXIS, kind), ", ".join(word for word, axes in doubts.items() if name in axes)]
             for name, axis in estimate.axes.items()
             if arm.axes[name].kind == kind
         ]
         tables.append(table(["axis", *headings(_AXIS, kind), ""], rows))
     return Group(Text(time), *tables, _sensor_table(stream.live, now), *map(Text, _sentences(stream, summaries)))
-
-
-def _doubts(estimate: LiveEstimate, axis: str) -> str:
-    """What is to be known of an axis beside its numbers."""
-    return ", ".join(word for word in ("stale", "doubtful") if axis in getattr(estimate, word))
 
 
 def _sensor_table(live: LiveEstimator, now: int | None) -> Table:

@@ -212,21 +212,16 @@ def orientation_table(results: Iterable[tuple[str, OrientationScore | None]]) ->
 
 def runs_table(results: Mapping[str, Summary], kind: Kind) -> Table:
     """Many results: lines for each of up to 20 by name, and for each axis of a kind all of them together."""
-    results = {name: _of_kind(summary, kind) for name, summary in results.items()}
+    axes = {name: [axis for axis, one in given.axes.items() if one.kind == kind] for name, given in results.items()}
     rows: list[list[str]] = []
     if len(results) <= _FEW_RUNS:
-        rows += [[name, axis, *_pooled([one], axis, kind)] for name, one in results.items() for axis in one.axes]
-    for axis in dict.fromkeys(axis for one in results.values() for axis in one.axes):
-        having = [one for one in results.values() if axis in one.axes]
+        rows += [[name, axis, *_pooled([one], axis, kind)] for name, one in results.items() for axis in axes[name]]
+    for axis in dict.fromkeys(axis for mine in axes.values() for axis in mine):
+        having = [one for name, one in results.items() if axis in axes[name]]
         rows.append([f"all {len(having)}", axis, *_pooled(having, axis, kind)])
     unit = SCREEN[kind].unit
     scores = (f"RMSE, {unit}", f"worst, {unit}", "95 % coverage", "NEES")
     return table(["result", "axis", *scores, "NIS", "prediction,\nof best other", "fused", "rejected", "notes"], rows)
-
-
-def _of_kind(summary: Summary, kind: Kind) -> Summary:
-    axes = {axis: part for axis, part in summary.axes.items() if part.kind == kind}
-    return msgspec.structs.replace(summary, axes=axes)
 
 
 def _pooled(summaries: Sequence[Summary], axis: str, kind: Kind) -> list[str]:
