@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -55,12 +54,3 @@ def test_any_order_of_commands_has_the_one_that_was_in_force(
         for instant in range(newest - window, newest + 2):
             passed = [stamp for stamp in stamps if stamp <= instant]
             assert ours.at(axis, instant) == (one[passed[-1]] if passed else level)
-
-
-@pytest.mark.parametrize("window", [1, 10, 100])
-def test_what_the_window_does_not_need_is_let_go(window: int) -> None:
-    """Those of the window are kept, one that was in force before it, and one for its step."""
-    commands = Commands((0.0,))
-    for stamp in range(1000):
-        commands.add(stamp, bytes((FUSED,)), (0.1 * stamp,), stamp - window)
-    assert len(commands._given[0]) <= window + 3

@@ -194,9 +194,7 @@ def _difference_table(compared: Sequence[Compared], kind: Kind) -> Table:
         if each.result.summary.axes[axis].kind == kind
     ]
     headings = ["result", "axis", f"RMS, {unit}", f"largest, {unit}", "at, s"]
-    made = table(headings, rows)
-    made.title, made.title_justify, made.title_style = f"Positions less those of {compared[0].name}", "left", ""
-    return made
+    return table(headings, rows, f"Positions less those of {compared[0].name}")
 
 
 def _draw(compared: Sequence[Compared], why: str) -> None:

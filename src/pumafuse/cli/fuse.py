@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.resources import as_file, files
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 
 from ..errors import RunError, printable, warn
@@ -49,14 +49,9 @@ def run(
     given = FusionConfig.load(config)
     given.sensor_names(sensors)  # before any run is read
     warn(given.arm.doubts())
-    whole = partial(fuse, config=given, sensors=sensors, rate=rate, mode=mode, engine=engine)
-    long = partial(fuse_to, config=given, sensors=sensors, rate=rate, part=part, force=force)
-    needs = {"--smooth": mode == "smoothed", "--as-live": mode == "as-live", "--engine filterpy": engine != "compiled"}
-    needs |= {"--rrd": rrd, "--figures": figures}
-    in_memory = next((option for option, wanted in needs.items() if wanted), None)
-    job = partial(_fuse, given, whole, long, in_memory, part=part, rrd=rrd, figures=figures, force=force)
     extras = [name for name, wanted in {"fused.rrd": rrd, "fused.png": figures}.items() if wanted]
     making = results.Making(given, sensors, rate, mode, engine, part, extras)
+    job = partial(_fuse, making, rrd, figures, force)
     if len(runs) == 1:
         summary = making.made(output, runs[0]) if resume else None
         where = "written to" if summary is None else "there already:"
@@ -103,43 +98,42 @@ def demo(output: Path, force: bool) -> None:
 
 
 def _fuse(
-    config: FusionConfig,
-    whole: Callable[..., Estimates],
-    long: Callable[..., Summary],
-    in_memory: str | None,
-    path: Path,
-    folder: Path,
-    progress: Callable[[float], None] | None = None,
-    *,
-    part: tuple[float | None, float | None],
+    how: results.Making,
     rrd: bool,
     figures: bool,
     force: bool,
+    path: Path,
+    folder: Path,
+    progress: Callable[[float], None] | None = None,
 ) -> Summary:
     """Fuse a part of a run and write its result folder, with ``fused.rrd`` and figures if wanted.
 
-    A long run goes through piece by piece, where nothing, such as an option, needs it ``in_memory``.
+    A long run goes through piece by piece, where nothing, such as an option, needs it in memory.
     """
     results.check_writable(folder, force)
-    stamps, rows = stamps_of(path), rows_of(path)
+    stamps, rows, config = stamps_of(path), rows_of(path), how.config
     if rows > SHORT:
-        in_memory = in_memory or needs_whole(path, config)
-    if rows <= SHORT or in_memory:
+        options = {"--smooth": how.mode == "smoothed", "--as-live": how.mode == "as-live"}
+        options |= {"--engine filterpy": how.engine != "compiled", "--rrd": rrd, "--figures": figures}
+        needed = next((option for option, wanted in options.items() if wanted), None) or needs_whole(path, config)
+        if needed is None:
+            long = partial(fuse_to, path, folder, config, force=force, progress=progress)
+            return long(sensors=how.sensors, rate=how.rate, part=how.part)
         if rows > MOST_IN_MEMORY:
             raise RunError(
-                f"{path}: {in_memory} needs the whole run in memory, and {rows / 1e6:.0f} million rows are too many: do"
+                f"{path}: {needed} needs the whole run in memory, and {rows / 1e6:.0f} million rows are too many: do"
                 " without, or cut the log into shorter runs"
             )
-        recorded = Run.read(path).between(*part)
-        est = whole(recorded, progress=progress)
-        results.check_fused(est.counts, est.config)
+    recorded = Run.read(path).between(*how.part)
+    whole = partial(fuse, recorded, config, sensors=how.sensors, rate=how.rate)
+    est = whole(mode=how.mode, engine=how.engine, progress=progress)
+    results.check_fused(est.counts, est.config)
 
-        def more(new: Path) -> None:
-            results.note_log(new, stamps)
-            draw(new, est, recorded, rrd, figures)
+    def more(new: Path) -> None:
+        results.note_log(new, stamps)
+        draw(new, est, recorded, rrd, figures)
 
-        return results.write(est, folder, force, more)
-    return long(path, folder, progress=progress)
+    return results.write(est, folder, force, more)
 
 
 def draw(folder: Path, est: Estimates, recorded: Run, rrd: bool, figures: bool) -> None:
@@ -180,16 +174,10 @@ def show(summary: Summary) -> None:
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
     """A folder for each run, named after its path; equal names get a number."""
-    found, free = dict[str, None](), dict[str, Iterator[str]]()
+    found = dict[str, None]()
     for path in map(Path.resolve, runs):
         named = path.parent if path.name == "run.toml" else path
         name = named.name if named.is_dir() else re.sub(r"(\.(csv|jsonl|ndjson|parquet))?(\.gz)?$", "", named.name)
-        names = free.setdefault(name, _numbered(name or "run"))
+        names = (f"{name or 'run'}{number}" for number in chain([""], map("_{}".format, count(2))))
         found[next(one for one in names if one not in found)] = None
     return [output / name for name in found]
-
-
-def _numbered(name: str) -> Iterator[str]:
-    """A name, and the same with a number."""
-    yield name
-    yield from (f"{name}_{number}" for number in count(2))

@@ -20,7 +20,7 @@ def run(
     paths: Sequence[Path],
     output: Path,
     sensor: str | None,
-    period: float | None,
+    period_ms: float | None,
     samples: int | None,
     paper: bool,
     tolerance: float | None,
@@ -34,7 +34,7 @@ def run(
     if not trials:
         from . import latency
 
-        if period is not None or samples is not None or paper or tolerance is not None:
+        if period_ms is not None or samples is not None or paper or tolerance is not None:
             raise ConfigError("--period, --samples, --paper and --tolerance are for step trials, not for recorded runs")
         latency.identify(paths, output, sensor, report, json, force)
         return
@@ -45,6 +45,7 @@ def run(
         reports.check_writable(report, force)
     campaign, name = StepTrials.read(folder), folder.resolve().name
     most = None if tolerance is None else si(tolerance, f"_{SCREEN[campaign.kind].unit}")
+    period = None if period_ms is None else si(period_ms, "_ms")
     found = identify(campaign, period=period, samples=samples, paper=paper, tolerance=most, name=name)
     warn(found.notes)
     write_file(output, found.arm.to_toml(), replace=force)

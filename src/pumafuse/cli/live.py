@@ -12,7 +12,6 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import msgspec
 from rich.console import Group
@@ -27,10 +26,8 @@ from ..fusion.placing import with_tool
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, OF_A_RUN, POSES, Address
 from ..live.estimator import LiveEstimator
-from ..live.health import Health
 from ..live.network import Remote, Several, UdpSender
 from ..live.record import Recorder
-from ..live.results import LiveEstimate
 from ..live.ros2 import Ros2Estimates, Ros2Source
 from ..live.rtde import RtdeSource
 from ..live.sources import QUIET, replayed, standard_input
@@ -86,8 +83,7 @@ def run(
     if recorded is not None:
         start = dict(recorded.start)
         known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
-    given_files = {one: Path(one.path) for one in sources if one.kind in OF_A_RUN}
-    files = {one: path / "run.toml" if path.is_dir() else path for one, path in given_files.items()}
+    files = {one: manifest.file_of(Path(one.path)) for one in sources if one.kind in OF_A_RUN}
     listed = {address: manifest.load(file) for address, file in files.items()}
     for address, one in listed.items():
         start |= one.command.start
@@ -117,14 +113,14 @@ def run(
         live = estimator(event_log=recorder)
         if recorder is not None:
             stack.callback(lambda: recorder.close(live.sure))
-        views = list[_View]()
+        views = list[Watcher]()
         if rerun:
             from ..views.live import LiveView
 
             views.append(stack.enter_context(contextlib.closing(LiveView(rerun, known, notify))))
         if ros is not None:
             views.append(Ros2Estimates(ros, live))
-        write = sender or (_nowhere if ros is not None else _output(status))
+        write = sender or _output(published=ros is not None, status=status)
         stream = Stream(live, write, notify, rate, views)
         screen = None
         if status and errors.is_terminal:
@@ -170,12 +166,10 @@ def _opened(
     return stack.enter_context(contextlib.closing(Ros2Source(listed, ros_args, notify)))
 
 
-def _nowhere(_: list[bytes]) -> None:
-    """Estimates that are published need no other place."""
-
-
-def _output(status: bool) -> Callable[[list[bytes]], None]:
-    """Writer to standard output; not to the screen that shows the status, as both would write over each other."""
+def _output(*, published: bool, status: bool) -> Callable[[list[bytes]], None]:
+    """Writer to standard output; not of what is published, nor to the screen that shows the status."""
+    if published:
+        return lambda _: None
     if sys.stdout is None:  # pyright: ignore[reportUnnecessaryComparison]
         raise RunError("standard output is closed; send the estimates elsewhere with --out udp://HOST:PORT")
     if status and sys.stdout.isatty():
@@ -210,13 +204,6 @@ def _listen(remote: Remote, feeder: _Feeder, signals: list[int]) -> int:
     return 0
 
 
-class _View(Watcher, Protocol):
-    """A watcher that has a turn of its own."""
-
-    def tick(self, health: Callable[[], Health]) -> None:
-        """Do what is due."""
-
-
 @dataclass
 class _Feeder:
     """Feeds a stream, and gives the recorder, the views and the screen their turn."""
@@ -225,7 +212,7 @@ class _Feeder:
     summaries: Sequence[Callable[[], str]]
     speed: float
     recorder: Recorder | None
-    views: Sequence[_View]
+    views: Sequence[Watcher]
     screen: Live | None
     sure: int | None = None
     now: int | None = None
@@ -276,20 +263,16 @@ def status(stream: Stream, summaries: Sequence[Callable[[], str]] = (), now: int
     """One screen: the position of each axis, and how each sensor does."""
     estimate = stream.live.estimate(now)
     time = "no event yet" if stream.live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
+    doubts = {"stale": estimate.stale, "doubtful": estimate.doubtful}
     arm, tables = stream.live.config.arm, list[Table]()
     for kind in arm.kinds:
         rows = [
-            [name, *cells(axis, _AXIS, kind), _doubts(estimate, name)]
+            [name, *cells(axis, _AXIS, kind), ", ".join(word for word, axes in doubts.items() if name in axes)]
             for name, axis in estimate.axes.items()
             if arm.axes[name].kind == kind
         ]
         tables.append(table(["axis", *headings(_AXIS, kind), ""], rows))
     return Group(Text(time), *tables, _sensor_table(stream.live, now), *map(Text, _sentences(stream, summaries)))
-
-
-def _doubts(estimate: LiveEstimate, axis: str) -> str:
-    """What is to be known of an axis beside its numbers."""
-    return ", ".join(word for word in ("stale", "doubtful") if axis in getattr(estimate, word))
 
 
 def _sensor_table(live: LiveEstimator, now: int | None) -> Table:

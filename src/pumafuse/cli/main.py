@@ -227,8 +227,7 @@ def identify(
     from . import identify as command
 
     _check_positive(period=period, tolerance=tolerance)
-    options = period and _seconds(period), samples, paper, tolerance
-    command.run(source, output, sensor, *options, report, json, force)
+    command.run(source, output, sensor, period, samples, paper, tolerance, report, json, force)
 
 
 @app.command()
@@ -464,13 +463,6 @@ def _level(text: str) -> tuple[str, float]:
         return axis.strip(), float(level)
     except ValueError:
         raise BadParameter(f"expected AXIS=VALUE, not '{text}'", param_hint="--start") from None
-
-
-def _seconds(milliseconds: float) -> float:
-    """Milliseconds of the command line in s, without a binary rounding in between."""
-    from ..units import si  # imports numpy, which no --help needs
-
-    return si(milliseconds, "_ms")
 
 
 def _check_interval(since: float | None, until: float | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import StringIO
 from typing import Literal, TextIO
 
@@ -18,7 +18,7 @@ from ..errors import printable
 from ..fusion.score import Z95, OrientationScore
 from ..fusion.segments import NOT_SELECTED
 from ..fusion.skill import PredictionError
-from ..fusion.summary import ScoreSummary, SensorSummary, Summary
+from ..fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, pooled, weighted_mean
 from ..units import DEG, SCREEN, Kind
 
 # By heading: an attribute, its format, and what it is multiplied by; None: what positions are on the screen.
@@ -39,6 +39,13 @@ _SCORE: Columns = {
     "velocity\n95 % cov.": ("velocity_coverage", ".1%", 1.0),
 }
 
+_ORIENTATION: Columns = {
+    "angle to the reference,\nRMS, deg": ("rms", ".3f", DEG),
+    "expected,\ndeg": ("expected", ".3f", DEG),
+    "scored": ("rows", ".0f", 1.0),
+    "left\nout": ("left_out", ".0f", 1.0),
+}
+
 
 def console(file: TextIO) -> Console:
     """A stream for people: 120 columns wide where it is no terminal; nowhere if it is closed, which makes it None."""
@@ -46,13 +53,13 @@ def console(file: TextIO) -> Console:
     return Console(file=there, highlight=False, emoji=False, width=None if there.isatty() else 120)
 
 
-def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+def table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> Table:
     """A table for the terminal, without columns in which no row has anything.
 
     Columns of numbers are right-justified. They, names and cells of several lines are not wrapped, and sentences get no
     narrower than a few words: a digit that is cut off makes another number.
     """
-    made = Table(box=box.SIMPLE_HEAD)
+    made = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="")
     kept: list[list[str]] = []
     for heading, *column in zip(headings, *rows, strict=True):
         if set(column) <= {"", "–"}:
@@ -115,8 +122,7 @@ def cells(row: object, columns: Columns, kind: Kind = "length") -> list[str]:
 
 def outcome_table(summary: Summary, kind: Kind) -> Table:
     """Components by outcome, innovations and their expected size, for each axis of a kind and sensor."""
-    axes = {axis: part for axis, part in summary.axes.items() if part.kind == kind}
-    sensors = [(axis, name, one) for axis, part in axes.items() for name, one in part.sensors.items()]
+    sensors = [(axis, name, one) for _, axis, _, name, one in _sensors([("", summary)], kind)]
     words = sorted({word for *_, one in sensors for word in one.outcomes}, key=lambda word: (word != "fused", word))
     rows = [
         [
@@ -153,38 +159,31 @@ def skill_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:
 
     rows = [
         [name, axis, sensor, str(one.skill.predictions), *map(prediction, msgspec.structs.astuple(one.skill)[1:])]
-        for name, summary in results
-        for axis, part in summary.axes.items()
-        for sensor, one in part.sensors.items()
-        if one.skill is not None and part.kind == kind
+        for name, axis, _, sensor, one in _sensors(results, kind)
+        if one.skill is not None
     ]
     by = ["last one\nheld", "constant\nvelocity", "command\nalone", "this\nfilter"]
-    made = table(["result", "axis", "sensor", "predictions", *by], rows)
-    made.title, made.title_justify, made.title_style = (
-        f"Error of predicting the next measurement, RMS / median in {SCREEN[kind].unit}, by …",
-        "left",
-        "",
-    )
-    return made
+    title = f"Error of predicting the next measurement, RMS / median in {SCREEN[kind].unit}, by …"
+    return table(["result", "axis", "sensor", "predictions", *by], rows, title)
 
 
 def consistency_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:
     """What each result says of itself on axes of a kind: likelihood, and of each sensor NIS and the share rejected."""
     rows = [
-        [
-            name,
-            axis,
-            number(part.log_likelihood, ".1f"),
-            sensor,
-            number(one.nis_mean),
-            number(share_rejected(one), ".1%"),
-        ]
-        for name, summary in results
-        for axis, part in summary.axes.items()
-        for sensor, one in part.sensors.items()
-        if part.kind == kind
+        [name, axis, f"{part.log_likelihood:.1f}", sensor, number(one.nis_mean), number(share_rejected(one), ".1%")]
+        for name, axis, part, sensor, one in _sensors(results, kind)
     ]
     return table(["result", "axis", "log-likelihood", "sensor", "NIS", "rejected"], rows)
+
+
+def _sensors(
+    results: Iterable[tuple[str, Summary]], kind: Kind
+) -> Iterator[tuple[str, str, AxisSummary, str, SensorSummary]]:
+    """Each sensor on each axis of a kind: the result, the axis with its summary, the sensor with its own."""
+    for name, summary in results:
+        for axis, part in summary.axes.items():
+            if part.kind == kind:
+                yield from ((name, axis, part, sensor, one) for sensor, one in part.sensors.items())
 
 
 def share_rejected(sensor: SensorSummary) -> float | None:
@@ -207,31 +206,22 @@ def score_table(results: Iterable[tuple[str, Summary, Mapping[str, ScoreSummary]
 
 def orientation_table(results: Iterable[tuple[str, OrientationScore | None]]) -> Table:
     """The angle between estimated and reference orientation of each result, where there is one."""
-    rows = [
-        [name, f"{one.rms * DEG:.3f}", f"{one.expected * DEG:.3f}", str(one.rows), str(one.left_out)]
-        for name, one in results
-        if one is not None
-    ]
-    return table(["result", "angle to the reference,\nRMS, deg", "expected,\ndeg", "scored", "left\nout"], rows)
+    rows = [[name, *cells(one, _ORIENTATION)] for name, one in results if one is not None]
+    return table(["result", *_ORIENTATION], rows)
 
 
 def runs_table(results: Mapping[str, Summary], kind: Kind) -> Table:
     """Many results: lines for each of up to 20 by name, and for each axis of a kind all of them together."""
-    results = {name: _of_kind(summary, kind) for name, summary in results.items()}
+    axes = {name: [axis for axis, one in given.axes.items() if one.kind == kind] for name, given in results.items()}
     rows: list[list[str]] = []
     if len(results) <= _FEW_RUNS:
-        rows += [[name, axis, *_pooled([one], axis, kind)] for name, one in results.items() for axis in one.axes]
-    for axis in dict.fromkeys(axis for one in results.values() for axis in one.axes):
-        having = [one for one in results.values() if axis in one.axes]
+        rows += [[name, axis, *_pooled([one], axis, kind)] for name, one in results.items() for axis in axes[name]]
+    for axis in dict.fromkeys(axis for mine in axes.values() for axis in mine):
+        having = [one for name, one in results.items() if axis in axes[name]]
         rows.append([f"all {len(having)}", axis, *_pooled(having, axis, kind)])
     unit = SCREEN[kind].unit
     scores = (f"RMSE, {unit}", f"worst, {unit}", "95 % coverage", "NEES")
     return table(["result", "axis", *scores, "NIS", "prediction,\nof best other", "fused", "rejected", "notes"], rows)
-
-
-def _of_kind(summary: Summary, kind: Kind) -> Summary:
-    axes = {axis: part for axis, part in summary.axes.items() if part.kind == kind}
-    return msgspec.structs.replace(summary, axes=axes)
 
 
 def _pooled(summaries: Sequence[Summary], axis: str, kind: Kind) -> list[str]:
@@ -240,24 +230,16 @@ def _pooled(summaries: Sequence[Summary], axis: str, kind: Kind) -> list[str]:
     scores = [part.score for part in parts if part.score is not None]
     sensors = [sensor for part in parts for sensor in part.sensors.values()]
     fused, rejected = ([sensor.outcomes.get(word, 0) for sensor in sensors] for word in ("fused", "rejected"))
-    rows = [score.rows for score in scores]
+    score = pooled(scores, [one.rows for one in scores])
     skills = [sensor.skill for sensor in sensors if sensor.skill is not None]
-    square = _mean([score.rmse**2 for score in scores], rows)
     return [
-        position(None if square is None else square**0.5, kind),
-        position(max((score.rmse for score in scores), default=None), kind),
-        number(_mean([score.coverage for score in scores], rows), ".1%"),
-        number(_mean([score.nees_mean for score in scores], rows), ".2f"),
-        number(_mean([sensor.nis_mean for sensor in sensors], fused), ".2f"),
-        number(_mean([one.of_best_other for one in skills], [one.predictions for one in skills]), ".2f"),
+        position(score and score.rmse, kind),
+        position(max((one.rmse for one in scores), default=None), kind),
+        number(score and score.coverage, ".1%"),
+        number(score and score.nees_mean, ".2f"),
+        number(weighted_mean([sensor.nis_mean for sensor in sensors], fused), ".2f"),
+        number(weighted_mean([one.of_best_other for one in skills], [one.predictions for one in skills]), ".2f"),
         str(sum(fused)),
         str(sum(rejected)),
         str(sum(len(summary.notes) for summary in summaries)),
     ]
-
-
-def _mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
-    """The weighted mean of the values that there are; None without any."""
-    known = [(value, weight) for value, weight in zip(values, weights, strict=True) if value is not None]
-    total = sum(weight for _, weight in known)
-    return sum(value * weight for value, weight in known) / total if total else None

@@ -69,7 +69,7 @@ _OF_STEP = 0.01  # by which no step of a clock that was counted differs from the
 _METRES = names.words_in(
     "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage tfMessage"
 )
-_TRIAL = re.compile(r"(.*)\[(\d+)\]")  # of a list of trials
+_TRIAL = re.compile(r"([^\[]*)\[(\d+)\]")  # of a list of trials
 _ECHO = re.compile(r"^field\.(transforms0\.)?")
 _ECHOED = re.compile(r"field\..*(position|translation|point)\.[xyz]$")  # of a message by `rostopic echo -p`: in m, too
 _RADIANS = ("JointState", "JointTrajectory", "JointTrajectoryControllerState")
@@ -189,22 +189,18 @@ def _of_one_run(parts: Sequence[Part]) -> list[Part]:
         return {*part.left_out, *(one.column for one in part.signals)}
 
     whole = [one for one in parts if {names.column_role(signal.name) for signal in one.signals} >= _WHOLE]
-    again = [one for one in whole if _place(one) != _place(whole[0]) and columns(one) == columns(whole[0])]
-    if not again:
-        return list(parts)
-    if trial := _TRIAL.match(whole[0].topic):  # others may have other columns
+    if whole and (trial := _TRIAL.match(whole[0].topic)):  # others may have other columns
         listed = [(one, _TRIAL.match(one.topic)) for one in parts if one.file == whole[0].file]
         again = [one for one, other in listed if other and other[1] == trial[1] and other[2] != trial[2]]
         what = f"{counted(len(again), 'table')} of other trials left out"
     else:
+        again = [one for one in whole if one.file != whole[0].file and columns(one) == columns(whole[0])]
         what = f"{counted(len(again), 'other file')} of the same columns left out, a run each"
+    if not again:
+        return list(parts)
     kept = [one for one in parts if one not in again]
     notes = (*whole[0].notes, f"{what}: {again[0].label} …")
     return [replace(one, notes=notes) if one is whole[0] else one for one in kept]
-
-
-def _place(part: Part) -> tuple[Path, str, str]:
-    return part.file, part.topic, part.entity
 
 
 def _files(log: Path) -> list[Path]:

@@ -26,6 +26,7 @@ from ..logs.tables import Table
 from ..model.arm import ArmModel
 from ..units import AN, KINDS, SCREEN, SI, Kind, Screen, kind_of, of_kind, seconds
 from .config import ARM_FILE, ROBOT_FILE, FusionConfig
+from .engine import Engine
 from .estimates import AxisEstimate, Estimates, Mode
 from .placing import in_base
 from .pose import orientation, relative_to
@@ -101,7 +102,7 @@ class Making:
     sensors: Sequence[str] | None  # those that are asked for; None: all
     rate: float | None  # of the even grid of estimates [Hz]; None: one for each command
     mode: Mode
-    engine: str
+    engine: Engine
     part: tuple[float | None, float | None]  # where the part of the run to use begins and ends [s]
     extras: Sequence[str]  # files that are made beside the usual ones
 

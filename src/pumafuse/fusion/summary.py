@@ -6,10 +6,10 @@ Names of keys are those for lengths; the file has those of each axis's kind: ``r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -25,6 +25,8 @@ from .score import OrientationScore, ReferenceTrack, score, score_orientation, s
 from .skill import Skill, skill
 from .verdicts import in_words, sentence
 
+P = TypeVar("P", bound=msgspec.Struct)
+_OF_SQUARES = {"rms", "rmse", "expected", "velocity_rmse", "innovation_rms", "innovation_sd"}  # roots of their means
 _BEATEN = 1.25  # times the RMS error of a simpler way, from which that is said: a bit less may be chance, or outliers
 
 
@@ -304,6 +306,32 @@ def beaten(axes: Mapping[str, AxisSummary]) -> list[str]:
                 " the verdict, and at --figures"
             )
     return found
+
+
+def weighted_mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
+    """The weighted mean of the values that there are; None without any."""
+    known = [(value, weight) for value, weight in zip(values, weights, strict=True) if value is not None]
+    total = sum(weight for _, weight in known)
+    return sum(value * weight for value, weight in known) / total if total else None
+
+
+def pooled(parts: Sequence[P], weights: Sequence[int]) -> P | None:
+    """Scores of several runs, or of pieces of one, as one: counts are summed, errors weighted; None without any."""
+    if not parts:
+        return None
+    keys = parts[0].__struct_fields__
+    return type(parts[0])(**{key: pooled_number(key, [getattr(one, key) for one in parts], weights) for key in keys})
+
+
+def pooled_number(key: str, values: Sequence[Any], weights: Sequence[int]) -> Any:
+    """A field of several scores as one: a root mean square by the squares, any other by its mean."""
+    if isinstance(values[0], msgspec.Struct):
+        return pooled(values, weights)
+    if isinstance(values[0], int):
+        return sum(values)
+    power = 2 if key in _OF_SQUARES else 1
+    mean = weighted_mean([None if value is None else value**power for value in values], weights)
+    return None if mean is None else mean ** (1 / power)
 
 
 def score_axis(

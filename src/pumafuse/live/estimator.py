@@ -679,11 +679,10 @@ class LiveEstimator:
         if self._contradicting.get(sensor) == other:
             return
         self._contradicting[sensor] = other
-        found = list(zip(self.axes, window.outcome, window.innovation, strict=True))
-        screens = {axis: self.config.arm.screen_of(axis) for axis, _, _ in found}
+        screens = map(self.config.arm.screen_of, self.axes)
         off = ", ".join(
-            f"{axis} by {nu * screens[axis].scale:+.4g} {screens[axis].unit}"
-            for axis, outcome, nu in found
+            f"{axis} by {nu * screen.scale:+.4g} {screen.unit}"
+            for axis, screen, outcome, nu in zip(self.axes, screens, window.outcome, window.innovation, strict=True)
             if outcome == Outcome.REJECTED
         )
         self._log.write(

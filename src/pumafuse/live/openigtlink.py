@@ -12,7 +12,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,15 +36,7 @@ _LARGEST = 1 << 16  # bytes of a message of poses
 _COMMAND = "command"  # the device
 _STATUS, _SEEN = "TransformStatus", "OK"  # a metadatum: whether the tracker sees the device
 
-
-class _Message(NamedTuple):
-    """A message whose header has been read."""
-
-    kind: str
-    device: str
-    stamp: int  # ns
-    content: bytes
-    seen: bool
+_Poses: TypeAlias = list[tuple[str, list[float]]]  # each device of a message, and the numbers of its pose
 
 
 class OpenIgtLinkSource(EventClient):
@@ -59,14 +51,10 @@ class OpenIgtLinkSource(EventClient):
         self._turns, self._on_receipt = takes_orientation(config), address.on_receipt
 
     def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
-        for message in _messages(connection.makefile("rb")):
-            yield list(self._events(message))
-
-    def _events(self, message: _Message) -> Iterator[Event]:
-        stamp = time.time_ns() if self._on_receipt or not message.stamp else message.stamp
-        for device, pose in _poses(message):
-            values = self._values(pose if message.seen else [math.nan] * len(pose))
-            yield Event(stamp, "" if device == _COMMAND else device, values)
+        for stamp, seen, poses in _messages(connection.makefile("rb")):
+            stamp = time.time_ns() if self._on_receipt or not stamp else stamp
+            told = ((device, pose if seen else [math.nan] * len(pose)) for device, pose in poses)
+            yield [Event(stamp, "" if device == _COMMAND else device, self._values(pose)) for device, pose in told]
 
     def _values(self, pose: list[float]) -> dict[str, Any]:
         """The values of a pose: a point and perhaps a quaternion, or the columns of a rotation matrix and a point."""
@@ -90,8 +78,11 @@ def _quaternion(pose: list[float]) -> tuple[float, ...] | None:
         return None
 
 
-def _messages(stream: BinaryIO) -> Iterator[_Message]:
-    """The messages of poses, until the connection ends; others, as images, are passed over."""
+def _messages(stream: BinaryIO) -> Iterator[tuple[int, bool, _Poses]]:
+    """Of messages of poses, until the connection ends: stamp [ns], whether all is seen, poses. Others are passed over.
+
+    Such are images.
+    """
     with stream:
         while len(head := stream.read(_HEAD.size)) == _HEAD.size:
             version, kind, device, seconds, fraction, size, _ = _HEAD.unpack(head)
@@ -108,7 +99,7 @@ def _messages(stream: BinaryIO) -> Iterator[_Message]:
                 return
             stamp = seconds * 10**9 + (fraction * 10**9 >> 32)
             content, seen = (body, True) if version == 1 else _without_metadata(body)
-            yield _Message(name, _text(device), stamp, content, seen)
+            yield stamp, seen, _poses(name, _text(device), content)
 
 
 def _pass_over(stream: BinaryIO, size: int) -> None:
@@ -130,17 +121,15 @@ def _without_metadata(body: bytes) -> tuple[bytes, bool]:
     return body[before:end], seen
 
 
-def _poses(message: _Message) -> Iterator[tuple[str, list[float]]]:
-    """Each device of a message and the numbers of its pose."""
-    if (layout := _LISTS.get(message.kind)) is not None:
-        one = _NAME.size + layout.size
-        for at in range(0, len(message.content), one):
-            name, _ = _NAME.unpack_from(message.content, at)
-            yield _text(name), list(layout.unpack_from(message.content, at + _NAME.size))
-        return
-    layouts = _POSES[message.kind]
-    fits = next((one for one in layouts if one.size == len(message.content)), layouts[-1])
-    yield message.device, list(fits.unpack(message.content))
+def _poses(kind: str, device: str, content: bytes) -> _Poses:
+    """The poses of a message of one kind, by its device if it is of one."""
+    if (layout := _LISTS.get(kind)) is not None:
+        begins = range(0, len(content), _NAME.size + layout.size)
+        poses = (list(layout.unpack_from(content, at + _NAME.size)) for at in begins)
+        return [(_text(_NAME.unpack_from(content, at)[0]), pose) for at, pose in zip(begins, poses, strict=True)]
+    layouts = _POSES[kind]
+    fits = next((one for one in layouts if one.size == len(content)), layouts[-1])
+    return [(device, list(fits.unpack(content)))]
 
 
 def _text(field: bytes) -> str:

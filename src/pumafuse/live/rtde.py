@@ -13,7 +13,6 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
-from typing import NamedTuple
 
 from ..errors import ConfigError
 from ..logs.columns import LOG_TIME
@@ -41,18 +40,6 @@ _TYPES = {  # of variables, in big endian
 _PATIENCE = 5.0  # s without a package, of a robot that sends one every few ms
 
 
-class _Recipe(NamedTuple):
-    """How a data package is read: its columns after the first byte, which is the ``number`` of the recipe."""
-
-    number: int
-    layout: struct.Struct
-    columns: list[str]
-
-    def row(self, body: bytes) -> SimpleNamespace:
-        """The columns of a package."""
-        return SimpleNamespace(**dict(zip(self.columns, self.layout.unpack_from(body, 1), strict=True)))
-
-
 class RtdeSource(EventClient):
     """Events of a robot."""
 
@@ -69,15 +56,17 @@ class RtdeSource(EventClient):
     def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
         connection.settimeout(_PATIENCE)
         packages = _packages(connection)
-        recipe = self._agree(connection, packages)
+        recipe, layout, columns = self._agree(connection, packages)
         for kind, body in packages:
             received = time.time_ns()
-            if kind == _DATA and body[:1] == bytes([recipe.number]):
-                row = recipe.row(body)
+            if kind == _DATA and body[:1] == recipe:
+                row = SimpleNamespace(**dict(zip(columns, layout.unpack_from(body, 1), strict=True)))
                 yield [event for one in self._readers for event in one.events(row, received)]
 
-    def _agree(self, connection: socket.socket, packages: Iterator[tuple[int, bytes]]) -> _Recipe:
-        """Agree on the protocol and on what is sent, and let the robot begin."""
+    def _agree(
+        self, connection: socket.socket, packages: Iterator[tuple[int, bytes]]
+    ) -> tuple[bytes, struct.Struct, list[str]]:
+        """Agree on what is sent, and let the robot begin: the first byte of data packages, and the columns after it."""
 
         def ask(kind: int, body: bytes) -> bytes:
             connection.sendall(_HEAD.pack(_HEAD.size + len(body), kind) + body)
@@ -98,13 +87,12 @@ class RtdeSource(EventClient):
             for name, size in sizes.items()
             for column in ([name] if size == 1 else [f"{name}_{place}" for place in range(size)])
         ]
-        recipe = _Recipe(found[0], struct.Struct(">" + "".join(_TYPES[kind] for kind in known.values())), columns)
         empty = SimpleNamespace(**dict.fromkeys(columns, 0.0))
         if lacking := [path for one in self._readers for path in one.lacks(empty)]:
             raise Refused(f"the robot has no column {', '.join(lacking)}; it has {', '.join(columns)}")
         if ask(_BEGIN, b"") != b"\x01":
             raise Refused(f"the robot does not begin to send {self._rate:g} times a second")
-        return recipe
+        return found[:1], struct.Struct(">" + "".join(_TYPES[kind] for kind in known.values())), columns
 
 
 def _variable(column: str) -> str:

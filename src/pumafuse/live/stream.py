@@ -9,6 +9,7 @@ from ..errors import ConfigError
 from ..filter.outcome import Outcome
 from .clock import nanoseconds
 from .estimator import LiveEstimator
+from .health import Health
 from .rate_limit import RateLimitedLog
 from .results import COMPARED, LiveEstimate, UpdateResult
 from .wire import BadLine, Event, LineDecoder, encode
@@ -26,6 +27,9 @@ class Watcher(Protocol):
 
     def estimate(self, estimate: LiveEstimate) -> None:
         """Receive an estimate that goes out."""
+
+    def tick(self, health: Callable[[], Health]) -> None:
+        """Do what is due, whether something has come or not."""
 
 
 class Stream:

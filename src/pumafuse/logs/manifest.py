@@ -258,6 +258,11 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return found
 
 
+def file_of(run: Path) -> Path:
+    """The ``run.toml`` of a run that is given as this file or as its folder."""
+    return run / "run.toml" if run.is_dir() else run
+
+
 def load(path: Path) -> Manifest:
     """Read ``run.toml``."""
     return of_tables(toml.read(path), str(path))
@@ -285,7 +290,7 @@ def stamps_of(run: Path) -> dict[str, tuple[int, int]]:
 
     Its files are ``run.toml``, the tables and recordings that it lists, and the URDF of its robot.
     """
-    listed, files = run / "run.toml" if run.is_dir() else run, [run]
+    listed, files = file_of(run), [run]
     try:
         if listed.suffix == ".toml":
             told = load(listed)

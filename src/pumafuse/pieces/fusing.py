@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -41,13 +40,6 @@ from .reading import Log
 
 PIECE = 1_000_000  # rows that are read at a time
 _SETTLED = 10.0  # lags after which a motion is over
-
-
-class _Begun(NamedTuple):
-    """What the pieces of a run share: its first segment, and the filter with its state."""
-
-    segment: Segment
-    core: Filter
 
 
 def fuse_to(
@@ -107,9 +99,9 @@ def _pieces(
             continue
         run = run.between(*part)
         begun = begun or _begin(run, config, chosen)
-        over = cut - ahead > run.ends(begun.segment.origin)[1] + overlap
+        over = cut - ahead > run.ends(begun[0].origin)[1] + overlap
         until = NEVER if cut == NEVER or over else cut - ahead
-        est = _piece(run, config, chosen, rate, begun, (after, until))
+        est = _piece(run, config, chosen, rate, *begun, (after, until))
         span = [(instant - est.origin) / 1e9 for instant in (after, until)]
         yield est, (span[0], span[1]), 1.0 if until == NEVER else log.done / log.rows
         given = [est.segments[0].given(axis)[0] for axis in est.axes]
@@ -125,8 +117,8 @@ def _margins(config: FusionConfig) -> tuple[int, int]:
     return ahead, ahead + TOLERATED_STEP_BACK_NS + round(_SETTLED * lag * 1e9)
 
 
-def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> _Begun:
-    """The filter at rest before the first command, by the first rows of a run."""
+def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> tuple[Segment, Filter]:
+    """What the pieces of a run share, by its first rows: its first segment, and the filter, at rest before it."""
     run = in_base(run.between(), config)[0]
     segment = build(run, config, chosen)
     biases = [
@@ -138,7 +130,7 @@ def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> _Beg
         for axis in segment.axes
     ]
     model = filter_model(config, segment.axes, segment.sensors, segment.start, biases)
-    return _Begun(segment, Filter(model, segment.origin))
+    return segment, Filter(model, segment.origin)
 
 
 def _piece(
@@ -146,7 +138,8 @@ def _piece(
     config: FusionConfig,
     chosen: tuple[str, ...] | None,
     rate: float | None,
-    begun: _Begun,
+    begun: Segment,
+    core: Filter,
     own: tuple[int, int],
 ) -> Estimates:
     """The estimates of the rows after and until the instants ``own`` [int ns], with notes."""
@@ -160,9 +153,9 @@ def _piece(
             f"{label}: the clock is set back by {lag.max():.3f} s; so long a run is fused piece by piece, in the order"
             " of time: cut the log there"
         )
-    segment = build(in_place, config, chosen, begun.segment, own)
+    segment = build(in_place, config, chosen, begun, own)
     times = output_times(segment, config, rate, own)
-    filtered = filter_piece(segment, begun.core, config, times, own)
+    filtered = filter_piece(segment, core, config, times, own)
     first = own[0] == ALWAYS
     if not first:  # for those who ask where the commands lead: the arm rests at what was commanded before
         segment = replace(segment, start={axis: float(segment.given(axis)[1][0]) for axis in segment.axes})

@@ -6,9 +6,8 @@ autocorrelations and the errors of simpler predictors do not know of pairs of me
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -23,19 +22,21 @@ from ..fusion.estimates import Estimates
 from ..fusion.offline import UNCOVERED
 from ..fusion.score import OrientationScore
 from ..fusion.segments import added
-from ..fusion.skill import PredictionError, Skill
 from ..fusion.summary import (
     AxisSummary,
-    ScoreSummary,
     SensorSummary,
     Summary,
     axis_summary,
     orientation_score,
+    pooled,
+    pooled_number,
     sensor_summary,
     summary_of,
+    weighted_mean,
 )
 from ..units import Kind
 
+_SIZES = ("innovation_rms", "innovation_sd")
 _NUMBER = re.compile(r"\d[\d.,]*(e[+-]?\d+)?")
 
 
@@ -97,7 +98,8 @@ def merged(digests: Sequence[Digest]) -> Summary:
         speed=speed,
         notes=tuple(notes),
     )
-    turned = _orientation([one.orientation for one in digests if one.orientation is not None])
+    oriented = [one.orientation for one in digests if one.orientation is not None]
+    turned = pooled(oriented, [one.rows for one in oriented])
     return msgspec.structs.replace(summary_of(whole, axes, turned), estimates=sum(one.estimates for one in digests))
 
 
@@ -118,59 +120,29 @@ def _axis(digests: Sequence[Digest], axis: str) -> AxisSummary:
     names = dict.fromkeys(name for part in parts for name in part.sensors)
     sensors = {name: _sensor(digests, axis, name) for name in names}
     fused = sum(_fused(sensor) for sensor in sensors.values())
+    scores = [part.score for part in parts if part.score is not None]
     return AxisSummary(
         sensors=sensors,
         log_likelihood=sum(part.log_likelihood for part in parts),
-        score=_score([part.score for part in parts if part.score is not None]),
+        score=pooled(scores, [one.rows for one in scores]),
         nees_band=chi_square_band(fused) if fused else None,
         kind=parts[0].kind,
     )
 
 
-def _score(parts: Sequence[ScoreSummary]) -> ScoreSummary | None:
-    if not parts:
-        return None
-    rows = [part.rows for part in parts]
-    square = _mean([part.rmse**2 for part in parts], rows) or 0.0
-    velocity = _mean([None if part.velocity_rmse is None else part.velocity_rmse**2 for part in parts], rows)
-    return ScoreSummary(
-        rmse=math.sqrt(square),
-        bias=_mean([part.bias for part in parts], rows) or 0.0,
-        coverage=_mean([part.coverage for part in parts], rows) or 0.0,
-        nees_mean=_mean([part.nees_mean for part in parts], rows),
-        rows=sum(rows),
-        left_out=sum(part.left_out for part in parts),
-        velocity_rmse=None if velocity is None else math.sqrt(velocity),
-        velocity_coverage=_mean([part.velocity_coverage for part in parts], rows),
-    )
-
-
-def _orientation(parts: Sequence[OrientationScore]) -> OrientationScore | None:
-    if not parts:
-        return None
-    rows = [part.rows for part in parts]
-    rms, expected = (
-        math.sqrt(_mean([one**2 for one in each], rows) or 0.0)
-        for each in ([part.rms for part in parts], [part.expected for part in parts])
-    )
-    return OrientationScore(rms=rms, expected=expected, rows=sum(rows), left_out=sum(part.left_out for part in parts))
-
-
 def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
     having = [one for one in digests if name in one.axes[axis].sensors]
     parts = [one.axes[axis].sensors[name] for one in having]
-    outcomes, skill = added(part.outcomes for part in parts), _skill([part.skill for part in parts if part.skill])
+    skills = [part.skill for part in parts if part.skill]
+    outcomes, skill = added(part.outcomes for part in parts), pooled(skills, [one.predictions for one in skills])
     fused = [_fused(part) for part in parts]
     if not sum(fused):
         return SensorSummary(outcomes=outcomes, skill=skill)
     innovations = [one.innovations.get((axis, name), Innovations(0.0, {})) for one in having]
     found = _consistency(parts, innovations, digests[0].est.config, name, axis)
-    squares = [
-        _mean([None if rms is None else rms**2 for rms in each], fused) or 0.0
-        for each in ([part.innovation_rms for part in parts], [part.innovation_sd for part in parts])
-    ]
+    rms, sd = (pooled_number(key, [getattr(part, key) for part in parts], fused) or 0.0 for key in _SIZES)
     bias = digests[-1].est.biases.get(name, {}).get(axis)
-    return sensor_summary(axis, outcomes, found, math.sqrt(squares[0]), math.sqrt(squares[1]), bias, skill)
+    return sensor_summary(axis, outcomes, found, rms, sd, bias, skill)
 
 
 def _consistency(
@@ -182,8 +154,8 @@ def _consistency(
     """
     fused = [_fused(part) for part in parts]
     count, lags = sum(fused), max(len(part.correlation) for part in parts)
-    nis = _mean([part.nis_mean for part in parts], fused) or 0.0
-    mean, power = _mean([one.mean for one in innovations], fused) or 0.0, 0.0
+    nis = weighted_mean([part.nis_mean for part in parts], fused) or 0.0
+    mean, power = weighted_mean([one.mean for one in innovations], fused) or 0.0, 0.0
     products = np.zeros(lags)
     for part, one, n in zip(parts, innovations, fused, strict=True):
         own, aside = n * ((part.nis_mean or 0.0) - one.mean**2), n * (one.mean - mean) ** 2
@@ -207,32 +179,5 @@ def _consistency(
     )
 
 
-def _skill(parts: Sequence[Skill]) -> Skill | None:
-    if not parts:
-        return None
-    predictions = [part.predictions for part in parts]
-
-    def error(ones: Iterable[PredictionError]) -> PredictionError:
-        squares, medians = zip(*((one.rms**2, one.median) for one in ones), strict=True)
-        return PredictionError(
-            rms=math.sqrt(_mean(squares, predictions) or 0.0), median=_mean(medians, predictions) or 0.0
-        )
-
-    return Skill(
-        predictions=sum(predictions),
-        last_held=error(part.last_held for part in parts),
-        constant_velocity=error(part.constant_velocity for part in parts),
-        command_alone=error(part.command_alone for part in parts),
-        filter=error(part.filter for part in parts),
-    )
-
-
 def _fused(sensor: SensorSummary) -> int:
     return sensor.outcomes.get(Outcome.FUSED.word, 0)
-
-
-def _mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
-    """The weighted mean of the values that there are; None without any."""
-    known = [(value, weight) for value, weight in zip(values, weights, strict=True) if value is not None]
-    total = sum(weight for _, weight in known)
-    return sum(value * weight for value, weight in known) / total if total else None

@@ -38,7 +38,7 @@ class Log:
 
     def __init__(self, path: Path) -> None:
         """Open a folder with ``run.toml``, ``run.toml`` itself, or one table; see :func:`rows_of`."""
-        self._listed = None if path.suffix == ".parquet" else manifest.load(_manifest(path))
+        self._listed = None if path.suffix == ".parquet" else manifest.load(manifest.file_of(path))
         self._folder = path if path.is_dir() else path.parent
         self.done, self._cut = 0, ALWAYS
         if self._listed is None:
@@ -93,7 +93,7 @@ def rows_of(path: Path) -> int:
     if path.suffix == ".parquet":
         count = tables.row_count(path)
         return 0 if count and any(name.startswith("time_") for name in tables.of_text(path)) else count
-    if not (listed := _manifest(path)).is_file() or listed.suffix != ".toml":
+    if not (listed := manifest.file_of(path)).is_file() or listed.suffix != ".toml":
         return 0
     entries = list(manifest.load(listed).entries.values())
     clocks = {(entry.rows, repr(entry.time)) for entry in entries}
@@ -115,7 +115,7 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
     """
     if path.suffix == ".parquet":
         return "a cylindrical [frame]" if isinstance(config.frame, Cylindrical) else None
-    listed = manifest.load(_manifest(path))
+    listed = manifest.load(manifest.file_of(path))
     entries = listed.entries.values()
     oriented = [one for one in entries if one.orientation or one.joints]
     told = {name for name, entry in listed.sensors.items() if entry in oriented}
@@ -133,10 +133,6 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
         "a cylindrical [frame]": framed and any(not set(CARTESIAN).isdisjoint(entry.axes) for entry in entries),
     }
     return next((what for what, there in needs.items() if there), None)
-
-
-def _manifest(path: Path) -> Path:
-    return path / "run.toml" if path.is_dir() else path
 
 
 class _Rows:

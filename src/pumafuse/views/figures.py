@@ -226,6 +226,8 @@ def lag_figures(found: Latency) -> Markup:
     )
     source, origin = run.sensors[summary.sensor], int(np.min(run.command.stamp[run.command.stamp != NO_STAMP]))
     axes = [axis for axis in summary.axes if axis in source.values and axis in run.axes]
+    of_reference = summary.sensor == "reference"
+    colour = colours.REFERENCE if of_reference else colours.sensor_colours([summary.sensor])[summary.sensor]
     with drawing(2, len(axes), width=12.0, height=2.6, ratios=[3.0, 1.4]) as canvas:
         for axis, motion, course in zip(axes, canvas.axes[::2], canvas.axes[1::2], strict=True):
             screen, one = SCREEN[run.kinds.get(axis, "length")], summary.axes[axis]
@@ -245,7 +247,7 @@ def lag_figures(found: Latency) -> Markup:
                 value * screen.scale,
                 ".",
                 ms=4,
-                color=_measured(summary.sensor),
+                color=colour,
                 label=summary.sensor,
             )
             motion.plot(seconds(fine, origin), moved * screen.scale, color=colours.ESTIMATE, lw=1.2, label="model")
@@ -263,10 +265,6 @@ def lag_figures(found: Latency) -> Markup:
             column.set_xlabel(_TIME)
         canvas.axes[0].legend(loc="best", ncols=3, frameon=False)
         return canvas.svg()
-
-
-def _measured(sensor: str) -> str:
-    return colours.REFERENCE if sensor == "reference" else colours.sensor_colours([sensor])[sensor]
 
 
 def _busiest(time: FloatArray, value: FloatArray, length: float) -> float:

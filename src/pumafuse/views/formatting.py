@@ -68,12 +68,12 @@ def level(found: Level) -> str:
     return f"{found.level}: {found.mean:.4g}{spread} ({found.trials})"
 
 
-def plant(found: PLANTS) -> str:
-    """A plant's parameters with their intervals."""
+def plant(found: PLANTS, first: str = "τ {} ms", second: str = "ω {} rad/s, ζ {}") -> str:
+    """A plant's parameters with their intervals, in the words for its order."""
     if isinstance(found, FirstOrder):
-        return f"τ {with_interval(found.time_constant, found.time_constant_ci95, MS)} ms"
+        return first.format(with_interval(found.time_constant, found.time_constant_ci95, MS))
     omega = with_interval(found.natural_frequency, found.natural_frequency_ci95)
-    return f"ω {omega} rad/s, ζ {with_interval(found.damping, found.damping_ci95)}"
+    return second.format(omega, with_interval(found.damping, found.damping_ci95))
 
 
 def gain(found: Gain) -> str:

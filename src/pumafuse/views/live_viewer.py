@@ -75,7 +75,8 @@ class Viewer:
             time.sleep(_PAUSE)
         if self._mode == "web" and not self._opened:
             data, page = self._awaited
-            _serve(self._web_port, self._data_port, page, data)
+            for server in (_page_server(self._web_port, self._data_port, page), _data_server(self._data_port, data)):
+                threading.Thread(target=server.serve_forever, daemon=True).start()
             self._report(f"Rerun: open http://{HOST}:{self._web_port}/?url={quote(_url(self._data_port), safe='')}")
         elif self._own is None or not self._opened:
             self._report(f"Rerun: drawing into the viewer at {self.url}")
@@ -145,12 +146,6 @@ def _listens(port: int) -> bool:
 
 
 # ---- what a browser reaches ------------------------------------------------------------------------------------------
-
-
-def _serve(web_port: int, port: int, page: int, data: int) -> None:
-    """Serve the page and its data in the background."""
-    for server in (_page_server(web_port, port, page), _data_server(port, data)):
-        threading.Thread(target=server.serve_forever, daemon=True).start()
 
 
 def _is_ours(host: str | None, port: int) -> bool:

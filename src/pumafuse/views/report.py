@@ -15,7 +15,7 @@ from ..identification.identify import Identification, OrderFit, TrialResult
 from ..identification.trials import StepTrials
 from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
-from ..model.plants import PLANTS, FirstOrder
+from ..model.plants import FirstOrder
 from ..tuning.latency import AxisLag, Latency, LatencySummary, SensorLag
 from ..tuning.parameters import rounded
 from ..units import KINDS, MS, SCREEN, Kind, Screen
@@ -28,6 +28,7 @@ _PHYSICS = 0.005  # s: a usual step of simulators
 _TEXT = frozenset({"axis", "coefficient", "factor", "level: mean ± sd (trials)", "verdict", "outlying trials"}) | {
     "plant", "trial", "flags", "run", "source", "axis,\nsensor",
 }  # fmt: skip
+_PLANT = "a time constant of {} ms", "a natural frequency of {} rad/s with damping {}"
 _SPEED: dict[Kind, str] = {"length": "m/s", "angle": "rad/s"}  # the s of a gain line: slopes are per that in arm.toml
 T = TypeVar("T")
 
@@ -140,23 +141,16 @@ def _verifications(verified: Sequence[AxisVerification], kind: Kind) -> TextTabl
 def verdict(one: AxisVerification) -> str:
     """How far off the model is on one axis, how late the arm is here, and what the best model would be."""
     best, screen = one.best_in_class, SCREEN[one.kind]
+    plant = formatting.plant(best.plant, *_PLANT)
     left_out = f"; {one.outlying} outlying measurements are left out" if one.outlying else ""
     return (
         f"{one.run}, {one.axis}: the model is off by {one.model.rms * screen.scale:.3f} {screen.unit} RMS,"
         f" {one.model.percent:.1f} % of the motion; the best model of its order would be off by"
         f" {best.fit.rms * screen.scale:.3f}: {one.verdict}; by the model the arm is {one.lag * MS:.1f} ms late,"
         f" here it is {formatting.with_interval(best.lag, best.lag_ci95, MS)} ms; the best model has a gain of"
-        f" {best.gain:.3f}, a dead time of {best.delay * MS:.1f} ms and {_plant_words(best.plant)}; the start level is"
+        f" {best.gain:.3f}, a dead time of {best.delay * MS:.1f} ms and {plant}; the start level is"
         f" {one.start * screen.scale:g} {screen.unit} ({one.start_from}){left_out}"
     )
-
-
-def _plant_words(plant: PLANTS) -> str:
-    if isinstance(plant, FirstOrder):
-        return f"a time constant of {formatting.with_interval(plant.time_constant, plant.time_constant_ci95, MS)} ms"
-    frequency = formatting.with_interval(plant.natural_frequency, plant.natural_frequency_ci95)
-    damping = formatting.with_interval(plant.damping, plant.damping_ci95)
-    return f"a natural frequency of {frequency} rad/s with damping {damping}"
 
 
 # ---- how late -------------------------------------------------------------------------------------------------------
@@ -166,7 +160,9 @@ def answers(found: LatencySummary) -> list[str]:
     """How late each axis and each sensor is, whether that changes, and what the motion was too poor for."""
     lines = [f"{axis} is {formatting.between(one.lag, one.lag_ci95, MS)} ms late." for axis, one in found.axes.items()]
     for name, one in found.sensors.items():
-        late = formatting.between(abs(one.latency), _turned(one.latency_ci95, one.latency), MS)
+        sign = -1.0 if one.latency < 0.0 else 1.0
+        low, high = sorted(sign * end for end in one.latency_ci95)
+        late = formatting.between(abs(one.latency), (low, high), MS)
         word = "later" if one.latency >= 0.0 else "earlier"
         same = one.latency_ci95[0] < 0.0 < one.latency_ci95[1]
         lines.append(
@@ -178,11 +174,6 @@ def answers(found: LatencySummary) -> list[str]:
         " as they are late, every axis is less late."
     )
     return [*lines, *_changes(found), *(f"{axis}: {note}" for axis, one in found.axes.items() for note in one.notes)]
-
-
-def _turned(interval: tuple[float, float], value: float) -> tuple[float, float]:
-    """The interval of the absolute value."""
-    return interval if value >= 0.0 else (-interval[1], -interval[0])
 
 
 def _changes(found: LatencySummary) -> list[str]:

@@ -126,7 +126,8 @@ def _send(est: Estimates, run: Run, sink: Sink) -> None:
         sink.band(f"residual/{name}/estimate", "estimate's sd", est.time, nothing, axis.position_sd, screen)
         for edge in (2.0, -2.0):
             path = f"innovation/{name}/{'upper' if edge > 0.0 else 'lower'}"
-            sink.series(path, styles.edge(f"{edge:+.0f}"), est.time[[0, -1]], np.full(2, edge))
+            line = styles.line(colours.BAND, f"{edge:+.0f}", width=0.7)
+            sink.series(path, line, est.time[[0, -1]], np.full(2, edge))
     for sensor in est.measurements.sensors:
         _outcomes(sink, est, sensor)
     send_scene(sink, est, run)

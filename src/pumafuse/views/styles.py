@@ -31,16 +31,6 @@ def line(colour: str, label: str, *, width: float = 1.5, step: bool = False) -> 
     return rr.SeriesLines(colors=[colours.rgb(colour)], widths=[width], names=label, interpolation_mode=mode)
 
 
-def edge(label: str) -> rr.SeriesLines:
-    """The upper or lower line of a band."""
-    return line(colours.BAND, label, width=0.7)
-
-
-def banded(label: str, unit: str) -> rr.Measurements:
-    """A line with a translucent band of a standard deviation each way."""
-    return rr.Measurements.from_fields(colors=[colours.rgb(colours.ESTIMATE)], widths=[1.8], names=label, units=unit)
-
-
 def points(colour: str, label: str, marker: Marker = "Circle") -> rr.SeriesPoints:
     """Points; crosses are larger."""
     size = 3.0 if marker == "Cross" else 1.2
@@ -84,9 +74,11 @@ class Sink:
         self._send(path, style, time[there], rr.Scalars.columns(scalars=value[there] * scale))
 
     def band(self, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, screen: Screen) -> None:
-        """Send values [SI] with their variances."""
+        """Send values [SI] with their variances: a line with a translucent band of a standard deviation each way."""
+        colour = colours.rgb(colours.ESTIMATE)
+        style = rr.Measurements.from_fields(colors=[colour], widths=[1.8], names=label, units=screen.unit)
         columns = rr.Measurements.columns(values=value * screen.scale, variances=(sd * screen.scale) ** 2)
-        self._send(path, banded(label, screen.unit), time, columns)
+        self._send(path, style, time, columns)
 
     def _send(self, path: str, style: Style, time: FloatArray, columns: rr.ComponentColumnList) -> None:
         """Send columns, with the first of them their style; nothing where there are none."""
