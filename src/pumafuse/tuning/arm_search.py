@@ -177,15 +177,8 @@ class ArmSearch:
     def lag_scatter(self, model: Model, arm: Arm) -> float:
         """How much more the lag scatters over pieces of the runs than the information says, 1 or more (White, 1982)."""
         names = self.freedom.names(model)
-        free = [name for name, one in zip(names, self.limits.inside(arm, names), strict=True) if one]
-        slope = np.array(
-            [(arm.moved([name], [arm.coordinate(name) + _SLOPE]).total - arm.total) / _SLOPE for name in free]
-        )
-        if not slope.any():
-            return 1.0
-        information, scatter = self._measured.scattered(arm, free, self.rest, self.limits, _PIECES)
-        cov = covariance(information)
-        return max(1.0, math.sqrt(float(slope @ cov @ scatter @ cov @ slope) / float(slope @ cov @ slope)))
+        variances = self._measured.lag_variances(arm, names, self.rest, self.limits, _PIECES, lambda one: one.total)
+        return max(1.0, math.sqrt(variances[1] / variances[0])) if variances[0] > 0.0 else 1.0
 
     def _bent(self, freedom: Freedom) -> Bent | None:
         if self.plain is None or not {"delay", "lag"} <= set(freedom.free):
@@ -277,8 +270,7 @@ class ArmSearch:
         if len(tried) <= count:
             return tried
         varied = "gain" in self.freedom.names(model)
-        log, gain = self._measured.weighed(tried, self.rest, self.limits if varied else None)
-        return [tried[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:count].tolist()]
+        return self._measured.likeliest(tried, self.rest, self.limits if varied else None, count)
 
     def _shapes(self, model: Model, arm: Arm) -> Iterator[Arm]:
         """Arms of a model that are as late as another one."""

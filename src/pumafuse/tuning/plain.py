@@ -117,8 +117,7 @@ def plain_arm(measured: Measured) -> PlainArm | None:
         return None
     most = 0.5 * (power * _CHANCE / number + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
-    commands = [Arm(delay, float(LAGS[0])) for delay in late]
-    delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
+    (delayed,) = measured.likeliest([Arm(delay, float(LAGS[0])) for delay in late], rest, None, 1)
     between = float(min(allowed)), float(max(allowed))
     step = None
     if len(whole.recordings) == 1:  # of several nothing is told
