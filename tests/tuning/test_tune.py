@@ -18,7 +18,7 @@ import pytest
 import pumafuse as pf
 from pumafuse.logs.run import Source
 from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.parameters import Fit, with_order
+from pumafuse.tuning.parameters import Fit
 from pumafuse.tuning.summary import TuningSummary
 from pumafuse.tuning.tune import Pipeline, plans
 from pumafuse.tuning.validation import check
@@ -31,6 +31,7 @@ from tuning_runs import (
     replaced,
     spoiled,
     spoiled_arm,
+    with_order,
     with_outliers,
     with_sensors,
 )
@@ -46,7 +47,7 @@ def tuned() -> pf.Tuning:
 
 
 def total(run: pf.Run, config: pf.FusionConfig) -> float:
-    return Likelihood([run], config).evaluate(config).total
+    return Likelihood([run], config).evaluate(config).log_likelihood
 
 
 # ---- the result -----------------------------------------------------------------------------------------------------

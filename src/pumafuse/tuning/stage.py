@@ -23,8 +23,8 @@ from .identifiability import (
     not_identifiable_noise,
     shared_times,
 )
-from .likelihood import Likelihood
-from .maximise import Notify, Point, ignore, maximise_with_gates
+from .likelihood import Likelihood, Point
+from .maximise import Notify, ignore, maximise_with_gates
 from .parameters import (
     LATENCIES,
     Fit,
@@ -37,7 +37,7 @@ from .parameters import (
     with_gates,
     with_own_delays,
 )
-from .search import FreeOf, arm_searches, search
+from .search import FreeOf, Search, arm_searches
 
 _GATE = 5.0  # of the fit for a sensor with a narrow one:
 _NARROWEST = 3.0  # below it rejecting good measurements would pay, the more the smaller the noise
@@ -104,7 +104,7 @@ def run_stage(
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]
         every = parameters(at, config, likelihood.sensors, plan.fit, names, likelihood.resolution, believed)
-        return for_few(likelihood, [one for one in every if _may_vary(one, at, plan, excited)])[0]
+        return for_few(likelihood, [one for one in every if _may_vary(one, at, plan, excited)])
 
     start, notes = likelihood.config, list[str]()
     own = with_own_delays(start, excited)
@@ -123,7 +123,7 @@ def run_stage(
     if plan.sd_prior:
         believed |= likelihood.scatter
         believed |= {(name, axis): noise for axis, one in arms.items() for name, noise in one.likely_noise.items()}
-    best, orders = search(likelihood, start, free, arms, notify, plan.one_delay)
+    best, orders = Search(likelihood, free, arms, notify).found(start, plan.one_delay)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
@@ -141,7 +141,7 @@ def run_stage(
         for name, sensor in config.sensors.items()
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
-    notes += few_measurements(likelihood, free(best.config)) + for_few(likelihood, [])[1]
+    notes += few_measurements(likelihood, free(best.config))
     return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched)
 
 
@@ -220,8 +220,8 @@ def with_large_biases(
     """
     gaps: dict[tuple[str, Kind], float] = {}
     misfit = likelihood.misfit(config)
-    for (name, axis), (expected, measured) in likelihood.responses(config, centred=False).items():
-        gap = abs(float(np.median(measured - expected)))
+    for (name, axis), apart in likelihood.apart(config).items():
+        gap = abs(float(np.median(np.concatenate(apart))))
         scatter = likelihood.scatter.get((name, axis), 0.0)
         if gap > _FAR * (scatter + misfit[axis] + config.start.offset_sd_of(axis)):
             of = name, config.arm.axes[axis].kind
@@ -250,9 +250,9 @@ def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str])
         for kind in config.arm.kinds:
             if not _may_be_biased(config, name, kind, fixed):
                 continue
-            before = likelihood.evaluate(config).total
+            before = likelihood.evaluate(config).log_likelihood
             biased = [_with_bias(config, name, kind, width) for width in _BIAS_WIDTHS]
-            gains = [likelihood.evaluate(one).total - before for one in biased]
+            gains = [likelihood.evaluate(one).log_likelihood - before for one in biased]
             best_width = int(np.argmax(gains))
             if gains[best_width] > _BIAS_GAIN:
                 config = biased[best_width]

@@ -22,8 +22,7 @@ from ..units import MS
 from .arm_search import ArmSearch
 from .identifiability import FEWEST, TuneError, correlations, excited_axes, least_count
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
-from .likelihood import Likelihood, LogLikelihood
-from .maximise import Point
+from .likelihood import Likelihood, Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
 from .plain import LONGEST, Doubt, doubts, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, refitted, run_stage
@@ -37,7 +36,6 @@ from .summary import (
     found_biases,
     open_interval,
     text,
-    with_doubts,
 )
 from .validation import Check, check
 
@@ -179,7 +177,7 @@ def tune(
     result, arms = pipeline.result(), {axis: one for stage in stages for axis, one in stage.arms.items()}
     lost = [axis for axis, one in arms.items() if one.plain is None or result.arm.lag_of(axis) > LONGEST]
     untold = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]  # nobody measures these
-    lags = with_doubts(fitted_lags(free, config, result, around, untold), found, config, result, untold)
+    lags = fitted_lags(free, config, result, around, found, untold)
     tuned = _with_provenance(result, free, known, {} if interrupted else lags, names)
     doubted += [f"{axis}: {one.plain.step}" for axis, one in arms.items() if one.plain and one.plain.step]
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
@@ -323,7 +321,7 @@ class Pipeline:
     @property
     def log_likelihood(self) -> float:
         """Of the best configuration."""
-        return _evaluated(self.whole, self.best).total
+        return _evaluated(self.whole, self.best).log_likelihood
 
     def arms_but(self, axes: Collection[str]) -> list[dict[str, ArmSearch]]:
         """The arms that each stage searched for, but for those of some axes."""
@@ -343,7 +341,7 @@ class Pipeline:
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
-        before, after = (_evaluated(self.whole, config).total for config in (self.config, self.result()))
+        before, after = (_evaluated(self.whole, config).log_likelihood for config in (self.config, self.result()))
         if after < before - _NOTHING:
             self.best, self.stages = self.config, []
             self.notes.append("nothing more likely was found than the configuration as given, which is kept")
@@ -355,7 +353,8 @@ class Pipeline:
         """
         found, exact = self._written(self.best, rounded), self._written(self.best, float)
         lost = (
-            _evaluated(one.likelihood, exact).total - _evaluated(one.likelihood, found).total for one in self.stages
+            _evaluated(one.likelihood, exact).log_likelihood - _evaluated(one.likelihood, found).log_likelihood
+            for one in self.stages
         )
         return exact if any(one > _NOTHING for one in lost) else found
 
@@ -368,7 +367,7 @@ class Pipeline:
         return best
 
 
-def _evaluated(likelihood: Likelihood, config: FusionConfig) -> LogLikelihood:
+def _evaluated(likelihood: Likelihood, config: FusionConfig) -> Point:
     """The log-likelihood of a configuration under the gates that the likelihood was made with."""
     return likelihood.evaluate(with_gates(config, likelihood.config))
 
