@@ -18,8 +18,9 @@ from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.arms import Arm, Measured, Recording
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.plain import Doubt, PlainArm, doubts, off, plain_arm, with_plain_arm
+from pumafuse.tuning.stage import Plan
 from pumafuse.tuning.summary import fitted_lags
-from pumafuse.tuning.tune import Pipeline, plans
+from pumafuse.tuning.tune import Pipeline
 from tuning_runs import free_of, quietly, replaced, scenario
 
 DEAD_BAND = Path(__file__).parent / "data" / "dead-band.csv"
@@ -193,7 +194,7 @@ def test_an_arm_by_which_a_filter_predicts_better_is_to_take_the_place_of_the_li
     axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.11))
     arm = pf.ArmModel(name="servo", update_period=0.1, delay=0.18, axes={"j": axis})
     config = pf.FusionConfig(arm=arm, sensors={"encoder": pf.Sensor(sd=2e-4)})
-    pipeline = Pipeline([run], config, plans(config, ["noise", "delay", "plant"], [], None), lambda _, __: None)
+    pipeline = Pipeline([run], config, [Plan(["noise", "delay", "plant"], [])], lambda _, __: None)
     quietly(pipeline.fit)
     assert not any(one.refutes or one.sentence(pipeline.result(), "j") for one in pipeline.doubts().values())
     early = replaced(arm, delay=0.05, axes={"j": replaced(axis, plant=pf.FirstOrder(time_constant=0.1))})
@@ -208,10 +209,10 @@ def test_an_arm_that_takes_the_place_of_another_is_kept_and_others_are_not_searc
     """Of two axes one is held at the arm of least squares: that stays, the other one's is the one that was found."""
     simulated = pf.simulate(scenario("panel-vision", 0.25, 0.02), 2)
     config, kinds = simulated.config, ("noise", "delay", "plant")
-    first = Pipeline([simulated.run], config, plans(config, kinds, [], None), lambda _, __: None)
+    first = Pipeline([simulated.run], config, [Plan(kinds, [])], lambda _, __: None)
     quietly(first.fit)
     held = with_plain_arm(config, "tangential", Arm(0.031, 0.042))
-    again = plans(held, kinds, ["axes.tangential"], None)
+    again = [Plan(kinds, ["axes.tangential"])]
     second = Pipeline([simulated.run], held, again, lambda _, __: None, first.arms_but(["tangential"]))
     quietly(second.fit)
     replaced_arm = second.result().arm

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Literal, TypeAlias, cast
 
@@ -133,7 +133,8 @@ def tune(
     kinds, fixed = kinds_of(fit), list(fix)
     _check(runs, config, kinds, fixed, share)
     config = with_tool(config, runs[0])
-    pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior, "delay" in share), progress)
+    plan = Plan(kinds, fixed, sd_prior=sd_prior, one_delay="delay" in share)
+    pipeline = Pipeline(runs, config, plans(config, plan, trust), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     found: dict[str, Doubt] = {}
     doubted: list[str] = []
@@ -151,11 +152,10 @@ def tune(
         sentences = {axis: one.sentence(pipeline.result(), axis) for axis, one in found.items()}
         doubted = [f"{axis}: {sentence}" for axis, sentence in sentences.items() if sentence]
         if refuted := [axis for axis, one in found.items() if one.refutes]:
-            held, start = [*fixed, *(f"axes.{axis}" for axis in refuted)], config
+            held, start = replace(plan, fixed=[*fixed, *(f"axes.{axis}" for axis in refuted)]), config
             for axis in refuted:
                 start = with_plain_arm(start, axis, found[axis].plain.arm)
-            again = plans(start, kinds, held, trust, sd_prior, "delay" in share)
-            pipeline = Pipeline(runs, start, again, progress, pipeline.arms_but(refuted))
+            pipeline = Pipeline(runs, start, plans(start, held, trust), progress, pipeline.arms_but(refuted))
             pipeline.fit()
         if validate is not None:
             validation = check(validate, config, pipeline.result())
@@ -239,28 +239,18 @@ def _check(
             raise ConfigError("--share delay: delays are not fitted; add delay to --fit")
 
 
-def plans(
-    config: FusionConfig,
-    kinds: Sequence[Fit],
-    fixed: Sequence[str],
-    trust: str | None,
-    sd_prior: bool = True,
-    one_delay: bool = False,
-) -> list[Plan]:
+def plans(config: FusionConfig, whole: Plan, trust: str | None) -> list[Plan]:
     """One plan for all sensors; with a trusted sensor one for it, then one for the others' noise, latency and scale.
 
     Raises:
         UnknownNameError: The trusted sensor is not configured.
     """
     if trust is None:
-        return [Plan(kinds, fixed, sd_prior=sd_prior, one_delay=one_delay)]
+        return [whole]
     config.sensor_names([trust])
-    arm: list[Fit] = [kind for kind in kinds if kind not in ("latency", "scale", "bias")]
-    others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency", "scale", "bias")]
-    return [
-        Plan(arm, fixed, [trust], sd_prior=sd_prior, one_delay=one_delay),
-        Plan(others, fixed, trusted=trust, sd_prior=sd_prior),
-    ]
+    arm: list[Fit] = [kind for kind in whole.fit if kind not in ("latency", "scale", "bias")]
+    others: list[Fit] = [kind for kind in whole.fit if kind in ("noise", "latency", "scale", "bias")]
+    return [replace(whole, fit=arm, sensors=[trust]), replace(whole, fit=others, trusted=trust, one_delay=False)]
 
 
 class Pipeline:
