@@ -124,14 +124,7 @@ class ArmSearch:
         least: Sequence[float],
         believed: bool = False,
     ) -> None:
-        """Search.
-
-        Args:
-            measured: The measurements of the axis.
-            freedom: What is to be found.
-            least: The least noise of each sensor [m].
-            believed: Whether the sensors' noise is believed to be what second differences show.
-        """
+        """``least``: noise of each sensor [m]; ``believed``: to be what second differences show."""
         self._measured, self.sensors = measured.liveliest(_ENOUGH), measured.sensors
         self._longest = longest_delay(measured.period)
         self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
@@ -404,6 +397,7 @@ class Chosen(NamedTuple):
     model: Model  # of which order and kind of gain it is
     mixture: Mixture  # all that the axis may be, with what others say of a dead time that it shares
     shares: bool  # whether it shares that
+    worth: float | None  # log-likelihood that a dead time of its own gains it; None where that is not asked
 
 
 def chosen_arms(
@@ -411,10 +405,7 @@ def chosen_arms(
 ) -> tuple[dict[str, Chosen], float | None]:
     """The likeliest arm of each axis, and the dead time that some of them share [s]; None: they do not.
 
-    Args:
-        searched: By axis.
-        delayed: The axes whose dead time is free.
-        one_delay: Whether these share one whatever the measurements say.
+    That of ``delayed`` axes is free; with ``one_delay`` they share one whatever the measurements say.
     """
     known = {axis: one.posterior for axis, one in searched.items() if axis in delayed}
     shares = list(known) if one_delay else sharing(known)
@@ -425,7 +416,7 @@ def chosen_arms(
         others = [known[one] for one in shares if mine and one != axis]
         model = chosen_model(posterior.mixture(others))
         likely = posterior.mixture(others, 1.0 / (1.0 + math.exp(worth[axis])) if mine and worth else 1.0)
-        found[axis] = Chosen(search.arm(model, delay if mine else None), model, likely, mine)
+        found[axis] = Chosen(search.arm(model, delay if mine else None), model, likely, mine, worth.get(axis))
     return found, delay
 
 

@@ -447,7 +447,7 @@ def _notes(one: AxisLag, gains: tuple[float, float]) -> list[str]:
 
 
 def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> AxisLag:
-    arm, model, mixture, shared = chosen
+    arm, model, mixture, shared, _ = chosen
 
     def interval(quantity: Quantity, value: float, margin: float = _MARGIN) -> Interval:
         """Of the models like the chosen one; of a logarithm in the number itself."""

@@ -32,7 +32,7 @@ from .parameters import (
     with_rest,
     with_shared_delay,
 )
-from .posterior import GAINS, GainKind, Mixture, Model, own_worth
+from .posterior import GAINS, GainKind, Mixture, Model
 
 _ROUGHLY = 0.1  # tolerance in log-likelihood where maxima are only compared
 _STEP = 0.010  # s, between latencies that are tried: their maxima are as wide
@@ -104,18 +104,17 @@ class Search:
     def _with_arms(self, config: FusionConfig, one_delay: bool) -> FusionConfig:
         """The configuration with the likeliest arm of each axis; one delay for those that share it."""
         searched = {axis: one for axis, one in self.arms.items() if one.freedom.free}
-        delayed = {axis: one.posterior for axis, one in searched.items() if "delay" in one.freedom.free}
+        delayed = [axis for axis, one in searched.items() if "delay" in one.freedom.free]
         found, delay = chosen_arms(searched, delayed, one_delay)
-        shares = [axis for axis, one in found.items() if one.shares]
-        worth = {} if one_delay else own_worth(delayed, shares)
         for axis, one in found.items():
             config, why = with_arm(config, axis, one.arm), self.reasons[axis]
             why += _why(searched[axis].freedom, one.mixture, one.model)
             if (bent := searched[axis].bent) is not None:
                 why += bent.sentences(config.arm.screen_of(axis))
             if len(delayed) > 1 and axis in delayed:
-                gain = f" (own {worth[axis]:+.1f})" if axis in worth else ""
+                gain = "" if one.worth is None else f" (own {one.worth:+.1f})"
                 why.append(f"delay: {'shared' if one.shares else 'its own'}{gain}")
+        shares = [axis for axis, one in found.items() if one.shares]
         return config if delay is None else with_shared_delay(config, shares, delay)
 
     def _nearest_latency(self, config: FusionConfig, one: Parameter) -> FusionConfig:
@@ -290,12 +289,7 @@ def arm_searches(
 ) -> dict[str, ArmSearch]:
     """The arm of each axis as far as it is free, and what it leaves, by sensors whose latency is known and steady.
 
-    Args:
-        likelihood: The likelihood.
-        config: The configuration as given.
-        free: The parameters to vary.
-        believed: Whether the sensors' noise is believed to be what second differences show.
-        known: Those that were searched for already.
+    ``believed``: the sensors' noise, to be what second differences show; ``known``: arms that were searched for before.
     """
     late = {one.sensor for one in free(config) if one.fit == "latency"}
     late |= {name for name, sensor in config.sensors.items() if sensor.latency_sd}
