@@ -547,17 +547,10 @@ class _Linear(NamedTuple):
 def rests(
     measured: Measured, arm: Arm, quickest: float, least: Sequence[float], believed: bool = False
 ) -> Iterator[tuple[Rest, float]]:
-    """The most likely rest that an arm leaves, without a disturbance and with one of each kind.
+    """The most likely rest that an arm leaves, without a disturbance and with one of each kind, and its log-posterior.
 
-    Args:
-        measured: The measurements.
-        arm: The arm.
-        quickest: The shortest time of a disturbance that is believed [s].
-        least: The least noise of each sensor [m].
-        believed: Whether the sensors' noise is believed to be what second differences show.
-
-    Yields:
-        Each with its log-posterior.
+    A disturbance is not quicker than ``quickest`` [s], the noise of each sensor is at ``least`` that [m], and it may be
+    ``believed`` to be what second differences show.
     """
     from scipy.optimize import minimize  # takes 0.2 s to import
 

@@ -189,14 +189,8 @@ def shared_times(
 ) -> list[NotIdentifiable]:
     """The latencies to fix where delays are free too: all latencies less and all delays more by as much is the same.
 
-    One of each group of sensors and moving axes that are connected by measurements, unless a delay or a latency among
-    them is known; and that of each sensor which measures no axis that moves.
-
-    Args:
-        sensors: For each axis its sensors.
-        axes: Those that move.
-        free: The free parameters.
-        config: The latency of its most accurate sensor is fixed.
+    One of each group of sensors and moving ``axes`` that are connected by measurements, that of the most accurate,
+    unless a delay or a latency among them is known; and that of each sensor which measures no axis that moves.
     """
     delays = {one.axis: one for one in free if one.fit == "delay"}
     latencies = {one.sensor: one for one in free if one.fit == "latency"}

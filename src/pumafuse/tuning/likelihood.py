@@ -133,18 +133,11 @@ class Likelihood:
         until: float | None = None,
         latest: float | None = None,
     ) -> None:
-        """Prepare the measurements of runs.
+        """Prepare the measurements of runs by some ``sensors``, or all.
 
-        Args:
-            runs: Recorded runs.
-            config: Arm and sensors.
-            sensors: Which to use; all for None.
-            until: Leave out measurements valid later than this after the first command [s].
-            latest: Leave out measurements that would lie before the first command with this latency [s]; None: each
-                with its own.
-
-        Raises:
-            PumafuseError: A run and the configuration do not fit together.
+        Without those that are valid later than ``until`` after the first command [s], and those that would lie before
+        it with the ``latest`` latency [s], or their own. Raises a PumafuseError where a run does not fit the
+        configuration.
         """
         chosen = config.sensor_names(sensors)
         named = [(run.name, part) for run in runs for part in segments(in_base(run, config)[0])[0]]
@@ -273,15 +266,9 @@ class Likelihood:
         The filter is linear in the measurements: what a lag that is longer in one part alone adds to the innovations
         is the difference of two runs of it, and the shifts are least squares on those.
 
-        Args:
-            axis: The axis.
-            config: The configuration.
-            count: How many parts.
-            free: What was fitted to the same measurements, which may have explained a part of the shifts.
-
-        Returns:
-            The middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,),
-            (n,) and (n, n); None where there are too few measurements.
+        What is ``free`` was fitted to the same measurements, and may have explained a part of the shifts. Returns the
+        middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,), (n,) and
+        (n, n); None where there are too few measurements.
         """
         part = max(self._of(axis), key=lambda one: len(one.rows), default=None)
         if part is None or len(part.rows) < 3 * count:
@@ -343,12 +330,7 @@ class Likelihood:
         return [axis for number, axis in enumerate(self.axes) if number in mine]
 
     def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> Point:
-        """The log-likelihood of the measurements under a configuration, without priors.
-
-        Args:
-            config: The configuration.
-            outcomes: The outcome of each component, to be repeated; None: the configuration's gates decide.
-        """
+        """The log-likelihood of the measurements, without priors; for ``outcomes`` of None the gates decide on them."""
         axes, results, densities = np.zeros(len(self.axes)), list[Results](), list[FloatArray]()
         for number, segment in enumerate(self._segments):
             found = innovations(segment, config, None if outcomes is None else outcomes[number])

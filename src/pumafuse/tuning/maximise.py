@@ -74,16 +74,10 @@ def maximise(
     tolerance: float = _TOLERANCE,
     worth: float = -np.inf,
 ) -> Point:
-    """Find the nearest maximum of the log-posterior.
+    """Find the nearest maximum of the log-posterior; for ``outcomes`` of None the gates decide on them.
 
-    Args:
-        likelihood: The likelihood.
-        start: Where to start.
-        free: The parameters to vary.
-        notify: Called with each better point.
-        outcomes: The outcome of each component, to be repeated; None: the gates decide.
-        tolerance: Gain in log-likelihood that is not worth another step.
-        worth: The log-posterior below which a maximum is not wanted: where it is out of reach, the search ends early.
+    A gain in log-likelihood of less than the ``tolerance`` is not worth another step, and a maximum below ``worth`` is
+    not wanted: where that is out of reach, the search ends early.
     """
     best, small = point(likelihood, start, free, outcomes), 0
     ascent = _Ascent(likelihood, free, outcomes, tolerance)

@@ -127,12 +127,9 @@ def plain_arm(measured: Measured) -> PlainArm | None:
 
 
 def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
-    """Where another lag in the second part of a run leaves much less than one for all of it; None where none does.
+    """Where another lag in the second part of a run, or of parts of one, leaves much less than an arm for all of it.
 
-    Args:
-        measured: One recording, or parts of one.
-        arm: Of all of it, or near that.
-        begin: When the first command was given [ns].
+    None where none does. The ``arm`` is near that; the first command was given at ``begin`` [ns].
     """
     rest = measured.white(arm)
     arm = measured.fitted(arm, ["delay", "gain"], rest, _ANY).arm

@@ -87,15 +87,7 @@ def run_stage(
 ) -> Stage:
     """Fit the parameters of a plan; where a combination is not identifiable, fix one of it and go on.
 
-    Args:
-        runs: The runs to fit on.
-        config: The configuration before.
-        plan: What to fit.
-        notify: Called with each better point.
-        known: The arms of axes that were searched for already.
-
-    Raises:
-        PumafuseError: Nothing can be fitted to the measurements.
+    ``known``: the arms of axes that were searched for already. Raises a PumafuseError where nothing can be fitted.
     """
     likelihood = likelihood_of(runs, config, plan)
     excited, fixed = excited_axes(likelihood, config), list[NotIdentifiable]()
@@ -213,11 +205,7 @@ def _identified(
 def with_large_biases(
     likelihood: Likelihood, config: FusionConfig, fixed: Sequence[str]
 ) -> tuple[FusionConfig, list[str]]:
-    """The configuration with a bias for each sensor that is so far off that nothing could be fitted to it.
-
-    Returns:
-        The configuration, and a note for each such sensor.
-    """
+    """With a bias for each sensor that is so far off that nothing could be fitted to it, and a note for each."""
     gaps: dict[tuple[str, Kind], float] = {}
     misfit = likelihood.misfit(config)
     for (name, axis), apart in likelihood.apart(config).items():
@@ -238,11 +226,7 @@ def with_large_biases(
 
 
 def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str]) -> tuple[FusionConfig, list[str]]:
-    """The configuration with a bias for each sensor that contradicts a more accurate one by a constant.
-
-    Returns:
-        The configuration, and a note for each such sensor.
-    """
+    """With a bias for each sensor that contradicts a more accurate one by a constant, and a note for each."""
     config, notes = best.config, list[str]()
     used = {name for names in likelihood.sensors.values() for name in names}
     ranked = sorted((name for name in config.sensors if name in used), key=lambda name: smallest_sd(config, name))

@@ -140,15 +140,10 @@ def fitted_lags(
     doubts: Mapping[str, Doubt] = MappingProxyType({}),
     lost: Collection[str] = (),
 ) -> dict[str, FittedLag]:
-    """The lag of each axis that the free parameters change, or whose arm is doubted.
+    """The lag of each axis that the free parameters change, or whose arm is doubted, but for those that are ``lost``.
 
-    Args:
-        free: The parameters that were fitted.
-        before: The configuration as given.
-        after: The tuned one.
-        around: From :func:`lag_intervals`; an axis that is not in it gets no interval.
-        doubts: What least squares say of an arm: its interval covers that, too, or is that where the arm is theirs.
-        lost: Axes of which no lag is told.
+    Intervals are ``around`` it, from :func:`lag_intervals`; where least squares doubt the arm they cover what these
+    say, and where the arm is theirs they are that.
     """
     found, slopes = dict[str, FittedLag](), lag_slopes(free, after)
     for axis in (one for one in dict.fromkeys([*slopes, *doubts]) if one not in lost):
