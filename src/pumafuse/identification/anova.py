@@ -109,9 +109,10 @@ def ordered(levels: set[str]) -> list[str]:
 
 def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
     """Mean and scatter of (n,) values at each level named in ``cells`` (n,)."""
-    groups = _groups(values, cells).items()
-    sds = {level: float(group.std(ddof=1)) if len(group) > 1 else None for level, group in groups}
-    return [Level(level=level, trials=len(one), mean=float(one.mean()), sd=sds[level]) for level, one in groups]
+    return [
+        Level(level=level, trials=len(one), mean=float(one.mean()), sd=float(one.std(ddof=1)) if len(one) > 1 else None)
+        for level, one in _groups(values, cells).items()
+    ]
 
 
 def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:
