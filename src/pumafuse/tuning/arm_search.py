@@ -104,18 +104,9 @@ class Freedom(NamedTuple):
 
 
 class ArmSearch:
-    """The arms of an axis: maxima of each model, and the walk from one along the dead time.
+    """The arms of an axis: maxima of each model, and the walk from one along the dead time."""
 
-    Attributes:
-        freedom: What was to be found.
-        sensors: By which it is known.
-        plain: The linear arm of least squares; None where nothing moves.
-        bent: Their arm with what it has of play, a fastest speed and a sag; None for a linear axis.
-        limits: Where its numbers may lie.
-        rest: What the best arm leaves.
-        rests: Likewise, without a disturbance, with a smooth one and with a rough one.
-        posterior: All models that count, along their dead times.
-    """
+    rests: Sequence[Rest]  # what the best arm leaves, without a disturbance, with a smooth one and with a rough one
 
     def __init__(
         self,
@@ -128,7 +119,7 @@ class ArmSearch:
         self._measured, self.sensors = measured.liveliest(_ENOUGH), measured.sensors
         self._longest = longest_delay(measured.period)
         self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
-        self.bent = self._bent(freedom)
+        self.bent = self._bent(freedom)  # their arm with what it has of play, a fastest speed and a sag
         self.freedom = freedom.bent(self.bent)
         self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
         self._fits = self._by_least_squares()
@@ -145,7 +136,7 @@ class ArmSearch:
             ):
                 highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
                 branches.append(self._walk(model, peak, highest - _FORLORN))
-        self.posterior = AxisPosterior(branches)
+        self.posterior = AxisPosterior(branches)  # of all models that count, along their dead times
 
     @property
     def likely_noise(self) -> dict[str, float]:

@@ -59,15 +59,12 @@ FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
 
 
 class Search:
-    """The search for the most likely configuration of a likelihood with some free parameters.
-
-    Attributes:
-        reasons: For each axis, for the order of its plant, its gain, its disturbance and whether it shares a delay.
-    """
+    """The search for the most likely configuration of a likelihood with some free parameters."""
 
     def __init__(self, likelihood: Likelihood, free: FreeOf, arms: Mapping[str, ArmSearch], notify: Notify) -> None:
         """Of ``arms`` that were looked for; what is ``free`` depends on the order of the plants."""
         self.likelihood, self.free, self.arms, self.notify = likelihood, free, arms, notify
+        # for the order of the plant of an axis, its gain, its disturbance and whether it shares a delay
         self.reasons: dict[str, list[str]] = {axis: [] for axis in likelihood.sensors}
 
     def found(self, config: FusionConfig, one_delay: bool) -> tuple[Point, dict[str, str]]:

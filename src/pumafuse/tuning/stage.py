@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 
-from ..fusion.config import FusionConfig, Sensor
+from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..logs.run import Run
 from ..units import SCREEN, Kind, as_length, of_kind
@@ -148,15 +147,13 @@ def refitted(stage: Stage, runs: Sequence[Run], config: FusionConfig, plan: Plan
 
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:
     """The likelihood of the runs; where latencies vary, without what one could put before the first command."""
-
-    def gate_of(sensor: Sensor) -> float:
-        return _GATE if 0.0 < sensor.gate < _NARROWEST else min(sensor.gate, _WIDEST)
-
-    sensors = {name: msgspec.structs.replace(one, gate=gate_of(one)) for name, one in config.sensors.items()}
     latest = None
     if "latency" in plan.fit:
         latest = LATENCIES[1] + max((sensor.latency for sensor in config.sensors.values()), default=0.0)
-    return Likelihood(runs, msgspec.structs.replace(config, sensors=sensors), plan.sensors, until=until, latest=latest)
+    for name, sensor in config.sensors.items():
+        gate = _GATE if 0.0 < sensor.gate < _NARROWEST else min(sensor.gate, _WIDEST)
+        config = changed(config, ("sensors", name, "gate"), gate)
+    return Likelihood(runs, config, plan.sensors, until=until, latest=latest)
 
 
 def _may_vary(one: Parameter, config: FusionConfig, plan: Plan, excited: Sequence[str]) -> bool:

@@ -254,14 +254,7 @@ def plans(config: FusionConfig, whole: Plan, trust: str | None) -> list[Plan]:
 
 
 class Pipeline:
-    """Stages one after the other, each from where the last one ended; the best is there at any moment.
-
-    Attributes:
-        whole: The likelihood of all measurements.
-        best: The best configuration so far, with the gates of the search and all digits.
-        stages: The stages that are complete; none where the configuration as given is the result.
-        notes: What was noticed, a sentence each.
-    """
+    """Stages one after the other, each from where the last one ended; the best is there at any moment."""
 
     def __init__(
         self,
@@ -274,9 +267,9 @@ class Pipeline:
         """``known``: of each stage, the arms of axes that were searched for already."""
         self.runs, self.config, self.plans, self.progress = runs, config, plans, progress
         self._known = known or [{} for _ in plans]
-        self.whole = likelihood_of(runs, config, plans[-1])
-        self.best = config
-        self.stages: list[Stage] = []
+        self.whole = likelihood_of(runs, config, plans[-1])  # of all measurements
+        self.best = config  # so far, with the gates of the search and all digits
+        self.stages: list[Stage] = []  # that are complete; none where the configuration as given is the result
         self.notes: list[str] = []
 
     def fit(self) -> None:
