@@ -14,7 +14,7 @@ import pumafuse as pf
 from pumafuse.simulation.true_sensor import Outliers
 from pumafuse.tuning.intervals import ConfidenceInterval, confidence_intervals
 from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.parameters import Fit, Parameter, parameters
+from pumafuse.tuning.parameters import Fit, Parameter, changed, parameters
 from pumafuse.tuning.stage import Plan, Stage, run_stage
 from pumafuse.tuning.summary import Fitted
 
@@ -51,6 +51,16 @@ def with_sensors(config: pf.FusionConfig, *names: str, **changes: object) -> pf.
     chosen = names or tuple(config.sensors)
     each = {name: replaced(one, **changes) if name in chosen else one for name, one in config.sensors.items()}
     return replaced(config, sensors=each)
+
+
+def with_order(config: pf.FusionConfig, axis: str, order: int) -> pf.FusionConfig:
+    """The configuration with an axis's plant of this order and of the same lag."""
+    plant = config.arm.axes[axis].plant
+    if (1 if isinstance(plant, pf.FirstOrder) else 2) == order:
+        return config
+    lag = plant.lag
+    plant = pf.FirstOrder(time_constant=lag) if order == 1 else pf.SecondOrder(natural_frequency=2.0 / lag, damping=1.0)
+    return changed(config, ("arm", "axes", axis, "plant"), plant)
 
 
 def with_process(config: pf.FusionConfig, **changes: float) -> pf.FusionConfig:

@@ -63,7 +63,9 @@ def test_the_folder_holds_the_result(
     assert msgspec.json.decode(done.stdout, type=TuningSummary) == wanted.details
     found = pf.FusionConfig.load(out / "fusion.toml")
     likelihood = Likelihood([run], found)
-    assert likelihood.evaluate(found).total == pytest.approx(likelihood.evaluate(wanted.config).total, abs=1e-6)
+    assert likelihood.evaluate(found).log_likelihood == pytest.approx(
+        likelihood.evaluate(wanted.config).log_likelihood, abs=1e-6
+    )
 
 
 def test_worse_on_the_validation_run_is_code_3(place: Path, given: tuple[Path, Path]) -> None:
@@ -160,5 +162,5 @@ def test_ctrl_c_keeps_the_best_so_far(tmp_path: Path) -> None:
     summary = msgspec.json.decode((out / "tuning.json").read_bytes(), type=TuningSummary)
     assert summary.interrupted
     found, likelihood = pf.FusionConfig.load(out / "fusion.toml"), Likelihood([sim.run], known)
-    assert likelihood.evaluate(found).total > likelihood.evaluate(known).total
+    assert likelihood.evaluate(found).log_likelihood > likelihood.evaluate(known).log_likelihood
     assert f"written to {out}" in output

@@ -190,7 +190,9 @@ def test_a_shared_parameter_has_the_profile_of_all_measurements() -> None:
     def highest(value: float) -> float:
         fixed = latency.put(best, value)
         cost = minimize(
-            lambda at: -likelihood.evaluate(moved(fixed, noise, at), outcomes).total, start, method="Nelder-Mead"
+            lambda at: -likelihood.evaluate(moved(fixed, noise, at), outcomes).log_likelihood,
+            start,
+            method="Nelder-Mead",
         )
         return -float(cost.fun)
 
@@ -217,7 +219,7 @@ def test_an_axis_has_the_information_of_the_others_on_a_shared_parameter() -> No
     def highest(value: float) -> float:
         fixed, near = delay.put(best.config, value), latency.get(best.config)
         cost = minimize_scalar(
-            lambda at: -likelihood.evaluate(latency.put(fixed, at), outcomes).total,
+            lambda at: -likelihood.evaluate(latency.put(fixed, at), outcomes).log_likelihood,
             bounds=(near - 0.02, near + 0.02),
             method="bounded",
         )

@@ -65,11 +65,11 @@ def test_a_gain_that_recovers_is_part_of_it() -> None:
     likelihood = Likelihood([sim.run], config)
     delay, plant = sim.config.arm.delay_of("vertical"), axes["vertical"].plant.lag
     free = free_of(likelihood, config, ("noise", "gain"))
-    found = fitted_lags(free, config, config, {"vertical": (0.001, np.inf)}, [])["vertical"]
+    found = fitted_lags(free, config, config, {"vertical": (0.001, np.inf)})["vertical"]
     assert found.lag_ms == pytest.approx(1e3 * (delay + plant + 0.01))
     assert found.lag_ms_ci95 == (pytest.approx(found.lag_ms - 1.0), None)
-    assert fitted_lags(free, config, config, {"vertical": (10.0, 0.1)}, [])["vertical"].lag_ms_ci95[0] == 0.0
-    assert fitted_lags(free_of(likelihood, config, ("noise",)), config, config, {}, []) == {}
+    assert fitted_lags(free, config, config, {"vertical": (10.0, 0.1)})["vertical"].lag_ms_ci95[0] == 0.0
+    assert fitted_lags(free_of(likelihood, config, ("noise",)), config, config, {}) == {}
 
 
 def test_an_end_is_open_only_where_nothing_can_go_there() -> None:
@@ -96,7 +96,7 @@ def test_intervals_contain_the_lag_over_25_runs() -> None:
         sim = outage(seed)
         stage = fit_stage(sim.run, spoiled_arm(sim.config), ("noise", "delay", "plant"))
         around = lag_intervals(stage.likelihood, stage.best, stage.free)
-        for axis, one in fitted_lags(stage.free, sim.config, stage.best.config, around, []).items():
+        for axis, one in fitted_lags(stage.free, sim.config, stage.best.config, around).items():
             low, high = one.lag_ms_ci95
             assert low is not None and high is not None and low < one.lag_ms < high
             inside.append(low <= 1e3 * sim.config.arm.lag_of(axis) <= high)

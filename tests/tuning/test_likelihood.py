@@ -19,10 +19,21 @@ from pumafuse.fusion.consistency import densities_of, log_likelihood
 from pumafuse.logs.run import Source
 from pumafuse.model.arm import AxisModel
 from pumafuse.simulation.true_sensor import Outliers
-from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.maximise import Point, derivatives, point
-from pumafuse.tuning.parameters import moved, with_order
-from tuning_runs import ALL, SCENARIOS, free_of, quietly, replaced, scenario, spoiled_arm, with_process, with_sensors
+from pumafuse.tuning.likelihood import Likelihood, Point
+from pumafuse.tuning.maximise import derivatives, point
+from pumafuse.tuning.parameters import moved
+from tuning_runs import (
+    ALL,
+    SCENARIOS,
+    free_of,
+    quietly,
+    replaced,
+    scenario,
+    spoiled_arm,
+    with_order,
+    with_process,
+    with_sensors,
+)
 
 DATA = Path(pf.__file__).parent / "data"
 AXES = ("tangential", "vertical")
@@ -137,7 +148,7 @@ def test_runs_add_up_and_so_do_axes() -> None:
         alone, outcomes = both.of_axis(axis), both.outcomes_of(axis, together.outcomes)
         value = alone.evaluate(config, outcomes)
         assert value.axes[number] == pytest.approx(together.axes[number], rel=1e-12)
-        assert value.total == value.axes[number]
+        assert value.log_likelihood == value.axes[number]
         derived = alone.derivatives(config, free, outcomes)
         foreign = [place for place, parameter in enumerate(free) if parameter.axis not in (None, axis)]
         assert not derived.score[foreign].any() and not derived.information[foreign].any()
@@ -206,7 +217,7 @@ def test_another_configuration_is_as_if_built_with_it() -> None:
     moved_there, built_there = old.evaluate(config), new.evaluate(config)
     np.testing.assert_allclose(moved_there.axes, built_there.axes, rtol=1e-13)
     assert np.sum(moved_there.outcomes[0]) == np.sum(built_there.outcomes[0]) > 0
-    assert moved_there.total != pytest.approx(old.evaluate(sim.config).total, abs=0.1)
+    assert moved_there.log_likelihood != pytest.approx(old.evaluate(sim.config).log_likelihood, abs=0.1)
     free = free_of(new, config, ALL)
     found, wanted = (
         likelihood.derivatives(config, free, value.outcomes)
@@ -381,16 +392,16 @@ def test_a_sensor_that_froze_in_a_run_has_no_scatter() -> None:
     assert set(Likelihood([well, frozen], config).scatter) == {("tracker", "radial")}
 
 
-def test_the_response_of_the_noiseless_arm_is_that_of_the_oracle() -> None:
+def test_measurements_are_as_far_from_the_noiseless_arm_as_from_the_oracles() -> None:
     """As each sensor would measure it: with scale, start levels and delays."""
     case = CASES["axes and missing values"]
     run, config = case.made()
     likelihood = Likelihood([run], config)
-    responses = likelihood.responses(config, centred=False)
-    assert {name for name, _ in responses} == set(case.seen)
-    for (name, axis), (expected, measured) in responses.items():
+    apart = likelihood.apart(config)
+    assert {name for name, _ in apart} == set(case.seen)
+    for (name, axis), (left,) in apart.items():
         oracle = AxisOracle(run, config, axis)
         mine = [measurement for measurement in oracle.measurements if measurement.sensor == name]
         position, _ = oracle.undisturbed(np.array([measurement.valid for measurement in mine]))
-        np.testing.assert_allclose(expected, config.sensors[name].scale * position, atol=1e-12)
-        assert measured.tolist() == [measurement.value for measurement in mine]
+        value = np.array([measurement.value for measurement in mine])
+        np.testing.assert_allclose(left, value - config.sensors[name].scale * position, atol=1e-12)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from pumafuse.tuning.likelihood import Derivatives, Likelihood
-from pumafuse.tuning.maximise import Point, derivatives, maximise, point
+from pumafuse.tuning.likelihood import Derivatives, Likelihood, Point
+from pumafuse.tuning.maximise import derivatives, maximise, point
 from pumafuse.tuning.parameters import Fit, Parameter, moved
 from pumafuse.tuning.steps import bounded_step
 from tuning_runs import (

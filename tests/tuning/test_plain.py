@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,10 @@ from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.arms import Arm, Measured, Recording
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.plain import Doubt, PlainArm, doubts, off, plain_arm, with_plain_arm
-from pumafuse.tuning.summary import FittedLag, with_doubts
-from pumafuse.tuning.tune import Pipeline, plans
-from tuning_runs import quietly, replaced, scenario
+from pumafuse.tuning.stage import Plan
+from pumafuse.tuning.summary import fitted_lags
+from pumafuse.tuning.tune import Pipeline
+from tuning_runs import free_of, quietly, replaced, scenario
 
 DEAD_BAND = Path(__file__).parent / "data" / "dead-band.csv"
 T = 0.02
@@ -106,17 +108,22 @@ def test_one_command_says_the_lag_of_an_arm_with_a_dead_band(tmp_path: Path) -> 
 
 def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_that_of_least_squares() -> None:
     """80 (78 to 82) ms by the likelihood and 50 to 60 ms by least squares are 50 to 82; an open end stays open."""
-    config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config
+    simulated = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2)
+    config, (first, *others) = simulated.config, simulated.config.arm.axes
+    slow = replaced(config.arm.axes[first], delay=config.arm.delay_of(first) + 0.08 - config.arm.lag_of(first))
+    slow = replaced(config, arm=replaced(config.arm, axes={**config.arm.axes, first: slow}))
+    free = [one for one in free_of(Likelihood([simulated.run], slow), slow, ["delay"]) if one.axis == first]
     arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), 0.055, 1e-3, *[Measured([], T, [])] * 2)
     doubted = {axis: Doubt(arm, off=1.5e-3, lag=0.08) for axis in config.arm.axes}
-    first, *others = config.arm.axes
-    lags = {first: FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(78.0, 82.0))}
-    found = with_doubts(lags, doubted, config, config)
-    assert found[first] == FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(50.0, 82.0))
-    assert found[others[0]].lag_ms_ci95 == (50.0, 60.0)
-    assert others[0] not in with_doubts(lags, doubted, config, config, lost=[others[0]])
-    lags = {first: FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(None, 82.0))}
-    assert with_doubts(lags, doubted, config, config)[first].lag_ms_ci95 == (None, 82.0)
+
+    def told(below: float, above: float, lost: Sequence[str] = ()) -> dict[str, tuple[float | None, float | None]]:
+        found = fitted_lags(free, config, slow, {first: (below, above)}, doubted, lost)
+        return {axis: one.lag_ms_ci95 for axis, one in found.items()}
+
+    found = told(0.002, 0.002)
+    assert found[first] == (50.0, pytest.approx(82.0)) and found[others[0]] == (50.0, 60.0)
+    assert others[0] not in told(0.002, 0.002, others[:1])
+    assert told(0.002, np.inf)[first] == (50.0, None)
     assert [Doubt(arm, off, lag=0.08).refutes for off in (3.9e-3, 4.1e-3)] == [False, True]
     assert Doubt(arm, 1e-3, lag=0.08, is_beaten=True).refutes
 
@@ -187,7 +194,7 @@ def test_an_arm_by_which_a_filter_predicts_better_is_to_take_the_place_of_the_li
     axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.11))
     arm = pf.ArmModel(name="servo", update_period=0.1, delay=0.18, axes={"j": axis})
     config = pf.FusionConfig(arm=arm, sensors={"encoder": pf.Sensor(sd=2e-4)})
-    pipeline = Pipeline([run], config, plans(config, ["noise", "delay", "plant"], [], None), lambda _, __: None)
+    pipeline = Pipeline([run], config, [Plan(["noise", "delay", "plant"], [])], lambda _, __: None)
     quietly(pipeline.fit)
     assert not any(one.refutes or one.sentence(pipeline.result(), "j") for one in pipeline.doubts().values())
     early = replaced(arm, delay=0.05, axes={"j": replaced(axis, plant=pf.FirstOrder(time_constant=0.1))})
@@ -202,10 +209,10 @@ def test_an_arm_that_takes_the_place_of_another_is_kept_and_others_are_not_searc
     """Of two axes one is held at the arm of least squares: that stays, the other one's is the one that was found."""
     simulated = pf.simulate(scenario("panel-vision", 0.25, 0.02), 2)
     config, kinds = simulated.config, ("noise", "delay", "plant")
-    first = Pipeline([simulated.run], config, plans(config, kinds, [], None), lambda _, __: None)
+    first = Pipeline([simulated.run], config, [Plan(kinds, [])], lambda _, __: None)
     quietly(first.fit)
     held = with_plain_arm(config, "tangential", Arm(0.031, 0.042))
-    again = plans(held, kinds, ["axes.tangential"], None)
+    again = [Plan(kinds, ["axes.tangential"])]
     second = Pipeline([simulated.run], held, again, lambda _, __: None, first.arms_but(["tangential"]))
     quietly(second.fit)
     replaced_arm = second.result().arm

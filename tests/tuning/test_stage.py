@@ -12,7 +12,6 @@ import pumafuse as pf
 from pumafuse.simulation.true_sensor import Outliers, TrueSensor
 from pumafuse.tuning.arms import BELIEF
 from pumafuse.tuning.intervals import ConfidenceInterval
-from pumafuse.tuning.parameters import with_order
 from pumafuse.tuning.stage import Stage
 from tuning_runs import (
     SCENARIOS,
@@ -24,6 +23,7 @@ from tuning_runs import (
     scenario,
     spoiled,
     spoiled_arm,
+    with_order,
     with_process,
     with_sensors,
 )

@@ -18,9 +18,10 @@ import pytest
 import pumafuse as pf
 from pumafuse.logs.run import Source
 from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.parameters import Fit, with_order
+from pumafuse.tuning.parameters import Fit
+from pumafuse.tuning.stage import Plan
 from pumafuse.tuning.summary import TuningSummary
-from pumafuse.tuning.tune import Pipeline, plans
+from pumafuse.tuning.tune import Pipeline
 from pumafuse.tuning.validation import check
 from tuning_runs import (
     fitted,
@@ -31,6 +32,7 @@ from tuning_runs import (
     replaced,
     spoiled,
     spoiled_arm,
+    with_order,
     with_outliers,
     with_sensors,
 )
@@ -46,7 +48,7 @@ def tuned() -> pf.Tuning:
 
 
 def total(run: pf.Run, config: pf.FusionConfig) -> float:
-    return Likelihood([run], config).evaluate(config).total
+    return Likelihood([run], config).evaluate(config).log_likelihood
 
 
 # ---- the result -----------------------------------------------------------------------------------------------------
@@ -193,7 +195,7 @@ def test_the_last_third_is_validated_on_with_numbers_of_the_first_two() -> None:
     best.
     """
     sim, config = with_outliers(4), spoiled(with_outliers(4).config)
-    pipeline = Pipeline([sim.run], config, plans(config, ["noise"], ["process"], None, False), lambda _, __: None)
+    pipeline = Pipeline([sim.run], config, [Plan(["noise"], ["process"], sd_prior=False)], lambda _, __: None)
     quietly(pipeline.fit)
     stamp = sim.run.command.stamp
     until = 2.0 / 3.0 * float(stamp[-1] - stamp[0]) / 1e9
@@ -313,7 +315,7 @@ def test_what_is_as_likely_at_first_is_kept() -> None:
     """A search that chose other orders and ended lower: the configuration is the one as given, with a note."""
     sim = outage(1)
     given = with_order(with_order(sim.config, "tangential", 1), "vertical", 2)
-    pipeline = Pipeline([sim.run], given, plans(given, ARM, [], None), lambda _, __: None)
+    pipeline = Pipeline([sim.run], given, [Plan(ARM, [])], lambda _, __: None)
     pipeline.fit()
     chosen = pipeline.best.arm.axes
     assert isinstance(chosen["tangential"].plant, pf.SecondOrder)

@@ -109,15 +109,37 @@ def ordered(levels: set[str]) -> list[str]:
 
 def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
     """Mean and scatter of (n,) values at each level named in ``cells`` (n,)."""
-    groups = _groups(values, cells).items()
-    sds = {level: float(group.std(ddof=1)) if len(group) > 1 else None for level, group in groups}
-    return [Level(level=level, trials=len(one), mean=float(one.mean()), sd=sds[level]) for level, one in groups]
+    return [
+        Level(level=level, trials=len(one), mean=float(one.mean()), sd=float(one.std(ddof=1)) if len(one) > 1 else None)
+        for level, one in _groups(values, cells).items()
+    ]
 
 
 def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:
     """Every coefficient, (trials,), against every factor, the level of each trial."""
-    pairs = product(coefficients.items(), factors)
-    return [_dependence(coefficient, values, factor, factors) for (coefficient, values), factor in pairs]
+    from scipy.stats import f, f_oneway
+
+    found = list[Dependence]()
+    for (coefficient, values), factor in product(coefficients.items(), factors):
+        groups = list(_groups(values, factors[factor]).values())
+        by_welch, adjusted, ratio, p = welch(groups), _adjusted(values, factor, factors), None, None
+        if any(np.ptp(group) > 0.0 for group in groups):
+            test = f_oneway(*groups)
+            ratio = float(test.statistic / f.ppf(0.95, len(groups) - 1, len(values) - len(groups)))
+            p = float(test.pvalue)
+        found.append(
+            Dependence(
+                coefficient=coefficient,
+                factor=factor,
+                levels=levels_of(values, factors[factor]),
+                i_ratio=ratio,
+                p=p,
+                welch_p=by_welch,
+                adjusted_p=adjusted,
+                verdict=_verdict(ratio, by_welch, adjusted, alone=len(factors) == 1),
+            )
+        )
+    return found
 
 
 def welch(groups: Sequence[FloatArray]) -> float | None:
@@ -210,27 +232,6 @@ def _replicate_sd(trials: Sequence[Trial], values: FloatArray) -> float | None:
     squares = sum(float(np.var(group)) * len(group) for group in groups.values())
     freedom = len(values) - len(groups)
     return float(np.sqrt(squares / freedom)) if freedom else None
-
-
-def _dependence(coefficient: str, values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> Dependence:
-    from scipy.stats import f, f_oneway
-
-    groups = list(_groups(values, factors[factor]).values())
-    by_welch, adjusted, ratio, p = welch(groups), _adjusted(values, factor, factors), None, None
-    if any(np.ptp(group) > 0.0 for group in groups):
-        found = f_oneway(*groups)
-        ratio = float(found.statistic / f.ppf(0.95, len(groups) - 1, len(values) - len(groups)))
-        p = float(found.pvalue)
-    return Dependence(
-        coefficient=coefficient,
-        factor=factor,
-        levels=levels_of(values, factors[factor]),
-        i_ratio=ratio,
-        p=p,
-        welch_p=by_welch,
-        adjusted_p=adjusted,
-        verdict=_verdict(ratio, by_welch, adjusted, alone=len(factors) == 1),
-    )
 
 
 def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:

@@ -181,7 +181,8 @@ def identify(
         if one.trial.axis in axes
     }
     left_out = {trial: why for axis in axes.values() for trial, why in axis.left_out.items()}
-    own = {
+    unknown = None, None
+    own: dict[str, tuple[float | None, float | None]] = {
         trial.name: (delay, gain)
         for one in commons.values()
         for trial, delay, gain in zip(one.trials, one.delay.tolist(), one.gain.tolist(), strict=True)
@@ -190,17 +191,28 @@ def identify(
     factors = anova.factors_of([one.trial for one in used], period, kind)
     performance = anova.performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance, kind)
     fastest = max(one.trial.speed_at(period) for one in used)
-    arm = msgspec.structs.replace(
-        arm,
-        validity=anova.validity(performance, fastest, kind),
-        provenance=_provenance(axes, left_out, one_delay, performance, samples, paper),
-    )
-    return Identification(
-        arm=_rounded(arm),
+    found = Identification(
+        arm=msgspec.structs.replace(arm, validity=anova.validity(performance, fastest, kind)),
         method="published" if paper else "fitted",
         samples=samples,
         tolerance=tolerance,
-        trials=[_result(one, period, usual[one.trial.axis], own, rms, left_out) for one in fitted],
+        trials=[
+            TrialResult(
+                trial=trial.name,
+                axis=trial.axis,
+                step=trial.step,
+                speed=trial.speed_at(period),
+                factors=trial.factors,
+                onset=one.onset if np.isfinite(one.onset) else None,
+                first=_order_fit(one.first, trial, usual[trial.axis]),
+                second=_order_fit(one.second, trial, usual[trial.axis]),
+                common_delay=own.get(trial.name, unknown)[0],
+                common_gain=own.get(trial.name, unknown)[1],
+                combined_rms=rms.get(trial.name),
+                left_out=left_out.get(trial.name),
+            )
+            for one, trial in ((one, one.trial) for one in fitted)
+        ],
         axes=axes,
         one_delay=one_delay,
         dependences=anova.dependences({key: values for key, (values, _) in coefficients(used).items()}, factors),
@@ -212,6 +224,8 @@ def identify(
         performance=performance,
         notes=[*trials.notes, *notes],
     )
+    arm = msgspec.structs.replace(found.arm, provenance=_provenance(found))
+    return msgspec.structs.replace(found, arm=_rounded(arm))
 
 
 def _fit_all(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[Fitted]:
@@ -258,26 +272,20 @@ def _arm(
     return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=models), words
 
 
-def _provenance(
-    axes: Mapping[str, CombinedAxis],
-    left_out: Mapping[str, str],
-    one_delay: str,
-    performance: Sequence[anova.Performance],
-    samples: int | None,
-    paper: bool,
-) -> dict[str, Any]:
+def _provenance(found: Identification) -> dict[str, Any]:
     """What the arm's file says of where its numbers come from."""
+    axes, published = found.axes, found.method == "published"
     return {
         "made_by": f"pumafuse identify {version('pumafuse')}",
         "trials": {axis: one.trials for axis, one in axes.items()},
-        "left_out": left_out,
+        "left_out": {trial: why for one in axes.values() for trial, why in one.left_out.items()},
         "order": {axis: one.choice.why for axis, one in axes.items()},
-        "delay": one_delay,
+        "delay": found.one_delay,
         "delay_spread_ms": {axis: round(one.delay_spread * units.MS, 2) for axis, one in axes.items()},
         "gain": {axis: one.gain_words for axis, one in axes.items()},
-        "validity": {one.factor: one.verdict for one in performance},
-        "samples": "all" if samples is None else samples,
-        "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
+        "validity": {one.factor: one.verdict for one in found.performance},
+        "samples": "all" if found.samples is None else found.samples,
+        "method": "delay and gain read off each trial (--paper)" if published else "all parameters fitted",
     }
 
 
@@ -286,32 +294,6 @@ def _rounded(arm: ArmModel) -> ArmModel:
     text = json.dumps(units.from_si(msgspec.to_builtins(arm)), default=float)
     tree = json.loads(text, parse_float=lambda number: float(f"{float(number):.{_DIGITS}g}"))
     return msgspec.convert(units.to_si(tree), ArmModel)
-
-
-def _result(
-    one: Fitted,
-    period: float,
-    usual: float,
-    own: Mapping[str, tuple[float, float]],
-    rms: Mapping[str, float],
-    left_out: Mapping[str, str],
-) -> TrialResult:
-    trial = one.trial
-    delay, gain = own.get(trial.name, (None, None))
-    return TrialResult(
-        trial=trial.name,
-        axis=trial.axis,
-        step=trial.step,
-        speed=trial.speed_at(period),
-        factors=trial.factors,
-        onset=one.onset if np.isfinite(one.onset) else None,
-        first=_order_fit(one.first, trial, usual),
-        second=_order_fit(one.second, trial, usual),
-        common_delay=delay,
-        common_gain=gain,
-        combined_rms=rms.get(trial.name),
-        left_out=left_out.get(trial.name),
-    )
 
 
 def _order_fit(fit: StepFit, trial: Trial, usual: float) -> OrderFit:

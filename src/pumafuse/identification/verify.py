@@ -26,7 +26,7 @@ from ..logs.run import Run
 from ..model.arm import ArmModel, commanded_speed
 from ..model.plants import PLANTS
 from ..toml import Interval
-from ..tuning.arms import Arm, Coordinates, Limits, Measured, Recording, Rest, covariance
+from ..tuning.arms import Arm, Coordinates, Limits, Measured, Recording, Rest
 from ..tuning.plain import COMMANDS, LAGS, ROWS, delays
 from ..units import Kind
 from .estimate import t_quantile
@@ -44,7 +44,6 @@ _BETTER = 0.8  # share of the error below which a recovery is recommended
 _DAMPED = 1.0  # ζ of the grid, of second order
 _STARTS = 3  # cells of it to search from
 _BLOCKS = 10  # of a run, whose errors count as independent of each other
-_STEP = 1e-5  # of a coordinate, by which the lag is varied
 _REAL = -np.inf, np.inf
 _ANY = Limits(  # s, s, 1, 1, s/m or s/rad: as far as arms may be given, and beyond what is seen of them
     {"delay": (0.0, 1e4), "lag": (1e-6, 1e4), "damping": (1e-3, 1e3), "gain": _REAL, "slope": _REAL}, {}
@@ -200,14 +199,11 @@ def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[Ax
             recording = Recording(given, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
             measured = Measured([recording], arm.update_period, [source], arm.axes[axis])
             notes = [*jumps, *segment.notes] if not found else []
-            counts = dict(segment.command_counts), _used(segment.counts[source])
-            found.append(_verified(measured, run, axis, arm, counts, notes))
+            one, trace = _verified(measured, run, axis, arm)
+            counts = {"used" if word == Outcome.FUSED.word else word: n for word, n in segment.counts[source].items()}
+            commands = dict(segment.command_counts)
+            found.append((msgspec.structs.replace(one, commands=commands, rows=counts, notes=notes), trace))
     return found
-
-
-def _used(counts: Mapping[str, int]) -> dict[str, int]:
-    """The counts of a source's rows, for which there is no filter here that could fuse them."""
-    return {"used" if outcome == Outcome.FUSED.word else outcome: count for outcome, count in counts.items()}
 
 
 def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
@@ -222,14 +218,8 @@ def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
     return replace(run, sensors={name: sources[name] for name in sensors}, reference=None)
 
 
-def _verified(
-    measured: Measured,
-    run: Run,
-    axis: str,
-    arm: ArmModel,
-    counts: tuple[dict[str, int], dict[str, int]],
-    notes: list[str],
-) -> tuple[AxisVerification, Trace]:
+def _verified(measured: Measured, run: Run, axis: str, arm: ArmModel) -> tuple[AxisVerification, Trace]:
+    """One axis of a run by one source; which rows were used, and what was wrong with the run, is yet to be told."""
     model, own = arm.axes[axis], Arm.of(arm.axes[axis], arm.delay_of(axis))
     recovery = own.recovery or RECOVERY
     farthest = abs(measured.recordings[0].start) + np.abs(measured.responses(own)[0]).max()
@@ -263,11 +253,11 @@ def _verified(
         recovery=recovery,
         best_in_class=best,
         outlying=count - len(recording.time),
-        commands=counts[0],
-        rows=counts[1],
+        commands={},
+        rows={},
         holds=as_it_is.fit >= _HOLDS,
         verdict=_verdict(as_it_is, lag, best) + _recovers(as_it_is, recovering, recovery, model.kind),
-        notes=notes,
+        notes=[],
     )
     return verification, trace
 
@@ -368,8 +358,7 @@ def _on_grid(measured: Measured, own: Arm) -> list[Arm]:
     """The best of a grid over dead times and plants, each with its best gain that is the same at every speed."""
     part, alike = measured.excerpt(COMMANDS, ROWS), own._replace(damping=_DAMPED if own.damping else 0.0, slope=0.0)
     arms = [alike._replace(delay=delay, lag=lag) for delay, lag in product(delays(part).tolist(), LAGS.tolist())]
-    log, gain = part.weighed(arms, part.white(own), _ANY)
-    return [arms[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:_STARTS].tolist()]
+    return part.likeliest(arms, part.white(own), _ANY, _STARTS)
 
 
 def _half_width(measured: Measured, arm: Arm, names: Coordinates, rest: Rest, speed: float) -> float:
@@ -378,9 +367,5 @@ def _half_width(measured: Measured, arm: Arm, names: Coordinates, rest: Rest, sp
     What a model leaves over of a run is correlated, and each measurement alone would count far too much: a block of the
     run counts as one observation (Bester, Conley & Hansen, J. Econometrics 165, 2011).
     """
-    free = [name for name, inside in zip(names, _ANY.inside(arm, names), strict=True) if inside]
-    here, varied = arm.model, [arm.moved([name], [arm.coordinate(name) + _STEP]) for name in free]
-    slope = np.array([one.model.lag(one.delay, speed) - here.lag(arm.delay, speed) for one in varied]) / _STEP
-    information, scatter = measured.scattered(arm, free, rest, _ANY, _BLOCKS)
-    weight = covariance(information) @ slope
-    return t_quantile(_BLOCKS - 1) * float(weight @ scatter @ weight * _BLOCKS / (_BLOCKS - 1)) ** 0.5
+    _, variance = measured.lag_variances(arm, names, rest, _ANY, _BLOCKS, lambda one: one.model.lag(one.delay, speed))
+    return t_quantile(_BLOCKS - 1) * (variance * _BLOCKS / (_BLOCKS - 1)) ** 0.5

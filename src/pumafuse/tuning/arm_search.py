@@ -104,18 +104,9 @@ class Freedom(NamedTuple):
 
 
 class ArmSearch:
-    """The arms of an axis: maxima of each model, and the walk from one along the dead time.
+    """The arms of an axis: maxima of each model, and the walk from one along the dead time."""
 
-    Attributes:
-        freedom: What was to be found.
-        sensors: By which it is known.
-        plain: The linear arm of least squares; None where nothing moves.
-        bent: Their arm with what it has of play, a fastest speed and a sag; None for a linear axis.
-        limits: Where its numbers may lie.
-        rest: What the best arm leaves.
-        rests: Likewise, without a disturbance, with a smooth one and with a rough one.
-        posterior: All models that count, along their dead times.
-    """
+    rests: Sequence[Rest]  # what the best arm leaves, without a disturbance, with a smooth one and with a rough one
 
     def __init__(
         self,
@@ -124,18 +115,11 @@ class ArmSearch:
         least: Sequence[float],
         believed: bool = False,
     ) -> None:
-        """Search.
-
-        Args:
-            measured: The measurements of the axis.
-            freedom: What is to be found.
-            least: The least noise of each sensor [m].
-            believed: Whether the sensors' noise is believed to be what second differences show.
-        """
+        """``least``: noise of each sensor [m]; ``believed``: to be what second differences show."""
         self._measured, self.sensors = measured.liveliest(_ENOUGH), measured.sensors
         self._longest = longest_delay(measured.period)
         self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
-        self.bent = self._bent(freedom)
+        self.bent = self._bent(freedom)  # their arm with what it has of play, a fastest speed and a sag
         self.freedom = freedom.bent(self.bent)
         self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
         self._fits = self._by_least_squares()
@@ -152,7 +136,7 @@ class ArmSearch:
             ):
                 highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
                 branches.append(self._walk(model, peak, highest - _FORLORN))
-        self.posterior = AxisPosterior(branches)
+        self.posterior = AxisPosterior(branches)  # of all models that count, along their dead times
 
     @property
     def likely_noise(self) -> dict[str, float]:
@@ -177,15 +161,8 @@ class ArmSearch:
     def lag_scatter(self, model: Model, arm: Arm) -> float:
         """How much more the lag scatters over pieces of the runs than the information says, 1 or more (White, 1982)."""
         names = self.freedom.names(model)
-        free = [name for name, one in zip(names, self.limits.inside(arm, names), strict=True) if one]
-        slope = np.array(
-            [(arm.moved([name], [arm.coordinate(name) + _SLOPE]).total - arm.total) / _SLOPE for name in free]
-        )
-        if not slope.any():
-            return 1.0
-        information, scatter = self._measured.scattered(arm, free, self.rest, self.limits, _PIECES)
-        cov = covariance(information)
-        return max(1.0, math.sqrt(float(slope @ cov @ scatter @ cov @ slope) / float(slope @ cov @ slope)))
+        variances = self._measured.lag_variances(arm, names, self.rest, self.limits, _PIECES, lambda one: one.total)
+        return max(1.0, math.sqrt(variances[1] / variances[0])) if variances[0] > 0.0 else 1.0
 
     def _bent(self, freedom: Freedom) -> Bent | None:
         if self.plain is None or not {"delay", "lag"} <= set(freedom.free):
@@ -277,8 +254,7 @@ class ArmSearch:
         if len(tried) <= count:
             return tried
         varied = "gain" in self.freedom.names(model)
-        log, gain = self._measured.weighed(tried, self.rest, self.limits if varied else None)
-        return [tried[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:count].tolist()]
+        return self._measured.likeliest(tried, self.rest, self.limits if varied else None, count)
 
     def _shapes(self, model: Model, arm: Arm) -> Iterator[Arm]:
         """Arms of a model that are as late as another one."""
@@ -412,6 +388,7 @@ class Chosen(NamedTuple):
     model: Model  # of which order and kind of gain it is
     mixture: Mixture  # all that the axis may be, with what others say of a dead time that it shares
     shares: bool  # whether it shares that
+    worth: float | None  # log-likelihood that a dead time of its own gains it; None where that is not asked
 
 
 def chosen_arms(
@@ -419,10 +396,7 @@ def chosen_arms(
 ) -> tuple[dict[str, Chosen], float | None]:
     """The likeliest arm of each axis, and the dead time that some of them share [s]; None: they do not.
 
-    Args:
-        searched: By axis.
-        delayed: The axes whose dead time is free.
-        one_delay: Whether these share one whatever the measurements say.
+    That of ``delayed`` axes is free; with ``one_delay`` they share one whatever the measurements say.
     """
     known = {axis: one.posterior for axis, one in searched.items() if axis in delayed}
     shares = list(known) if one_delay else sharing(known)
@@ -433,7 +407,7 @@ def chosen_arms(
         others = [known[one] for one in shares if mine and one != axis]
         model = chosen_model(posterior.mixture(others))
         likely = posterior.mixture(others, 1.0 / (1.0 + math.exp(worth[axis])) if mine and worth else 1.0)
-        found[axis] = Chosen(search.arm(model, delay if mine else None), model, likely, mine)
+        found[axis] = Chosen(search.arm(model, delay if mine else None), model, likely, mine, worth.get(axis))
     return found, delay
 
 

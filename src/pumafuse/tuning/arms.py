@@ -51,6 +51,7 @@ _REACH = {
     "play": 0.7, "max_speed": 0.3, "knee": math.inf, "beyond": 0.3, "knee_below": math.inf, "below": 0.3,
 }  # fmt: skip
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
+_NUDGE = 1e-5  # of a coordinate, by which a lag is varied
 _LOG_2PI = math.log(2.0 * math.pi)
 
 Coordinates: TypeAlias = Sequence[str]  # among the fields below
@@ -387,14 +388,25 @@ class Measured:
                 break
         return Fit(best.arm, best.log_posterior, best.information)
 
-    def scattered(
-        self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits, pieces: int
-    ) -> tuple[FloatArray, FloatArray]:
-        """The information of coordinates, and what it is by the scatter of the score over pieces of the recordings."""
-        left, slopes, _ = self._sloped(arm, names, rest)
-        begins = np.unique(np.arange(pieces) * len(left) // pieces)
-        scores = np.add.reduceat(slopes * left, begins, axis=1)
-        return self._linear(arm, names, rest, limits).information, scores @ scores.T
+    def lag_variances(
+        self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits, pieces: int, lag: Callable[[Arm], float]
+    ) -> tuple[float, float]:
+        """The variance of a lag [s²] by the information, and by the scatter of the score over pieces of the recordings.
+
+        Both are the same where the model is right (White, Econometrica 50, 1982). Coordinates at a bound stay there.
+        """
+        free = [name for name, inside in zip(names, limits.inside(arm, names), strict=True) if inside]
+        beside = [arm.moved([name], [arm.coordinate(name) + _NUDGE]) for name in free]
+        slope = np.array([(lag(one) - lag(arm)) / _NUDGE for one in beside])
+        left, slopes, _ = self._sloped(arm, free, rest)
+        scores = np.add.reduceat(slopes * left, np.unique(np.arange(pieces) * len(left) // pieces), axis=1)
+        weight = covariance(self._linear(arm, free, rest, limits).information) @ slope
+        return float(slope @ weight), float(np.sum((weight @ scores) ** 2))
+
+    def likeliest(self, arms: Sequence[Arm], rest: Rest, limits: Limits | None, count: int) -> list[Arm]:
+        """The likeliest of some arms, the best first, each with its best gain; for ``limits`` of None with its own."""
+        log, gain = self.weighed(arms, rest, limits)
+        return [arms[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:count].tolist()]
 
     def _linear(self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits) -> _Linear:
         """Posterior, score and information at an arm."""
@@ -535,17 +547,10 @@ class _Linear(NamedTuple):
 def rests(
     measured: Measured, arm: Arm, quickest: float, least: Sequence[float], believed: bool = False
 ) -> Iterator[tuple[Rest, float]]:
-    """The most likely rest that an arm leaves, without a disturbance and with one of each kind.
+    """The most likely rest that an arm leaves, without a disturbance and with one of each kind, and its log-posterior.
 
-    Args:
-        measured: The measurements.
-        arm: The arm.
-        quickest: The shortest time of a disturbance that is believed [s].
-        least: The least noise of each sensor [m].
-        believed: Whether the sensors' noise is believed to be what second differences show.
-
-    Yields:
-        Each with its log-posterior.
+    A disturbance is not quicker than ``quickest`` [s], the noise of each sensor is at ``least`` that [m], and it may be
+    ``believed`` to be what second differences show.
     """
     from scipy.optimize import minimize  # takes 0.2 s to import
 

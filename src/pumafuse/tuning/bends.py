@@ -60,10 +60,7 @@ class Bent(NamedTuple):
 def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
     """The least-squares arm with what pays of play, a fastest speed and a sag; None for a linear axis.
 
-    Args:
-        plain: What least squares say of a linear arm.
-        given: What is known of it: what is not ``free`` stays.
-        free: The coordinates that are, among them dead time and lag.
+    What is known of it and not ``free`` stays as ``given``; dead time and lag are free.
     """
     search = _Search(plain, given, free)
     if min(half.count for half in search.halves) < _FEWEST:

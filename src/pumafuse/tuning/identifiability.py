@@ -12,8 +12,8 @@ from ..arrays import FloatArray
 from ..errors import PumafuseError
 from ..fusion.config import FusionConfig
 from . import arms
-from .likelihood import Likelihood
-from .maximise import Point, derivatives
+from .likelihood import Likelihood, Point
+from .maximise import derivatives
 from .parameters import Parameter, smallest_sd
 
 FEWEST, FEW = 12, 30  # components of an axis: to fit anything, and to fit what only many can tell
@@ -96,35 +96,32 @@ def least_count(likelihood: Likelihood) -> int:
     return min((count for count in likelihood.count.tolist() if count > 0), default=0)
 
 
-def for_few(likelihood: Likelihood, free: Sequence[Parameter]) -> tuple[list[Parameter], list[str]]:
-    """The parameters that as many measurements as there are can tell, and a sentence for each axis with few."""
-    few = {
-        axis: count for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True) if 0 < count < FEW
-    }
-    kept = [
+def for_few(likelihood: Likelihood, free: Sequence[Parameter]) -> list[Parameter]:
+    """The parameters that as many measurements as there are can tell."""
+    few = {axis for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True) if count < FEW}
+    return [
         one
         for one in free
         if one.axis not in few
         or not (one.path[-1] in _OF_MANY or (one.fit == "plant" and one.path[-1] != "time_constant"))
     ]
-    notes = [
-        f"{axis}: only {count} measurements: gain, disturbance, maneuvers and the order of the plant stay as they are"
-        for axis, count in few.items()
-    ]
-    return kept, notes
 
 
 def few_measurements(likelihood: Likelihood, free: Sequence[Parameter]) -> list[str]:
-    """A sentence for each axis with too few measurements for as many numbers."""
-    found: list[str] = []
+    """A sentence for each axis with too few measurements for as many numbers, or for some kinds of numbers."""
+    many, few = list[str](), list[str]()
     for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True):
-        numbers = sum(one.axis == axis for one in free)
-        if count < _ENOUGH * numbers:
-            found.append(
+        if count < _ENOUGH * (numbers := sum(one.axis == axis for one in free)):
+            many.append(
                 f"{axis}: {count} measurements for {numbers} numbers to fit: with fewer than {_ENOUGH} for each, noise"
                 " and motion are hard to tell apart and error bars need not hold; fit less, or record for longer"
             )
-    return found
+        if 0 < count < FEW:
+            few.append(
+                f"{axis}: only {count} measurements: gain, disturbance, maneuvers and the order of the plant stay as"
+                " they are"
+            )
+    return many + few
 
 
 # ---- identifiability ------------------------------------------------------------------------------------------------
@@ -192,14 +189,8 @@ def shared_times(
 ) -> list[NotIdentifiable]:
     """The latencies to fix where delays are free too: all latencies less and all delays more by as much is the same.
 
-    One of each group of sensors and moving axes that are connected by measurements, unless a delay or a latency among
-    them is known; and that of each sensor which measures no axis that moves.
-
-    Args:
-        sensors: For each axis its sensors.
-        axes: Those that move.
-        free: The free parameters.
-        config: The latency of its most accurate sensor is fixed.
+    One of each group of sensors and moving ``axes`` that are connected by measurements, that of the most accurate,
+    unless a delay or a latency among them is known; and that of each sensor which measures no axis that moves.
     """
     delays = {one.axis: one for one in free if one.fit == "delay"}
     latencies = {one.sensor: one for one in free if one.fit == "latency"}

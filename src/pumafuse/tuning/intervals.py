@@ -15,8 +15,8 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..toml import Interval
 from .identifiability import covariance, within_bounds
-from .likelihood import Likelihood, in_threads
-from .maximise import Point, derivatives, maximise, point
+from .likelihood import Likelihood, Point, in_threads
+from .maximise import derivatives, maximise, point
 from .parameters import Parameter, coordinates, moved, rounded
 
 Distances: TypeAlias = tuple[float, float]  # s; to the lower and upper end of an interval, infinite where it is open

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +18,7 @@ from ..arrays import FloatArray
 from ..discovery.guesses import ArmGuess, AxisGuess, Pair, SensorGuess, guess
 from ..discovery.own_frames import own_frames
 from ..discovery.roles import relations
-from ..discovery.sensors import Alignment, aligned
+from ..discovery.sensors import aligned
 from ..discovery.survey import SOONER, Survey, early, interpolation, soonest, too_early
 from ..errors import PumafuseWarning, UnknownNameError
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor, Start
@@ -251,11 +251,13 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     Raises:
         PumafuseError: The runs tell nothing: no motion, too few measurements, a sensor that does not follow.
     """
-    every = [_with_reference(run) for run in ([runs] if isinstance(runs, Run) else runs)]
+    every = [in_axes(run, None)[0] for run in ([runs] if isinstance(runs, Run) else runs)]
     if not every:
         raise TuneError("no run to look at")
+    measured = [{REFERENCE: run.reference, **run.sensors} if run.reference else run.sensors for run in every]
+    every = [replace(run, sensors=sources, reference=None) for run, sources in zip(every, measured, strict=True)]
     aside = {name: one.words for run in every for name, one in own_frames(run).items()}
-    every = [_without(run, aside) for run in every]
+    every = [replace(run, sensors={k: v for k, v in run.sensors.items() if k not in aside}) for run in every]
     turned = [f"sensor '{name}' {words}: `pumafuse register` finds it; it is not used" for name, words in aside.items()]
     if turned and not any(run.sensors for run in every):
         raise TuneError("; ".join(turned))
@@ -306,20 +308,6 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
 
 
 # ---- the first guess ------------------------------------------------------------------------------------------------
-
-
-def _with_reference(run: Run) -> Run:
-    """A run in the arm's axes whose reference is one of its sensors."""
-    run = in_axes(run, None)[0]
-    if run.reference is None:
-        return run
-    return replace(run, sensors={REFERENCE: run.reference, **run.sensors}, reference=None)
-
-
-def _without(run: Run, names: Collection[str]) -> Run:
-    """A run without some sensors."""
-    kept = {name: source for name, source in run.sensors.items() if name not in names}
-    return run if len(kept) == len(run.sensors) else replace(run, sensors=kept)
 
 
 def first_guess(guesses: Sequence[tuple[ArmGuess, Mapping[str, SensorGuess]]]) -> FusionConfig:
@@ -459,7 +447,7 @@ def _notes(one: AxisLag, gains: tuple[float, float]) -> list[str]:
 
 
 def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> AxisLag:
-    arm, model, mixture, shared = chosen
+    arm, model, mixture, shared, _ = chosen
 
     def interval(quantity: Quantity, value: float, margin: float = _MARGIN) -> Interval:
         """Of the models like the chosen one; of a logarithm in the number itself."""
@@ -482,7 +470,14 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
             low = max(low, 0.0)
         return (math.exp(low), math.exp(high) if high < _HIGHEST else math.inf) if log else (low, high)
 
-    plant = arm.model.plant
+    plant, values = arm.model.plant, dict[str, Any]()
+    for name in ("time_constant", "natural_frequency", "damping"):
+        if (value := getattr(plant, name, None)) is not None:
+            values |= {name: value, f"{name}_ci95": interval(name, value)}
+    for bend in search.freedom.bends:
+        values |= {bend: getattr(arm, bend), f"{bend}_ci95": interval(bend, getattr(arm, bend))}
+    if arm.recovery:
+        values |= {"gain_recovery": arm.recovery, "gain_recovery_ci95": interval("gain_recovery", arm.recovery)}
     found = AxisLag(
         sensor=trusted,
         lag=arm.total,
@@ -494,16 +489,8 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         gain=arm.gain,
         gain_ci95=None if model.gain == "given" else interval("gain", arm.gain),
         kind=kind,
+        **values,
     )
-    values: dict[str, Any] = {}
-    for name in ("time_constant", "natural_frequency", "damping"):
-        if (value := getattr(plant, name, None)) is not None:
-            values |= {name: value, f"{name}_ci95": interval(name, value)}
-    for bend in search.freedom.bends:
-        values |= {bend: getattr(arm, bend), f"{bend}_ci95": interval(bend, getattr(arm, bend))}
-    if arm.recovery:
-        values |= {"gain_recovery": arm.recovery, "gain_recovery_ci95": interval("gain_recovery", arm.recovery)}
-    found = msgspec.structs.replace(found, **values)
     notes = ["; ".join(search.bent.sentences(SCREEN[kind]))] if search.bent is not None else []
     return msgspec.structs.replace(found, notes=[*notes, *_notes(found, search.limits.bounds["gain"])])
 
@@ -548,7 +535,14 @@ def _sensors(
         if one is None:
             notes.append(_APART.format(name, trusted))
             continue
-        found[name] = _sensor_lag(one)
+        found[name] = SensorLag(
+            latency=one.latency,
+            latency_ci95=one.latency_ci95,
+            latency_sd=one.latency_sd,
+            scale=one.scale,
+            scale_ci95=one.scale_ci95,
+            steps=[LatencyStep(time=step.time, before=step.before, after=step.after) for step in one.steps],
+        )
         notes += one.doubts(name, trusted)
         sd = sensor.sd if isinstance(sensor.sd, dict) else {}
         better = msgspec.structs.replace(
@@ -560,17 +554,6 @@ def _sensors(
         )
         config = changed(config, ("sensors", name), better)
     return config, found, notes
-
-
-def _sensor_lag(one: Alignment) -> SensorLag:
-    return SensorLag(
-        latency=one.latency,
-        latency_ci95=one.latency_ci95,
-        latency_sd=one.latency_sd,
-        scale=one.scale,
-        scale_ci95=one.scale_ci95,
-        steps=[LatencyStep(time=step.time, before=step.before, after=step.after) for step in one.steps],
-    )
 
 
 # ---- the lag over the run -------------------------------------------------------------------------------------------
@@ -599,13 +582,12 @@ class _Course(NamedTuple):
 
 
 class _Trend(NamedTuple):
-    """A drift over the run and its standard deviation [s], a wandering beside it [s], whether each is significant."""
+    """A drift over the run and its standard deviation [s], whether it is more than chance, and a wandering [s]."""
 
     drift: float
     drift_sd: float
-    wander: float
     drifts: bool
-    wanders: bool
+    wander: float  # 0 where it is no more than chance
 
 
 def _with_courses(
@@ -623,10 +605,7 @@ def _with_courses(
         parts = zip(course.time.tolist(), course.shift.tolist(), sd.tolist(), strict=True)
         known[axis] = msgspec.structs.replace(
             known[axis],
-            drift=trend.drift,
-            drift_sd=trend.drift_sd,
-            drifts=trend.drifts,
-            wander=trend.wander if trend.wanders else 0.0,
+            **trend._asdict(),
             course=[PartLag(time=time, shift=shift, sd=one) for time, shift, one in parts],
         )
     return known, _clock(list(courses.values()))
@@ -647,13 +626,8 @@ def _trend(course: _Course) -> _Trend:
     weight = 1.0 / np.maximum(variance, 1e-18)
     wander = math.sqrt(max(float(weight @ (rest**2 - variance) / weight.sum()), 0.0))
     sd = math.sqrt(max(1.0, chi2 / free) / power)
-    return _Trend(
-        drift=drift,
-        drift_sd=sd,
-        wander=wander,
-        drifts=abs(drift) > max(_DRIFTS * sd, _SMALLEST),
-        wanders=wander > _SMALLEST and float(chdtrc(free, chi2)) < _WANDERS,
-    )
+    wanders = wander > _SMALLEST and float(chdtrc(free, chi2)) < _WANDERS
+    return _Trend(drift, sd, abs(drift) > max(_DRIFTS * sd, _SMALLEST), wander if wanders else 0.0)
 
 
 def _clock(courses: Sequence[_Course]) -> tuple[float | None, float | None]:
@@ -667,4 +641,4 @@ def _clock(courses: Sequence[_Course]) -> tuple[float | None, float | None]:
     if float(shift @ information @ shift) < 0.5 * every:
         return None, None
     trend = _trend(_Course(courses[0].time, shift, information))
-    return trend.drift if trend.drifts else None, trend.wander if trend.wanders else None
+    return trend.drift if trend.drifts else None, trend.wander or None

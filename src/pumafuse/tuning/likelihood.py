@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from ..arrays import SD_OF_MEDIAN, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import SD_OF_MEDIAN, CodeArray, FloatArray, IntArray, TimeArray
 from ..discovery.following import resolution, scatter
 from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
@@ -61,10 +61,13 @@ def in_threads(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
 
 
 @dataclass(frozen=True)
-class LogLikelihood:
-    """The log-likelihood of a configuration."""
+class Point:
+    """A configuration with its log-likelihood and its log-posterior."""
 
-    axes: FloatArray  # of each axis's components, with positions in mm or mrad, (A,)
+    config: FusionConfig  # the configuration
+    axes: FloatArray  # the log-likelihood of each axis's components, with positions in mm or mrad, (A,)
+    # logarithms of priors, but for a constant, of each axis's parameters; of shared ones they count for the first, (A,)
+    priors: FloatArray
     results: Sequence[Results]  # what became of each measurement on each axis, for each segment
 
     @property
@@ -73,9 +76,19 @@ class LogLikelihood:
         return [one.outcome for one in self.results]
 
     @property
-    def total(self) -> float:
-        """The sum over all axes."""
+    def log_likelihood(self) -> float:
+        """Of all axes."""
         return float(self.axes.sum())
+
+    @property
+    def posteriors(self) -> FloatArray:
+        """The log-posterior of each axis, (A,)."""
+        return self.axes + self.priors
+
+    @property
+    def log_posterior(self) -> float:
+        """The log-posterior of all axes: what is maximised."""
+        return float(self.posteriors.sum())
 
 
 class Derivatives(NamedTuple):
@@ -85,18 +98,6 @@ class Derivatives(NamedTuple):
     information: FloatArray  # the expected −∂²L/∂a², (k, k)
     # what it is by the scatter of the score over pieces of the runs; the same where the model is right, (k, k)
     scatter: FloatArray
-
-
-class _Linear(NamedTuple):
-    """Innovations and variances of one axis of one segment, to first order."""
-
-    whole: int  # the index of the segment
-    mine: list[int]  # which parameters they depend on, (p,)
-    fused: BoolArray  # which measurements were fused, (m,)
-    nu: FloatArray  # ν, (m,)
-    S: FloatArray  # their variances, (m,)
-    d_nu: FloatArray  # ∂ν/∂a, (p, m)
-    d_s: FloatArray  # ∂S/∂a, (p, m)
 
 
 @dataclass(frozen=True)
@@ -132,18 +133,11 @@ class Likelihood:
         until: float | None = None,
         latest: float | None = None,
     ) -> None:
-        """Prepare the measurements of runs.
+        """Prepare the measurements of runs by some ``sensors``, or all.
 
-        Args:
-            runs: Recorded runs.
-            config: Arm and sensors.
-            sensors: Which to use; all for None.
-            until: Leave out measurements valid later than this after the first command [s].
-            latest: Leave out measurements that would lie before the first command with this latency [s]; None: each
-                with its own.
-
-        Raises:
-            PumafuseError: A run and the configuration do not fit together.
+        Without those that are valid later than ``until`` after the first command [s], and those that would lie before
+        it with the ``latest`` latency [s], or their own. Raises a PumafuseError where a run does not fit the
+        configuration.
         """
         chosen = config.sensor_names(sensors)
         named = [(run.name, part) for run in runs for part in segments(in_base(run, config)[0])[0]]
@@ -213,23 +207,24 @@ class Likelihood:
         return [part for part in self._parts if self.axes[part.axis] == axis]
 
     @cached_property
-    def scatter(self) -> dict[tuple[str, str], float]:
-        """Rough noise of each sensor on each axis [m or rad], by the names of both."""
-        found: dict[tuple[str, str], list[float]] = {}
-        for part in self._parts:
-            for name, rows in part.segment.rows_by_sensor().items():
-                if len(rows.time) > 3:
-                    found.setdefault((name, self.axes[part.axis]), []).append(scatter(rows.value[:, 0]))
-        return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
-
-    @cached_property
-    def resolution(self) -> dict[tuple[str, str], float]:
-        """Noise of the steps in which values of a sensor on an axis come, if they do [m or rad], by both names."""
+    def _values(self) -> dict[tuple[str, str], list[FloatArray]]:
+        """What a sensor measured of an axis, by the names of both, of each segment."""
         found: dict[tuple[str, str], list[FloatArray]] = {}
         for part in self._parts:
             for name, rows in part.segment.rows_by_sensor().items():
                 found.setdefault((name, self.axes[part.axis]), []).append(rows.value[:, 0])
-        every = {key: resolution(np.concatenate(values)) for key, values in found.items()}
+        return found
+
+    @cached_property
+    def scatter(self) -> dict[tuple[str, str], float]:
+        """Rough noise of each sensor on each axis [m or rad], by the names of both."""
+        sds = {key: [scatter(one) for one in values if len(one) > 3] for key, values in self._values.items()}
+        return {key: float(np.median(each)) for key, each in sds.items() if each and min(each) > 0.0}
+
+    @cached_property
+    def resolution(self) -> dict[tuple[str, str], float]:
+        """Noise of the steps in which values of a sensor on an axis come, if they do [m or rad], by both names."""
+        every = {key: resolution(np.concatenate(values)) for key, values in self._values.items()}
         return {key: noise for key, noise in every.items() if noise > 0.0}
 
     @cached_property
@@ -253,35 +248,15 @@ class Likelihood:
                 found[axis] = max(found[axis], reached)
         return found
 
-    def responses(
-        self, config: FusionConfig, *, centred: bool = True
-    ) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
-        """The response of the noiseless arm as each sensor would measure it, and what it measured, [m], (m,).
-
-        Args:
-            config: The configuration.
-            centred: Whether to subtract the median of each run from both.
-
-        Returns:
-            Both, by sensor and axis.
-        """
-        certain = _certain(config)
-        found: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
+    def apart(self, config: FusionConfig) -> dict[tuple[str, str], list[FloatArray]]:
+        """How far the measurements of each sensor on an axis are from the noiseless arm [m], of each segment (m,)."""
+        certain, found = _certain(config), dict[tuple[str, str], list[FloatArray]]()
         for part in self._parts:
-            rows, value = part.segment.measurement_rows, part.segment.unwrapped()[:, 0]
-            predicted = value - innovations(part.segment, certain).innovation[:, 0]
+            left = innovations(part.segment, certain).innovation[:, 0]
             for number, name in enumerate(part.segment.sensors):
-                mine = rows.source == number
-                if not mine.any():
-                    continue
-                expected, measured = predicted[mine], value[mine]
-                if centred:
-                    expected, measured = expected - np.median(expected), measured - np.median(measured)
-                found.setdefault((name, self.axes[part.axis]), []).append((expected, measured))
-        return {
-            key: (np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]))
-            for key, pairs in found.items()
-        }
+                if (mine := part.segment.measurement_rows.source == number).any():
+                    found.setdefault((name, self.axes[part.axis]), []).append(left[mine])
+        return found
 
     def shifts(
         self, axis: str, config: FusionConfig, count: int, free: Sequence[Parameter] = ()
@@ -291,15 +266,9 @@ class Likelihood:
         The filter is linear in the measurements: what a lag that is longer in one part alone adds to the innovations
         is the difference of two runs of it, and the shifts are least squares on those.
 
-        Args:
-            axis: The axis.
-            config: The configuration.
-            count: How many parts.
-            free: What was fitted to the same measurements, which may have explained a part of the shifts.
-
-        Returns:
-            The middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,),
-            (n,) and (n, n); None where there are too few measurements.
+        What is ``free`` was fitted to the same measurements, and may have explained a part of the shifts. Returns the
+        middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,), (n,) and
+        (n, n); None where there are too few measurements.
         """
         part = max(self._of(axis), key=lambda one: len(one.rows), default=None)
         if part is None or len(part.rows) < 3 * count:
@@ -337,8 +306,8 @@ class Likelihood:
     def misfit(self, config: FusionConfig) -> dict[str, float]:
         """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis."""
         found: dict[str, list[float]] = {axis: [] for axis in self.axes}
-        for (name, axis), (expected, measured) in self.responses(config).items():
-            apart = SD_OF_MEDIAN * float(np.median(np.abs(measured - expected)))
+        for (name, axis), parts in self.apart(config).items():
+            apart = SD_OF_MEDIAN * float(np.median(np.abs(np.concatenate([one - np.median(one) for one in parts]))))
             found[axis].append(max(apart / abs(config.sensors[name].scale), _SMALLEST))
         return {axis: min(apart, default=_SMALLEST) for axis, apart in found.items()}
 
@@ -360,13 +329,8 @@ class Likelihood:
         }
         return [axis for number, axis in enumerate(self.axes) if number in mine]
 
-    def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> LogLikelihood:
-        """The log-likelihood of the measurements under a configuration.
-
-        Args:
-            config: The configuration.
-            outcomes: The outcome of each component, to be repeated; None: the configuration's gates decide.
-        """
+    def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> Point:
+        """The log-likelihood of the measurements, without priors; for ``outcomes`` of None the gates decide on them."""
         axes, results, densities = np.zeros(len(self.axes)), list[Results](), list[FloatArray]()
         for number, segment in enumerate(self._segments):
             found = innovations(segment, config, None if outcomes is None else outcomes[number])
@@ -375,40 +339,35 @@ class Likelihood:
             results.append(found)
         for part in self._parts:
             axes[part.axis] += float(densities[part.whole][part.rows, part.column].sum())
-        return LogLikelihood(axes, results)
+        return Point(config, axes, np.zeros(len(axes)), results)
 
     def derivatives(
         self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]
     ) -> Derivatives:
         """Score and information of parameters while each component's outcome stays as it is."""
 
-        def of(part: _Part) -> _Linear:
-            return self._linear(part, outcomes, config, parameters)
+        def of(part: _Part) -> tuple[list[int], FloatArray, FloatArray]:
+            """Which parameters a part depends on, the scores of its pieces (p, pieces), and its information (p, p)."""
+            outcome = outcomes[part.whole][part.rows, part.column]
+            mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
+            beside = list[tuple[FusionConfig, FusionConfig, float]]()
+            for one in (parameters[number] for number in mine):
+                at, step = one.at(config), _LOG_STEP if one.log else _STEP
+                beside.append((one.move(config, at - step), one.move(config, at + step), 2.0 * step))
+            found, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
+            fused, sd = outcome != int(Outcome.REJECTED), found.innovation_sd[:, 0]
+            r, d_nu, d_s = found.innovation[:, 0] / sd, d_nu[:, :, 0] * (fused / sd), d_s[:, :, 0] / sd**2
+            excess = np.where(fused, r * r - 1.0, -1.0)
+            begins = np.unique(np.arange(_PIECES) * len(r) // _PIECES)
+            score = np.add.reduceat(0.5 * d_s * excess - d_nu * r, begins, axis=1)
+            return mine, score, d_nu @ d_nu.T + 0.5 * d_s @ d_s.T
 
         k = len(parameters)
         information, scores = np.zeros((k, k)), np.zeros((len(self._segments), k, _PIECES))
-        for part in in_threads(of, self._parts):
-            d_nu, d_s = part.d_nu * (part.fused / np.sqrt(part.S)), part.d_s / part.S
-            r = part.nu / np.sqrt(part.S)
-            excess = np.where(part.fused, r * r - 1.0, -1.0)
-            begins = np.unique(np.arange(_PIECES) * len(r) // _PIECES)
-            score = np.add.reduceat(0.5 * d_s * excess - d_nu * r, begins, axis=1)
-            scores[part.whole, part.mine, : len(begins)] += score
-            information[np.ix_(part.mine, part.mine)] += d_nu @ d_nu.T + 0.5 * d_s @ d_s.T
+        for part, (mine, score, known) in zip(self._parts, in_threads(of, self._parts), strict=True):
+            scores[part.whole, mine, : score.shape[1]] += score
+            information[np.ix_(mine, mine)] += known
         return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
-
-    def _linear(
-        self, part: _Part, outcomes: Sequence[CodeArray], config: FusionConfig, parameters: Sequence[Parameter]
-    ) -> _Linear:
-        outcome = outcomes[part.whole][part.rows, part.column]
-        mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
-        beside = list[tuple[FusionConfig, FusionConfig, float]]()
-        for one in (parameters[number] for number in mine):
-            at, step = one.at(config), _LOG_STEP if one.log else _STEP
-            beside.append((one.move(config, at - step), one.move(config, at + step), 2.0 * step))
-        found, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
-        nu, S = found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
-        return _Linear(part.whole, mine, outcome != int(Outcome.REJECTED), nu, S, d_nu[:, :, 0], d_s[:, :, 0])
 
 
 def _certain(config: FusionConfig) -> FusionConfig:

@@ -8,15 +8,14 @@ taken where the log-posterior itself, gates included, is greater there (λ as in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray
-from ..filter.events import Results
 from ..fusion.config import FusionConfig
-from .likelihood import Derivatives, Likelihood, in_threads
+from .likelihood import Derivatives, Likelihood, Point, in_threads
 from .parameters import Parameter, coordinates, moved, with_axis_of
 from .steps import bounded_step
 
@@ -35,27 +34,6 @@ _SHARES = (1.0, 0.5, 0.2)
 _REACH = 1.5  # longest step of a coordinate, in its scale
 
 
-@dataclass(frozen=True)
-class Point:
-    """A configuration with its log-likelihood and its log-posterior."""
-
-    config: FusionConfig  # the configuration
-    log_likelihood: float  # its log-likelihood
-    # the log-posterior of each axis but for a constant (shared parameters' priors count for the first), (A,)
-    axes: FloatArray
-    results: Sequence[Results]  # what became of each component, for each segment
-
-    @property
-    def outcomes(self) -> list[CodeArray]:
-        """The outcome of each component, for each segment, (m, A)."""
-        return [one.outcome for one in self.results]
-
-    @property
-    def log_posterior(self) -> float:
-        """The log-posterior of all axes: what is maximised."""
-        return float(self.axes.sum())
-
-
 Notify: TypeAlias = Callable[[Point], None]
 
 
@@ -70,10 +48,10 @@ def point(
     outcomes: Sequence[CodeArray] | None = None,
 ) -> Point:
     """Evaluate a configuration; with ``outcomes`` these are repeated and its gates are not applied."""
-    found, prior = likelihood.evaluate(config, outcomes), np.zeros(len(likelihood.axes))
+    prior = np.zeros(len(likelihood.axes))
     for one in free:
         prior[0 if one.axis is None else likelihood.axes.index(one.axis)] += one.log_prior(config)
-    return Point(config, found.total, found.axes + prior, found.results)
+    return replace(likelihood.evaluate(config, outcomes), priors=prior)
 
 
 def derivatives(likelihood: Likelihood, at: Point, free: Sequence[Parameter]) -> Derivatives:
@@ -96,16 +74,10 @@ def maximise(
     tolerance: float = _TOLERANCE,
     worth: float = -np.inf,
 ) -> Point:
-    """Find the nearest maximum of the log-posterior.
+    """Find the nearest maximum of the log-posterior; for ``outcomes`` of None the gates decide on them.
 
-    Args:
-        likelihood: The likelihood.
-        start: Where to start.
-        free: The parameters to vary.
-        notify: Called with each better point.
-        outcomes: The outcome of each component, to be repeated; None: the gates decide.
-        tolerance: Gain in log-likelihood that is not worth another step.
-        worth: The log-posterior below which a maximum is not wanted: where it is out of reach, the search ends early.
+    A gain in log-likelihood of less than the ``tolerance`` is not worth another step, and a maximum below ``worth`` is
+    not wanted: where that is out of reach, the search ends early.
     """
     best, small = point(likelihood, start, free, outcomes), 0
     ascent = _Ascent(likelihood, free, outcomes, tolerance)
@@ -150,7 +122,7 @@ class _Ascent:
                 return best, step, expected
             trial = self._point(best, at + step)
             gained = trial.log_posterior - best.log_posterior
-            worse = np.append(trial.axes < best.axes, gained < 0.0)[self._axis]
+            worse = np.append(trial.posteriors < best.posteriors, gained < 0.0)[self._axis]
             if gained > 0.0:
                 less = worse | (gained < _POOR * expected)
                 self._damping = np.where(less, 10.0 * self._damping, 0.1 * self._damping)

@@ -16,7 +16,7 @@ from ..arrays import FloatArray
 from ..errors import ConfigError, suggestion
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor
 from ..model.arm import Sag
-from ..model.plants import FirstOrder, SecondOrder
+from ..model.plants import SecondOrder
 from ..units import ending, of_kind, si
 from .arms import BELIEF, BENDS, BEYOND, Arm, Rest, longest_delay
 
@@ -234,26 +234,28 @@ def parameters(
         resolution: The least noise of a sensor on an axis [m or rad]: at rest all its values may be one.
         believed: The noise that a sensor on an axis is believed to have, within a factor of some 2 [m or rad].
     """
+    free = list[Parameter]()
+    for one in _every(known, sensors, fit):
+        if is_fixed(one.key, fixed) or not _belongs(one, config, sensors):
+            continue
+        if one.is_noise:
+            of = str(one.sensor), str(one.axis)
+            one = replace(one, bounds=(max(resolution.get(of, 0.0), one.bounds[0]), one.bounds[1]))
+            one = replace(one, prior=(one.coordinate(believed[of]), BELIEF)) if of in believed else one
+        free.append(one)
+    return free
+
+
+def _every(known: FusionConfig, sensors: Mapping[str, Sequence[str]], fit: Sequence[Fit]) -> list[Parameter]:
+    """The lines of the table for each axis and its sensors, then those that belong to no axis."""
     used = {name for names in sensors.values() for name in names}
-    every = [
+    return [
         line.of(known, axis, name)
         for axis, names in (*sensors.items(), (None, [name for name in known.sensors if name in used]))
         for line in _TABLE
         if line.fit in fit and ("{axis}" in line.key) == (axis is not None)
         for name in (names if "{sensor}" in line.key else [None])
     ]
-    free = [one for one in every if not is_fixed(one.key, fixed)]
-    free = [one for one in free if _belongs(one, config, sensors)]
-    return [_noise(one, resolution, believed) if one.is_noise else one for one in free]
-
-
-def _noise(
-    one: Parameter, resolution: Mapping[tuple[str, str], float], believed: Mapping[tuple[str, str], float]
-) -> Parameter:
-    """A sensor's noise with its least value and what is believed of it."""
-    of = str(one.sensor), str(one.axis)
-    one = replace(one, bounds=(max(resolution.get(of, 0.0), one.bounds[0]), one.bounds[1]))
-    return replace(one, prior=(one.coordinate(believed[of]), BELIEF)) if of in believed else one
 
 
 def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
@@ -298,18 +300,12 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
     Raises:
         ConfigError: It names none.
     """
-    sensors = dict.fromkeys(config.arm.axes, tuple(config.sensors))
-    biases = {of_kind("bias_sd_mm", kind) for kind in config.arm.kinds}
-    keys = {f"sensors.{name}.{bias}" for name in config.sensors for bias in biases} | {"delay_ms"}
-    for order in (1, 2):
-        for axis in sensors:
-            config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
-            for bend in BENDS:
-                config = changed(config, ("arm", "axes", axis, bend), 1.0)
-            both = Sag(knee=0.0, slope_beyond=-0.1, knee_below=0.0, slope_below=-0.1)
-            config = changed(config, ("arm", "axes", axis, "sag"), both)
-        config = with_drifts(with_own_delays(config, sensors))
-        keys |= {one.key for one in parameters(config, config, sensors, FITS)}
+    measured = {
+        axis: [name for name, sensor in config.sensors.items() if sensor.sd_of(axis) is not None]
+        for axis in config.arm.axes
+    }
+    keys = {one.key for one in _every(config, measured, FITS)}
+    keys |= {f"sensors.{name}.{of_kind('bias_sd_mm', kind)}" for name in config.sensors for kind in config.arm.kinds}
     for name in fixed:
         if not any(is_fixed(key, [name]) for key in keys):
             parts = sorted({part for key in keys for part in key.split(".")})
@@ -367,16 +363,6 @@ def rounded(value: float) -> float:
     return float(f"{value:.{_DIGITS}g}")
 
 
-def with_order(config: FusionConfig, axis: str, order: int) -> FusionConfig:
-    """The configuration with an axis's plant of this order and of the same lag."""
-    plant = config.arm.axes[axis].plant
-    if (1 if isinstance(plant, FirstOrder) else 2) == order:
-        return config
-    lag = plant.lag
-    plant = FirstOrder(time_constant=lag) if order == 1 else SecondOrder(natural_frequency=2.0 / lag, damping=1.0)
-    return changed(config, ("arm", "axes", axis, "plant"), plant)
-
-
 def rings(config: FusionConfig, axis: str) -> bool:
     """Whether the plant of an axis is lightly damped."""
     plant = config.arm.axes[axis].plant
@@ -395,12 +381,6 @@ def with_shared_delay(config: FusionConfig, axes: Iterable[str], delay: float) -
     for axis in axes:
         config = changed(config, ("arm", "axes", axis, "delay"), None)
     return changed(config, ("arm", "delay"), delay)
-
-
-def with_recovery(config: FusionConfig, axis: str, recovery: float | None) -> FusionConfig:
-    """The configuration with a gain of an axis that recovers so fast [s], or for None is constant."""
-    config = changed(config, ("arm", "axes", axis, "gain_recovery"), recovery)
-    return config if recovery is not None else changed(config, ("arm", "axes", axis, "gain", "slope"), 0.0)
 
 
 def with_disturbance(

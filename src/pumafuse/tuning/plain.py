@@ -117,8 +117,7 @@ def plain_arm(measured: Measured) -> PlainArm | None:
         return None
     most = 0.5 * (power * _CHANCE / number + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
-    commands = [Arm(delay, float(LAGS[0])) for delay in late]
-    delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
+    (delayed,) = measured.likeliest([Arm(delay, float(LAGS[0])) for delay in late], rest, None, 1)
     between = float(min(allowed)), float(max(allowed))
     step = None
     if len(whole.recordings) == 1:  # of several nothing is told
@@ -128,12 +127,9 @@ def plain_arm(measured: Measured) -> PlainArm | None:
 
 
 def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
-    """Where another lag in the second part of a run leaves much less than one for all of it; None where none does.
+    """Where another lag in the second part of a run, or of parts of one, leaves much less than an arm for all of it.
 
-    Args:
-        measured: One recording, or parts of one.
-        arm: Of all of it, or near that.
-        begin: When the first command was given [ns].
+    None where none does. The ``arm`` is near that; the first command was given at ``begin`` [ns].
     """
     rest = measured.white(arm)
     arm = measured.fitted(arm, ["delay", "gain"], rest, _ANY).arm

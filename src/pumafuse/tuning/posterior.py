@@ -134,12 +134,7 @@ class AxisPosterior:
         return found
 
     def mixture(self, others: Iterable[AxisPosterior] = (), sharing: float = 1.0) -> Mixture:
-        """The mixture, with what other axes say of the dead time, so far as it is likely that they share it.
-
-        Args:
-            others: The other axes.
-            sharing: The probability that they do.
-        """
+        """The mixture, with what other axes say of the dead time, as it is likely by ``sharing`` that they share it."""
         parts = [self._points(branch) for branch in self.branches]
         delay = np.concatenate([part.delay for part in parts])
         own = np.concatenate([part.weight for part in parts])

@@ -7,7 +7,7 @@ is worth its numbers is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
 import msgspec
@@ -18,8 +18,8 @@ from ..fusion.config import FusionConfig
 from .arm_search import SMOOTHER, WANDERS, ArmSearch, Freedom, chosen_arms
 from .arms import BENDS, Arm
 from .identifiability import covariance
-from .likelihood import Likelihood, in_threads
-from .maximise import Notify, Point, derivatives, maximise, maximise_by_axis, maximise_with_gates, point
+from .likelihood import Likelihood, Point, in_threads
+from .maximise import Notify, derivatives, maximise, maximise_by_axis, maximise_with_gates, point
 from .parameters import (
     LATENCIES,
     Parameter,
@@ -32,7 +32,7 @@ from .parameters import (
     with_rest,
     with_shared_delay,
 )
-from .posterior import GAINS, GainKind, Mixture, Model, own_worth
+from .posterior import GAINS, GainKind, Mixture, Model
 
 _ROUGHLY = 0.1  # tolerance in log-likelihood where maxima are only compared
 _STEP = 0.010  # s, between latencies that are tried: their maxima are as wide
@@ -56,55 +56,229 @@ _NAMES = {  # of an arm's coordinates, by the fields that they are in a configur
 }
 
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
-Reasons: TypeAlias = dict[str, list[str]]  # by axis
 
 
-def search(
-    likelihood: Likelihood,
-    config: FusionConfig,
-    free: FreeOf,
-    arms: Mapping[str, ArmSearch],
-    notify: Notify,
-    one_delay: bool = False,
-) -> tuple[Point, dict[str, str]]:
-    """Find the most likely configuration.
+class Search:
+    """The search for the most likely configuration of a likelihood with some free parameters."""
 
-    Args:
-        likelihood: The likelihood.
-        config: The configuration as given.
-        free: The parameters to vary, which depend on the order of the plants.
-        arms: What was looked for of each axis's arm.
-        notify: Called with each better point.
-        one_delay: Whether all axes whose delay is free share one whatever the measurements say.
+    def __init__(self, likelihood: Likelihood, free: FreeOf, arms: Mapping[str, ArmSearch], notify: Notify) -> None:
+        """Of ``arms`` that were looked for; what is ``free`` depends on the order of the plants."""
+        self.likelihood, self.free, self.arms, self.notify = likelihood, free, arms, notify
+        # for the order of the plant of an axis, its gain, its disturbance and whether it shares a delay
+        self.reasons: dict[str, list[str]] = {axis: [] for axis in likelihood.sensors}
 
-    Returns:
-        The best point; and for each axis the reasons for the order of its plant, its gain, its disturbance and whether
-        it shares the arm's delay.
-    """
-    reasons: Reasons = {axis: [] for axis in likelihood.sensors}
-    config = _with_arms(config, {axis: one for axis, one in arms.items() if one.freedom.free}, one_delay, reasons)
-    for one in free(config):
-        if one.fit == "latency":
-            config = _nearest_latency(likelihood, config, one, free)
-    found = list[Point]()
-    for start in _noise_models(likelihood, config, arms, free):
-        if found:  # an arm that is likeliest under one noise is near that under another
-            start = _with_arm_of(start, found[0].config, free)
-        found.append(_maximum(likelihood, start, free, notify))
-    likeliest = _likeliest(likelihood, found, free)
-    smooth = _smoothly_disturbed(likelihood, likeliest, arms, free, notify)
-    if _likeliest(likelihood, [*found, *smooth], free) != likeliest:
-        found += smooth
-    best = _from_wider_gates(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
-    best = _without_needless(likelihood, best, free, notify)
-    best = _under_gates(likelihood, best, config, free, notify)
-    for axis, why in reasons.items():
-        if rings(best.config, axis):
-            why.append("its plant rings: what holds the tool off is a disturbance, not noise that shakes the plant")
-    return best, {axis: "; ".join(why) for axis, why in reasons.items() if why}
+    def found(self, config: FusionConfig, one_delay: bool) -> tuple[Point, dict[str, str]]:
+        """The best point from a configuration as given, and the reasons by axis.
 
+        With ``one_delay`` all axes whose delay is free share one whatever the measurements say.
+        """
+        config = self._with_arms(config, one_delay)
+        for one in self.free(config):
+            if one.fit == "latency":
+                config = self._nearest_latency(config, one)
+        found = list[Point]()
+        for start in self._noise_models(config):
+            if found:  # an arm that is likeliest under one noise is near that under another
+                start = self._with_arm_of(start, found[0].config)
+            found.append(self._maximum(start))
+        likeliest = self._likeliest(found)
+        smooth = self._smoothly_disturbed(likeliest)
+        if self._likeliest([*found, *smooth]) != likeliest:
+            found += smooth
+        best = self._without_needless(self._from_wider_gates(self._likeliest(found, told=True)))
+        best = self._under_gates(best, config)
+        for axis, why in self.reasons.items():
+            if rings(best.config, axis):
+                why.append("its plant rings: what holds the tool off is a disturbance, not noise that shakes the plant")
+        return best, {axis: "; ".join(why) for axis, why in self.reasons.items() if why}
 
-# ---- arms -----------------------------------------------------------------------------------------------------------
+    def _own(self, config: FusionConfig) -> list[Parameter]:
+        """The free parameters that belong to an axis."""
+        return [one for one in self.free(config) if one.axis is not None]
+
+    # ---- arms and latencies -----------------------------------------------------------------------------------------
+
+    def _with_arms(self, config: FusionConfig, one_delay: bool) -> FusionConfig:
+        """The configuration with the likeliest arm of each axis; one delay for those that share it."""
+        searched = {axis: one for axis, one in self.arms.items() if one.freedom.free}
+        delayed = [axis for axis, one in searched.items() if "delay" in one.freedom.free]
+        found, delay = chosen_arms(searched, delayed, one_delay)
+        for axis, one in found.items():
+            config, why = with_arm(config, axis, one.arm), self.reasons[axis]
+            why += _why(searched[axis].freedom, one.mixture, one.model)
+            if (bent := searched[axis].bent) is not None:
+                why += bent.sentences(config.arm.screen_of(axis))
+            if len(delayed) > 1 and axis in delayed:
+                gain = "" if one.worth is None else f" (own {one.worth:+.1f})"
+                why.append(f"delay: {'shared' if one.shares else 'its own'}{gain}")
+        shares = [axis for axis, one in found.items() if one.shares]
+        return config if delay is None else with_shared_delay(config, shares, delay)
+
+    def _nearest_latency(self, config: FusionConfig, one: Parameter) -> FusionConfig:
+        """The configuration with the likeliest latency of a sensor on a grid."""
+        middle, steps = one.get(config), round((LATENCIES[1] - LATENCIES[0]) / _STEP)
+        shifts: list[float] = np.linspace(*LATENCIES, 1 + steps).tolist()
+        tried = [one.put(config, one.clipped(middle + shift)) for shift in shifts]
+        points = (point(self.likelihood, at, self.free(at)) for at in tried)
+        return max(points, key=lambda found: found.log_posterior).config
+
+    def _with_arm_of(self, config: FusionConfig, other: FusionConfig) -> FusionConfig:
+        """The configuration with the arm of another, and with its numbers that all axes share."""
+        config = msgspec.structs.replace(config, arm=other.arm)
+        for one in self.free(other):
+            if one.axis is None:
+                config = one.put(config, one.get(other))
+        return config
+
+    # ---- noise ------------------------------------------------------------------------------------------------------
+
+    def _noise_models(self, config: FusionConfig) -> list[FusionConfig]:
+        """With what the arms leave: without a disturbance, and where one may be fitted with either kind.
+
+        Noise that is not free stays as it is.
+        """
+        models = list[FusionConfig]()
+        for number in range(3):
+            model = config
+            for axis, search in self.arms.items():
+                model = with_rest(model, axis, search.rests[number], search.sensors)
+            models.append(self._with_free_noise(config, model))
+        distinct = [model for place, model in enumerate(models) if model not in models[:place]]
+        return [self._with_quiet(one) for one in distinct]
+
+    def _smoothly_disturbed(self, config: FusionConfig) -> list[Point]:
+        """The maximum with a smooth disturbance of axes that have none, from all that the arm leaves.
+
+        From little of it, beside noise that is not the best yet, it vanishes.
+        """
+        calm = [axis for axis in self._may_be_disturbed(config) if config.process[axis].disturbance_sd == 0.0]
+        if not calm:
+            return []
+        model = config
+        for axis in calm:
+            model = with_disturbance(model, axis, self.arms[axis].spread, _SLOW)
+        there = self._maximum(model, axes=calm).config
+        return [point(self.likelihood, there, self._own(there))]
+
+    def _with_free_noise(self, config: FusionConfig, model: FusionConfig) -> FusionConfig:
+        """The configuration with the noises of a model that are free."""
+        for axis in self._may_be_disturbed(config):
+            new = model.process[axis]
+            config = with_disturbance(config, axis, new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
+        for one in self.free(config):
+            if one.fit == "noise" and (one.sensor or one.path[-1] in _WALKING):
+                none = one.vanishes and one.at_bound(model) == "lower"
+                config = one.put(config, 0.0 if none else one.clipped(one.get(model)))
+        return config
+
+    def _may_be_disturbed(self, config: FusionConfig) -> list[str]:
+        """The axes of which a disturbance is free."""
+        for axis in self.likelihood.sensors:
+            config = with_disturbance(config, axis, 1.0, 1.0)
+        return [str(one.axis) for one in self.free(config) if one.path[-1] == "disturbance_sd"]
+
+    def _with_quiet(self, config: FusionConfig) -> FusionConfig:
+        """The configuration with a little of each free noise that is none in it, from which it can grow."""
+        for one in self.free(config):
+            if one.fit == "noise" and one.vanishes and one.axis in self.arms and one.get(config) <= 30 * one.bounds[0]:
+                share = _QUIET * (10.0 if one.path[-1].startswith("maneuver") else 1.0)
+                little = max(share * self.arms[str(one.axis)].spread, 30.0 * one.bounds[0])
+                config = one.put(config, one.clipped(little))
+        return config
+
+    # ---- maxima -----------------------------------------------------------------------------------------------------
+
+    def _maximum(self, config: FusionConfig, times: float | None = None, axes: Sequence[str] | None = None) -> Point:
+        """The maximum next to a configuration, each component being rejected for itself, by way of wider gates.
+
+        Gates make the likelihood jump: outliers that narrow gates reject are explained by noise where gates are wide.
+        By default gates are narrower first. Only the numbers of some ``axes`` are free, if they are given.
+        """
+
+        def free(at: FusionConfig) -> list[Parameter]:
+            return [one for one in self.free(at) if axes is None or one.axis in axes]
+
+        times = _narrower(config) if times is None else times
+        gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())
+        at = config
+        for wider in (times, 1.0) if gated else (1.0,):
+            at = with_gates(at, config, wider)
+            if shared := [one for one in free(at) if one.axis is None]:
+                at = maximise(self.likelihood, at, shared, self.notify, tolerance=_ROUGHLY).config
+            own = [one for one in free(at) if one.axis is not None]
+            at = maximise_by_axis(self.likelihood, at, own, self.notify, _ROUGHLY).config
+        if any(one.axis is None and one.sensor is not None for one in free(at)):  # which trades with noise
+            at = maximise(self.likelihood, at, free(at), self.notify, tolerance=_ROUGHLY).config
+        return point(self.likelihood, at, [one for one in free(at) if one.axis is not None])
+
+    def _from_wider_gates(self, config: FusionConfig) -> FusionConfig:
+        """The higher maximum of each axis, this one or that reached by way of wider gates, where any are rejected."""
+        found = point(self.likelihood, config, self._own(config))
+        if not self.likelihood.rejecting(found.results):
+            return config
+        peaks = [found, self._maximum(config, _WIDER)]
+        return _best_by_axis(self.likelihood, peaks, [peak.posteriors for peak in peaks])
+
+    def _under_gates(self, best: FusionConfig, given: FusionConfig) -> Point:
+        """The highest of the maxima under the gates as given.
+
+        Where whole rows are rejected it is looked for from narrower and wider gates.
+        """
+        free = self.free(best)
+        found = maximise_with_gates(self.likelihood, with_gates(best, given), free, self.notify)
+        whole = any(sensor.gates_rows(given.arm) for sensor in given.sensors.values())
+        if not (whole and self.likelihood.rejecting(found.results)):
+            return found
+        starts = [with_gates(found.config, given, times) for times in (_narrower(given), _WIDER)]
+        for start in [maximise(self.likelihood, one, free, tolerance=_ROUGHLY).config for one in starts]:
+            other = maximise_with_gates(self.likelihood, with_gates(start, given), free, self.notify)
+            found = max(found, other, key=lambda one: one.log_posterior)
+        return found
+
+    # ---- which noise pays -------------------------------------------------------------------------------------------
+
+    def _likeliest(self, peaks: Sequence[Point], told: bool = False) -> FusionConfig:
+        """The model of noise that is best for each axis after the penalty for its numbers; the reasons get why."""
+        scores = [_penalised(self.likelihood, peak, self.free(peak.config)) for peak in peaks]
+        for number, axis in enumerate(self.likelihood.axes):
+            for peak, score in zip(peaks, scores, strict=True):
+                process = peak.config.process[axis]
+                if process.disturbance_sd == 0.0:
+                    score[number] -= WANDERS
+                elif process.disturbance_kind == "matern":
+                    score[number] -= SMOOTHER
+            kinds = [_kind(peak.config, axis) for peak in peaks]
+            if told and len(set(kinds)) > 1 and axis in self.reasons:
+                mine = dict[str, float]()
+                for kind, score in zip(kinds, scores, strict=True):
+                    mine[kind] = max(float(score[number]), mine.get(kind, -np.inf))
+                gain = max(mine[kind] for kind in mine if kind != "none") - mine.get("none", -np.inf)
+                why = f"(one {gain:+.1f})"
+                if np.isinf(gain):
+                    soon = 1e3 * quickest(peaks[0].config)
+                    why = f"(one would be forgotten within {soon:.0f} ms, too soon for an arm)"
+                self.reasons[axis].append(f"disturbance: {max(mine, key=lambda kind: mine[kind])} {why}")
+        return _best_by_axis(self.likelihood, peaks, scores)
+
+    def _without_needless(self, config: FusionConfig) -> FusionConfig:
+        """The configuration without the noises that are not worth their penalty, one kind after the other.
+
+        Beside a disturbance it is twice as high: real arms jerk, and any noise that is large at that moment gains
+        likelihood without being true elsewhere. One that is known to an eighth of itself is needed, whatever it costs.
+        """
+        needed = _well_known(self.likelihood, config, self.free(config))
+        for field in _WALKING:
+            without = config
+            for one in self.free(config):
+                if one.path[-1] == field and one.key not in needed:
+                    without = one.put(without, one.bounds[0])
+            if without == config:
+                continue
+            peaks = [point(self.likelihood, config, self.free(config))]
+            peaks.append(maximise_by_axis(self.likelihood, without, self._own(without), self.notify, _ROUGHLY))
+            scores = [_penalised(self.likelihood, peak, self.free(peak.config), of_noise=2.0) for peak in peaks]
+            config = _best_by_axis(self.likelihood, peaks, scores)
+        return config
 
 
 def arm_searches(
@@ -112,12 +286,7 @@ def arm_searches(
 ) -> dict[str, ArmSearch]:
     """The arm of each axis as far as it is free, and what it leaves, by sensors whose latency is known and steady.
 
-    Args:
-        likelihood: The likelihood.
-        config: The configuration as given.
-        free: The parameters to vary.
-        believed: Whether the sensors' noise is believed to be what second differences show.
-        known: Those that were searched for already.
+    ``believed``: the sensors' noise, to be what second differences show; ``known``: arms that were searched for before.
     """
     late = {one.sensor for one in free(config) if one.fit == "latency"}
     late |= {name for name, sensor in config.sensors.items() if sensor.latency_sd}
@@ -154,25 +323,6 @@ def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom:
     return Freedom(given, names, (1, 2) if whole else (order,), gains)
 
 
-def _with_arms(
-    config: FusionConfig, searched: Mapping[str, ArmSearch], one_delay: bool, reasons: Reasons
-) -> FusionConfig:
-    """The configuration with the likeliest arm of each axis; one delay for those that share it."""
-    delayed = {axis: one.posterior for axis, one in searched.items() if "delay" in one.freedom.free}
-    found, delay = chosen_arms(searched, delayed, one_delay)
-    shares = [axis for axis, one in found.items() if one.shares]
-    worth = {} if one_delay else own_worth(delayed, shares)
-    for axis, one in found.items():
-        config = with_arm(config, axis, one.arm)
-        reasons[axis] += _why(searched[axis].freedom, one.mixture, one.model)
-        if (bent := searched[axis].bent) is not None:
-            reasons[axis] += bent.sentences(config.arm.screen_of(axis))
-        if len(delayed) > 1 and axis in delayed:
-            gain = f" (own {worth[axis]:+.1f})" if axis in worth else ""
-            reasons[axis].append(f"delay: {'shared' if one.shares else 'its own'}{gain}")
-    return config if delay is None else with_shared_delay(config, shares, delay)
-
-
 def _why(freedom: Freedom, mixture: Mixture, model: Model) -> list[str]:
     """Which order and which kind of gain are likely, and by how much the alternative is behind in log-probability."""
     found = list[str]()
@@ -185,202 +335,16 @@ def _why(freedom: Freedom, mixture: Mixture, model: Model) -> list[str]:
     return found
 
 
-def _nearest_latency(likelihood: Likelihood, config: FusionConfig, one: Parameter, free: FreeOf) -> FusionConfig:
-    """The configuration with the likeliest latency of a sensor on a grid."""
-    middle, steps = one.get(config), round((LATENCIES[1] - LATENCIES[0]) / _STEP)
-    shifts: list[float] = np.linspace(*LATENCIES, 1 + steps).tolist()
-    tried = [one.put(config, one.clipped(middle + shift)) for shift in shifts]
-    return max((point(likelihood, at, free(at)) for at in tried), key=lambda found: found.log_posterior).config
-
-
-# ---- noise ----------------------------------------------------------------------------------------------------------
-
-
-def _noise_models(
-    likelihood: Likelihood, config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf
-) -> list[FusionConfig]:
-    """The configuration with what the arms leave: without a disturbance, and where one may be fitted with either kind.
-
-    Noise that is not free stays as it is.
-    """
-    models = list[FusionConfig]()
-    for number in range(3):
-        model = config
-        for axis, search in arms.items():
-            model = with_rest(model, axis, search.rests[number], search.sensors)
-        models.append(_with_free_noise(config, model, free, likelihood.sensors))
-    distinct = [model for place, model in enumerate(models) if model not in models[:place]]
-    return [_with_quiet(one, arms, free) for one in distinct]
-
-
-def _smoothly_disturbed(
-    likelihood: Likelihood, config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf, notify: Notify
-) -> list[Point]:
-    """The maximum with a smooth disturbance of axes that have none, from all that the arm leaves and the best noise.
-
-    From little of it, beside noise that is not the best yet, it vanishes.
-    """
-    calm = [axis for axis in _may_be_disturbed(config, free, arms) if config.process[axis].disturbance_sd == 0.0]
-    if not calm:
-        return []
-    model = config
-    for axis in calm:
-        model = with_disturbance(model, axis, arms[axis].spread, _SLOW)
-
-    def theirs(at: FusionConfig) -> list[Parameter]:
-        return [one for one in free(at) if one.axis in calm]
-
-    there = _maximum(likelihood, model, theirs, notify).config
-    return [point(likelihood, there, [one for one in free(there) if one.axis is not None])]
-
-
-def _with_free_noise(config: FusionConfig, model: FusionConfig, free: FreeOf, axes: Iterable[str]) -> FusionConfig:
-    """The configuration with the noises of a model that are free."""
-    for axis in _may_be_disturbed(config, free, axes):
-        new = model.process[axis]
-        config = with_disturbance(config, axis, new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
-    for one in free(config):
-        if one.fit == "noise" and (one.sensor or one.path[-1] in _WALKING):
-            none = one.vanishes and one.at_bound(model) == "lower"
-            config = one.put(config, 0.0 if none else one.clipped(one.get(model)))
-    return config
-
-
-def _may_be_disturbed(config: FusionConfig, free: FreeOf, axes: Iterable[str]) -> list[str]:
-    """The axes of which a disturbance is free."""
-    for axis in axes:
-        config = with_disturbance(config, axis, 1.0, 1.0)
-    return [str(one.axis) for one in free(config) if one.path[-1] == "disturbance_sd"]
-
-
-def _with_arm_of(config: FusionConfig, other: FusionConfig, free: FreeOf) -> FusionConfig:
-    """The configuration with the arm of another, and with its numbers that all axes share."""
-    config = msgspec.structs.replace(config, arm=other.arm)
-    for one in free(other):
-        if one.axis is None:
-            config = one.put(config, one.get(other))
-    return config
-
-
-def _with_quiet(config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf) -> FusionConfig:
-    """The configuration with a little of each free noise that is none in it, from which it can grow."""
-    for one in free(config):
-        if one.fit == "noise" and one.vanishes and one.axis in arms and one.get(config) <= 30.0 * one.bounds[0]:
-            more = 10.0 if one.path[-1].startswith("maneuver") else 1.0
-            config = one.put(config, one.clipped(max(_QUIET * more * arms[str(one.axis)].spread, 30.0 * one.bounds[0])))
-    return config
-
-
-def _maximum(
-    likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify, times: float | None = None
-) -> Point:
-    """The maximum next to a configuration, each component being rejected for itself, by way of gates as wide as that.
-
-    Gates make the likelihood jump: outliers that narrow gates reject are explained by noise where gates are wide. By
-    default gates are narrower first.
-    """
-    times = _narrower(config) if times is None else times
-    gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())
-    at = config
-    for wider in (times, 1.0) if gated else (1.0,):
-        at = with_gates(at, config, wider)
-        if shared := [one for one in free(at) if one.axis is None]:
-            at = maximise(likelihood, at, shared, notify, tolerance=_ROUGHLY).config
-        own = [one for one in free(at) if one.axis is not None]
-        at = maximise_by_axis(likelihood, at, own, notify, _ROUGHLY).config
-    if any(one.axis is None and one.sensor is not None for one in free(at)):  # which trades with noise
-        at = maximise(likelihood, at, free(at), notify, tolerance=_ROUGHLY).config
-    return point(likelihood, at, [one for one in free(at) if one.axis is not None])
-
-
-def _from_wider_gates(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
-    """The higher maximum of each axis, this one or that reached by way of wider gates, where any are rejected."""
-    found = point(likelihood, config, [one for one in free(config) if one.axis is not None])
-    if not likelihood.rejecting(found.results):
-        return config
-    peaks = [found, _maximum(likelihood, config, free, notify, _WIDER)]
-    return _best_by_axis(likelihood, peaks, [peak.axes for peak in peaks])
-
-
 def _narrower(config: FusionConfig) -> float:
     """By how much gates may be narrower without being too narrow."""
     gates = [sensor.gate for sensor in config.sensors.values() if sensor.gate > 0.0]
     return min(max(_NARROWER, _NARROWEST / min(gates, default=_NARROWEST)), 1.0)
 
 
-def _under_gates(
-    likelihood: Likelihood, best: FusionConfig, given: FusionConfig, free: FreeOf, notify: Notify
-) -> Point:
-    """The highest of the maxima under the gates as given.
-
-    Where whole rows are rejected it is looked for from narrower and wider gates.
-    """
-    found = maximise_with_gates(likelihood, with_gates(best, given), free(best), notify)
-    whole = any(sensor.gates_rows(given.arm) for sensor in given.sensors.values())
-    if not (whole and likelihood.rejecting(found.results)):
-        return found
-    starts = [
-        maximise(likelihood, with_gates(found.config, given, times), free(best), tolerance=_ROUGHLY).config
-        for times in (_narrower(given), _WIDER)
-    ]
-    for start in starts:
-        other = maximise_with_gates(likelihood, with_gates(start, given), free(best), notify)
-        found = max(found, other, key=lambda one: one.log_posterior)
-    return found
-
-
-def _likeliest(
-    likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf, reasons: Reasons | None = None
-) -> FusionConfig:
-    """The model of noise that is best for each axis after the penalty for its numbers; ``reasons`` get why."""
-    scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
-    for number, axis in enumerate(likelihood.axes):
-        for peak, score in zip(peaks, scores, strict=True):
-            process = peak.config.process[axis]
-            if process.disturbance_sd == 0.0:
-                score[number] -= WANDERS
-            elif process.disturbance_kind == "matern":
-                score[number] -= SMOOTHER
-        kinds = [_kind(peak.config, axis) for peak in peaks]
-        if reasons is not None and len(set(kinds)) > 1 and axis in likelihood.sensors:
-            mine = dict[str, float]()
-            for kind, score in zip(kinds, scores, strict=True):
-                mine[kind] = max(float(score[number]), mine.get(kind, -np.inf))
-            gain = max(mine[kind] for kind in mine if kind != "none") - mine.get("none", -np.inf)
-            why = f"(one {gain:+.1f})"
-            if np.isinf(gain):
-                soon = 1e3 * quickest(peaks[0].config)
-                why = f"(one would be forgotten within {soon:.0f} ms, too soon for an arm)"
-            reasons[axis].append(f"disturbance: {max(mine, key=lambda kind: mine[kind])} {why}")
-    return _best_by_axis(likelihood, peaks, scores)
-
-
 def _kind(config: FusionConfig, axis: str) -> str:
     """What disturbance an axis has, in words."""
     process = config.process[axis]
     return "none" if process.disturbance_sd == 0.0 else _KINDS[process.disturbance_kind]
-
-
-def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
-    """The configuration without the noises that are not worth their penalty, one kind after the other.
-
-    Beside a disturbance it is twice as high: real arms jerk, and any noise that is large at that moment gains
-    likelihood without being true elsewhere. One that is known to an eighth of itself is needed, whatever it costs.
-    """
-    needed = _well_known(likelihood, config, free(config))
-    for field in _WALKING:
-        without = config
-        for one in free(config):
-            if one.path[-1] == field and one.key not in needed:
-                without = one.put(without, one.bounds[0])
-        if without == config:
-            continue
-        peaks = [point(likelihood, config, free(config))]
-        own = [one for one in free(without) if one.axis is not None]
-        peaks.append(maximise_by_axis(likelihood, without, own, notify, _ROUGHLY))
-        scores = [_penalised(likelihood, peak, free(peak.config), of_noise=2.0) for peak in peaks]
-        config = _best_by_axis(likelihood, peaks, scores)
-    return config
 
 
 def _well_known(likelihood: Likelihood, config: FusionConfig, free: Sequence[Parameter]) -> set[str]:
@@ -405,7 +369,7 @@ def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter], o
             price[likelihood.axes.index(one.axis)] += of_noise if beside else 1.0
             if one.path[-1] == "disturbance_time" and one.at_bound(peak.config) == "lower":
                 price[likelihood.axes.index(one.axis)] = np.inf
-    return peak.axes - 0.5 * price * np.log(np.maximum(likelihood.count, 2))
+    return peak.posteriors - 0.5 * price * np.log(np.maximum(likelihood.count, 2))
 
 
 def _best_by_axis(likelihood: Likelihood, peaks: Sequence[Point], scores: Sequence[FloatArray]) -> FusionConfig:

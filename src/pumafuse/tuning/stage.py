@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 
-from ..fusion.config import FusionConfig, Sensor
+from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..logs.run import Run
 from ..units import SCREEN, Kind, as_length, of_kind
@@ -23,8 +22,8 @@ from .identifiability import (
     not_identifiable_noise,
     shared_times,
 )
-from .likelihood import Likelihood
-from .maximise import Notify, Point, ignore, maximise_with_gates
+from .likelihood import Likelihood, Point
+from .maximise import Notify, ignore, maximise_with_gates
 from .parameters import (
     LATENCIES,
     Fit,
@@ -37,7 +36,7 @@ from .parameters import (
     with_gates,
     with_own_delays,
 )
-from .search import FreeOf, arm_searches, search
+from .search import FreeOf, Search, arm_searches
 
 _GATE = 5.0  # of the fit for a sensor with a narrow one:
 _NARROWEST = 3.0  # below it rejecting good measurements would pay, the more the smaller the noise
@@ -87,15 +86,7 @@ def run_stage(
 ) -> Stage:
     """Fit the parameters of a plan; where a combination is not identifiable, fix one of it and go on.
 
-    Args:
-        runs: The runs to fit on.
-        config: The configuration before.
-        plan: What to fit.
-        notify: Called with each better point.
-        known: The arms of axes that were searched for already.
-
-    Raises:
-        PumafuseError: Nothing can be fitted to the measurements.
+    ``known``: the arms of axes that were searched for already. Raises a PumafuseError where nothing can be fitted.
     """
     likelihood = likelihood_of(runs, config, plan)
     excited, fixed = excited_axes(likelihood, config), list[NotIdentifiable]()
@@ -104,7 +95,7 @@ def run_stage(
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]
         every = parameters(at, config, likelihood.sensors, plan.fit, names, likelihood.resolution, believed)
-        return for_few(likelihood, [one for one in every if _may_vary(one, at, plan, excited)])[0]
+        return for_few(likelihood, [one for one in every if _may_vary(one, at, plan, excited)])
 
     start, notes = likelihood.config, list[str]()
     own = with_own_delays(start, excited)
@@ -123,7 +114,7 @@ def run_stage(
     if plan.sd_prior:
         believed |= likelihood.scatter
         believed |= {(name, axis): noise for axis, one in arms.items() for name, noise in one.likely_noise.items()}
-    best, orders = search(likelihood, start, free, arms, notify, plan.one_delay)
+    best, orders = Search(likelihood, free, arms, notify).found(start, plan.one_delay)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
@@ -141,7 +132,7 @@ def run_stage(
         for name, sensor in config.sensors.items()
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
-    notes += few_measurements(likelihood, free(best.config)) + for_few(likelihood, [])[1]
+    notes += few_measurements(likelihood, free(best.config))
     return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched)
 
 
@@ -156,15 +147,13 @@ def refitted(stage: Stage, runs: Sequence[Run], config: FusionConfig, plan: Plan
 
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:
     """The likelihood of the runs; where latencies vary, without what one could put before the first command."""
-
-    def gate_of(sensor: Sensor) -> float:
-        return _GATE if 0.0 < sensor.gate < _NARROWEST else min(sensor.gate, _WIDEST)
-
-    sensors = {name: msgspec.structs.replace(one, gate=gate_of(one)) for name, one in config.sensors.items()}
     latest = None
     if "latency" in plan.fit:
         latest = LATENCIES[1] + max((sensor.latency for sensor in config.sensors.values()), default=0.0)
-    return Likelihood(runs, msgspec.structs.replace(config, sensors=sensors), plan.sensors, until=until, latest=latest)
+    for name, sensor in config.sensors.items():
+        gate = _GATE if 0.0 < sensor.gate < _NARROWEST else min(sensor.gate, _WIDEST)
+        config = changed(config, ("sensors", name, "gate"), gate)
+    return Likelihood(runs, config, plan.sensors, until=until, latest=latest)
 
 
 def _may_vary(one: Parameter, config: FusionConfig, plan: Plan, excited: Sequence[str]) -> bool:
@@ -213,15 +202,11 @@ def _identified(
 def with_large_biases(
     likelihood: Likelihood, config: FusionConfig, fixed: Sequence[str]
 ) -> tuple[FusionConfig, list[str]]:
-    """The configuration with a bias for each sensor that is so far off that nothing could be fitted to it.
-
-    Returns:
-        The configuration, and a note for each such sensor.
-    """
+    """With a bias for each sensor that is so far off that nothing could be fitted to it, and a note for each."""
     gaps: dict[tuple[str, Kind], float] = {}
     misfit = likelihood.misfit(config)
-    for (name, axis), (expected, measured) in likelihood.responses(config, centred=False).items():
-        gap = abs(float(np.median(measured - expected)))
+    for (name, axis), apart in likelihood.apart(config).items():
+        gap = abs(float(np.median(np.concatenate(apart))))
         scatter = likelihood.scatter.get((name, axis), 0.0)
         if gap > _FAR * (scatter + misfit[axis] + config.start.offset_sd_of(axis)):
             of = name, config.arm.axes[axis].kind
@@ -238,11 +223,7 @@ def with_large_biases(
 
 
 def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str]) -> tuple[FusionConfig, list[str]]:
-    """The configuration with a bias for each sensor that contradicts a more accurate one by a constant.
-
-    Returns:
-        The configuration, and a note for each such sensor.
-    """
+    """With a bias for each sensor that contradicts a more accurate one by a constant, and a note for each."""
     config, notes = best.config, list[str]()
     used = {name for names in likelihood.sensors.values() for name in names}
     ranked = sorted((name for name in config.sensors if name in used), key=lambda name: smallest_sd(config, name))
@@ -250,9 +231,9 @@ def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str])
         for kind in config.arm.kinds:
             if not _may_be_biased(config, name, kind, fixed):
                 continue
-            before = likelihood.evaluate(config).total
+            before = likelihood.evaluate(config).log_likelihood
             biased = [_with_bias(config, name, kind, width) for width in _BIAS_WIDTHS]
-            gains = [likelihood.evaluate(one).total - before for one in biased]
+            gains = [likelihood.evaluate(one).log_likelihood - before for one in biased]
             best_width = int(np.argmax(gains))
             if gains[best_width] > _BIAS_GAIN:
                 config = biased[best_width]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -136,49 +137,23 @@ def fitted_lags(
     before: FusionConfig,
     after: FusionConfig,
     around: Mapping[str, Distances],
-    lost: Collection[str],
-) -> dict[str, FittedLag]:
-    """The lag of each axis that the free parameters change.
-
-    Args:
-        free: The parameters that were fitted.
-        before: The configuration as given.
-        after: The tuned one.
-        around: From :func:`lag_intervals`; an axis that is not in it gets no interval.
-        lost: Axes of which no lag is told.
-    """
-    found: dict[str, FittedLag] = {}
-    for axis in lag_slopes(free, after):
-        lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
-        if axis in lost:
-            continue
-        low = max(lag - below, min(lag, 0.0))  # no arm is there before its commands
-        ends = [end * MS if abs(end) <= LONGEST else None for end in (low, lag + above)]
-        found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
-    return found
-
-
-def with_doubts(
-    lags: Mapping[str, FittedLag],
-    doubts: Mapping[str, Doubt],
-    before: FusionConfig,
-    after: FusionConfig,
+    doubts: Mapping[str, Doubt] = MappingProxyType({}),
     lost: Collection[str] = (),
 ) -> dict[str, FittedLag]:
-    """The lags with intervals that cover what least squares says of a doubted arm, and those of replaced arms.
+    """The lag of each axis that the free parameters change, or whose arm is doubted, but for those that are ``lost``.
 
-    Of axes that are ``lost`` none is told.
+    Intervals are ``around`` it, from :func:`lag_intervals`; where least squares doubt the arm they cover what these
+    say, and where the arm is theirs they are that.
     """
-    found = dict(lags)
-    for axis, doubt in ((axis, one) for axis, one in doubts.items() if axis not in lost):
-        low, high = (end * MS for end in doubt.lag_ci95)
-        if (one := found.get(axis)) is None:
-            lag = after.arm.lag_of(axis) * MS
-            found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag, lag_ms_ci95=(low, high))
-        else:
-            below, above = one.lag_ms_ci95
-            ends = None if below is None else min(below, low), None if above is None else max(above, high)
-            found[axis] = msgspec.structs.replace(one, lag_ms_ci95=ends)
+    found, slopes = dict[str, FittedLag](), lag_slopes(free, after)
+    for axis in (one for one in dict.fromkeys([*slopes, *doubts]) if one not in lost):
+        lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
+        low, high = max(lag - below, min(lag, 0.0)), lag + above  # no arm is there before its commands
+        if axis in doubts:
+            least, most = doubts[axis].lag_ci95
+            low, high = (min(low, least), max(high, most)) if axis in slopes else (least, most)
+        ends = [end * MS if abs(end) <= LONGEST else None for end in (low, high)]
+        found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Literal, TypeAlias, cast
 
@@ -22,8 +22,7 @@ from ..units import MS
 from .arm_search import ArmSearch
 from .identifiability import FEWEST, TuneError, correlations, excited_axes, least_count
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
-from .likelihood import Likelihood, LogLikelihood
-from .maximise import Point
+from .likelihood import Likelihood, Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
 from .plain import LONGEST, Doubt, doubts, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, refitted, run_stage
@@ -37,7 +36,6 @@ from .summary import (
     found_biases,
     open_interval,
     text,
-    with_doubts,
 )
 from .validation import Check, check
 
@@ -135,7 +133,8 @@ def tune(
     kinds, fixed = kinds_of(fit), list(fix)
     _check(runs, config, kinds, fixed, share)
     config = with_tool(config, runs[0])
-    pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior, "delay" in share), progress)
+    plan = Plan(kinds, fixed, sd_prior=sd_prior, one_delay="delay" in share)
+    pipeline = Pipeline(runs, config, plans(config, plan, trust), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     found: dict[str, Doubt] = {}
     doubted: list[str] = []
@@ -153,11 +152,10 @@ def tune(
         sentences = {axis: one.sentence(pipeline.result(), axis) for axis, one in found.items()}
         doubted = [f"{axis}: {sentence}" for axis, sentence in sentences.items() if sentence]
         if refuted := [axis for axis, one in found.items() if one.refutes]:
-            held, start = [*fixed, *(f"axes.{axis}" for axis in refuted)], config
+            held, start = replace(plan, fixed=[*fixed, *(f"axes.{axis}" for axis in refuted)]), config
             for axis in refuted:
                 start = with_plain_arm(start, axis, found[axis].plain.arm)
-            again = plans(start, kinds, held, trust, sd_prior, "delay" in share)
-            pipeline = Pipeline(runs, start, again, progress, pipeline.arms_but(refuted))
+            pipeline = Pipeline(runs, start, plans(start, held, trust), progress, pipeline.arms_but(refuted))
             pipeline.fit()
         if validate is not None:
             validation = check(validate, config, pipeline.result())
@@ -179,7 +177,7 @@ def tune(
     result, arms = pipeline.result(), {axis: one for stage in stages for axis, one in stage.arms.items()}
     lost = [axis for axis, one in arms.items() if one.plain is None or result.arm.lag_of(axis) > LONGEST]
     untold = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]  # nobody measures these
-    lags = with_doubts(fitted_lags(free, config, result, around, untold), found, config, result, untold)
+    lags = fitted_lags(free, config, result, around, found, untold)
     tuned = _with_provenance(result, free, known, {} if interrupted else lags, names)
     doubted += [f"{axis}: {one.plain.step}" for axis, one in arms.items() if one.plain and one.plain.step]
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
@@ -241,39 +239,22 @@ def _check(
             raise ConfigError("--share delay: delays are not fitted; add delay to --fit")
 
 
-def plans(
-    config: FusionConfig,
-    kinds: Sequence[Fit],
-    fixed: Sequence[str],
-    trust: str | None,
-    sd_prior: bool = True,
-    one_delay: bool = False,
-) -> list[Plan]:
+def plans(config: FusionConfig, whole: Plan, trust: str | None) -> list[Plan]:
     """One plan for all sensors; with a trusted sensor one for it, then one for the others' noise, latency and scale.
 
     Raises:
         UnknownNameError: The trusted sensor is not configured.
     """
     if trust is None:
-        return [Plan(kinds, fixed, sd_prior=sd_prior, one_delay=one_delay)]
+        return [whole]
     config.sensor_names([trust])
-    arm: list[Fit] = [kind for kind in kinds if kind not in ("latency", "scale", "bias")]
-    others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency", "scale", "bias")]
-    return [
-        Plan(arm, fixed, [trust], sd_prior=sd_prior, one_delay=one_delay),
-        Plan(others, fixed, trusted=trust, sd_prior=sd_prior),
-    ]
+    arm: list[Fit] = [kind for kind in whole.fit if kind not in ("latency", "scale", "bias")]
+    others: list[Fit] = [kind for kind in whole.fit if kind in ("noise", "latency", "scale", "bias")]
+    return [replace(whole, fit=arm, sensors=[trust]), replace(whole, fit=others, trusted=trust, one_delay=False)]
 
 
 class Pipeline:
-    """Stages one after the other, each from where the last one ended; the best is there at any moment.
-
-    Attributes:
-        whole: The likelihood of all measurements.
-        best: The best configuration so far, with the gates of the search and all digits.
-        stages: The stages that are complete; none where the configuration as given is the result.
-        notes: What was noticed, a sentence each.
-    """
+    """Stages one after the other, each from where the last one ended; the best is there at any moment."""
 
     def __init__(
         self,
@@ -286,9 +267,9 @@ class Pipeline:
         """``known``: of each stage, the arms of axes that were searched for already."""
         self.runs, self.config, self.plans, self.progress = runs, config, plans, progress
         self._known = known or [{} for _ in plans]
-        self.whole = likelihood_of(runs, config, plans[-1])
-        self.best = config
-        self.stages: list[Stage] = []
+        self.whole = likelihood_of(runs, config, plans[-1])  # of all measurements
+        self.best = config  # so far, with the gates of the search and all digits
+        self.stages: list[Stage] = []  # that are complete; none where the configuration as given is the result
         self.notes: list[str] = []
 
     def fit(self) -> None:
@@ -323,7 +304,7 @@ class Pipeline:
     @property
     def log_likelihood(self) -> float:
         """Of the best configuration."""
-        return _evaluated(self.whole, self.best).total
+        return _evaluated(self.whole, self.best).log_likelihood
 
     def arms_but(self, axes: Collection[str]) -> list[dict[str, ArmSearch]]:
         """The arms that each stage searched for, but for those of some axes."""
@@ -343,7 +324,7 @@ class Pipeline:
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
-        before, after = (_evaluated(self.whole, config).total for config in (self.config, self.result()))
+        before, after = (_evaluated(self.whole, config).log_likelihood for config in (self.config, self.result()))
         if after < before - _NOTHING:
             self.best, self.stages = self.config, []
             self.notes.append("nothing more likely was found than the configuration as given, which is kept")
@@ -355,7 +336,8 @@ class Pipeline:
         """
         found, exact = self._written(self.best, rounded), self._written(self.best, float)
         lost = (
-            _evaluated(one.likelihood, exact).total - _evaluated(one.likelihood, found).total for one in self.stages
+            _evaluated(one.likelihood, exact).log_likelihood - _evaluated(one.likelihood, found).log_likelihood
+            for one in self.stages
         )
         return exact if any(one > _NOTHING for one in lost) else found
 
@@ -368,7 +350,7 @@ class Pipeline:
         return best
 
 
-def _evaluated(likelihood: Likelihood, config: FusionConfig) -> LogLikelihood:
+def _evaluated(likelihood: Likelihood, config: FusionConfig) -> Point:
     """The log-likelihood of a configuration under the gates that the likelihood was made with."""
     return likelihood.evaluate(with_gates(config, likelihood.config))
 

@@ -80,13 +80,9 @@ def fused(run: Run, config: FusionConfig) -> Estimates:
 
 
 def check(run: Run, before: FusionConfig, after: FusionConfig, since: float = 0.0) -> list[Check]:
-    """Compare two configurations on a run.
+    """Compare the configuration as given and the tuned one on a run that neither was fitted on.
 
-    Args:
-        run: Not fitted on, at least not from ``since`` on.
-        before: The configuration as given.
-        after: The tuned one.
-        since: Count only from then on [s after the first command]; the filter runs from the beginning.
+    Only what comes ``since`` then [s after the first command] counts; the filter runs from the beginning.
     """
     pair = [_from(fused(run, config), since) for config in (before, after)]
     return [_check(run.name, axis, since, *pair) for axis in pair[0].axes if len(_of_axis(pair[0], axis).value)]
