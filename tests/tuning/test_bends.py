@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,7 +51,12 @@ def found(seed: int, true: Arm, free: tuple[str, ...] = FREE) -> Bent | None:
     return bent_arm(plain, Arm(0.0, 0.1), free)
 
 
-@pytest.mark.parametrize("seed", range(12))
+def seeds(count: int) -> list[Any]:
+    """So many, of which two are quick tests."""
+    return [*range(2), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, count))]
+
+
+@pytest.mark.parametrize("seed", seeds(12))
 def test_a_linear_arm_gets_neither(seed: int) -> None:
     """None of twelve, of first and of second order."""
     assert found(seed, arm_of(seed)) is None
@@ -92,7 +98,7 @@ def test_an_arm_that_wanders_smoothly_gets_neither(seed: int, comes_back: float,
     assert plain is not None and bent_arm(plain, Arm(0.0, 0.1), FREE) is None
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", seeds(8))
 def test_play_is_found(seed: int) -> None:
     """A tenth of the range, within 15 % by least squares alone; and less is left where it was not fitted.
 
@@ -105,7 +111,7 @@ def test_play_is_found(seed: int) -> None:
     assert bent.off > float(np.std(measured(seed, true).left(bent.arm)))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", seeds(8))
 def test_a_fastest_speed_is_found(seed: int) -> None:
     """Six tenths of the fastest commanded, within 3 %."""
     fastest = 0.6 * RANGE * 2.0 * math.pi
@@ -124,7 +130,7 @@ def test_both_are_found() -> None:
 
 
 @pytest.mark.parametrize("beyond", [-0.95, -0.3, 0.3])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", seeds(6))
 def test_a_sag_is_found(seed: int, beyond: float) -> None:
     """Where an axis stalls, hangs back or runs ahead: the knee within 5 % of the range, the slope within 10 %."""
     knee = RANGE * (-0.4, -0.2, 0.0, 0.2, 0.4, 0.55)[seed]
@@ -137,7 +143,7 @@ def test_a_sag_is_found(seed: int, beyond: float) -> None:
     assert bent.off < 0.95 * bent.linear_off
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_stops_on_both_sides_are_found(seed: int) -> None:
     """At -0.5 and 0.6 of the range, where a servo stalls; both within 2 % of it, and no play."""
     knees = {"knee": 0.6 * RANGE, "beyond": -0.95, "knee_below": -0.5 * RANGE, "below": -0.95}
@@ -217,6 +223,7 @@ def test_few_measurements_are_not_asked() -> None:
         assert plain is None or bent_arm(plain, Arm(0.0, 0.1), FREE) is None
 
 
+@pytest.mark.long
 def test_latency_says_play_with_its_interval() -> None:
     """3.4 degrees of a simulated tool within a tenth; the lag is that of the drive, 42 ms, not some 15 ms more."""
     run = pf.simulate(pf.Scenario.load(SCENARIOS / "tool-with-play.toml")).run

@@ -26,6 +26,7 @@ def tuned(
     return quietly(lambda: pf.tune([made.run], config, fit=fit, fix=fix))
 
 
+@pytest.mark.long
 def test_play_is_found_from_any_value() -> None:
     """3.4 degrees, from none, 2 and 40, the same: within a tenth, as noise shakes the drive within its play."""
     found = [tuned("tool-with-play", play=degrees and degrees * 0.0174533) for degrees in (None, 2.0, 40.0)]
@@ -46,6 +47,7 @@ def test_a_fastest_speed_is_found(degrees: float | None) -> None:
     assert "max_speed_deg_s_ci95" in found.config.arm.to_toml()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("knee", [None, 30.0])
 def test_a_sag_is_found(knee: float | None) -> None:
     """The lever's knee at 40 degrees, where a line in two pieces through its true sag has it, and the slope beyond.

@@ -270,6 +270,7 @@ def test_no_interval_ends_at_its_estimate() -> None:
         assert one.lag - low > 1e-4 and high - one.lag > 1e-4, name  # s
 
 
+@pytest.mark.long
 def test_no_digit_depends_on_how_a_process_hashes() -> None:
     """Python orders a set of names anew in each process: the result of two axes is the same to the last digit."""
     code = f"import pumafuse as pf; print(pf.latency(pf.Run.read({str(EXAMPLES / 'my-run')!r})).to_json())"

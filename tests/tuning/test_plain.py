@@ -96,6 +96,7 @@ def test_a_right_arm_is_not_refuted_and_a_wrong_one_is() -> None:
     assert "tangential" not in doubts(plain, with_plain_arm(slow, "tangential", one.plain.arm))
 
 
+@pytest.mark.long
 def test_one_command_says_the_lag_of_an_arm_with_a_dead_band(tmp_path: Path) -> None:
     """An encoder of a joint that is 140 ms late and has a dead band of 1°; its increments alone fit 283 ms best."""
     done = pumafuse("fuse", DEAD_BAND, "-o", tmp_path / "run")

@@ -78,6 +78,11 @@ def test_an_own_delay_is_worth_what_the_evidence_gains() -> None:
     assert own_worth(pair, ["a", "b"]) == pytest.approx({"a": -shared, "b": -shared}, abs=0.05)
 
 
+def test_odds_are_those_of_the_weights() -> None:
+    posterior = AxisPosterior([branch(0.08, 2e-3, math.log(3.0)), branch(0.09, 2e-3, 0.0, SECOND)])
+    assert posterior.mixture().log_odds(lambda one: one.order == 1) == pytest.approx(math.log(3.0), abs=0.02)
+
+
 def test_a_shared_delay_weighs_the_axes_by_what_they_know() -> None:
     """The product of two normal densities: the mean weighted by 1/sd²."""
     posteriors = [AxisPosterior([branch(0.080, 1e-3)]), AxisPosterior([branch(0.083, 2e-3)])]

@@ -44,6 +44,7 @@ def test_where_it_starts_does_not_matter() -> None:
     assert max(totals) - min(totals) < 0.1
 
 
+@pytest.mark.long
 def test_a_wrong_delay_and_a_wrong_lag_change_nothing() -> None:
     """Delay and time constant of a third, twice and three times what they are: the same arm, likelihood and noise."""
     sim = outage(1)

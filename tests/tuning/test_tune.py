@@ -311,6 +311,7 @@ def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, t
         assert total(sim.run, found.config) == pytest.approx(stop.calls[-1][1], abs=0.05)
 
 
+@pytest.mark.long
 def test_what_is_as_likely_at_first_is_kept() -> None:
     """A search that chose other orders and ended lower: the configuration is the one as given, with a note."""
     sim = outage(1)

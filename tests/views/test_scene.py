@@ -117,6 +117,7 @@ def test_a_sensor_stands_in_the_scene_and_its_marker_on_the_tool(fused: tuple[pf
         assert length == pytest.approx(0.5 * tool if "markers" in entity else 0.15 * 1e3 * away, rel=1e-4)
 
 
+@pytest.mark.long
 def test_a_robot_whose_joints_are_commanded_moves(tmp_path: Path) -> None:
     """A line through its links, worked out by hand for two in a plane, at 2500 of 5000 commands; in a view of the cell.
 

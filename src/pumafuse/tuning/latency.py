@@ -512,6 +512,7 @@ def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
         time_constant=arm.lag,
         time_constant_ci95=(0.0, high),
         gain=arm.gain,
+        kind=lag.kind,
         notes=[sentence],
     )
 

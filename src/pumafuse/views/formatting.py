@@ -31,9 +31,11 @@ def between(value: float, interval: Interval | None, unit: float = 1.0) -> str:
     """``value (low to high)``, all times ``unit``, to two digits of the interval; without it the value alone."""
     if interval is None:
         return f"{value * unit:.4g}"
-    width = max((interval[1] - interval[0]) * unit, 1e-5 * abs(value * unit), 1e-12)
+    low, high = (end * unit for end in interval)
+    ends = [end for end in (low, high, value * unit) if np.isfinite(end)]  # that of a plant may be anything
+    width = max(max(ends) - min(ends), 1e-5 * abs(value * unit), 1e-12)
     digits = min(max(1 - int(np.floor(np.log10(width))), 0), 6)
-    return f"{value * unit:.{digits}f} ({interval[0] * unit:.{digits}f} to {interval[1] * unit:.{digits}f})"
+    return f"{value * unit:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})".replace("inf", "∞")
 
 
 def milliseconds(estimate: Estimate | None) -> str:
