@@ -41,6 +41,7 @@ _GROUPED = r"^[+-]?\d{1,3}(,\d{3})+(\.\d*)?$"  # 1,000.123
 BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
 _NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
 _NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested, pa.types.is_union)
+_CLOCKS = (pa.types.is_timestamp, pa.types.is_duration, pa.types.is_time)
 _LISTS = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
 _TEXTS = (pa.types.is_string, pa.types.is_large_string)
 # Numbers that stand for "none": nines, and the ends of whole numbers of 16 and 32 bits.
@@ -111,7 +112,7 @@ class Table:
                 return self.stamps(f"{name}.{split[0]}", f"{name}.{split[1]}")
         if nanoseconds:
             return self._of_two(name, nanoseconds)
-        if pa.types.is_temporal(column.type):
+        if _is_any(column.type, _CLOCKS):
             return self._within_reach(name, self._of_clock(name, column)), None
         if (dated := self._dates(name, column)) is not None:
             return self._within_reach(name, self._of_clock(name, dated[0])), dated[1]
@@ -135,7 +136,7 @@ class Table:
         """Whether a column has dates, or times of day, and nothing else."""
         with suppress(RunError):  # dates mixed with numbers
             column = self.column(name)
-            return pa.types.is_temporal(column.type) or self._dates(name, column) is not None
+            return _is_any(column.type, _CLOCKS) or self._dates(name, column) is not None
         return False
 
     def zoned(self, name: str) -> bool | None:
