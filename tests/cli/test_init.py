@@ -140,6 +140,7 @@ def test_one_command_fuses_with_the_best_until_ctrl_c(tmp_path: Path, monkeypatc
     assert {"run.toml", "summary.json"} < names(tmp_path)
 
 
+@pytest.mark.long
 def test_one_command_says_that_the_fit_is_worse_as_tune_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Than the first guess, on the last third of the log: exit code 3, and the result is there."""
 
@@ -152,6 +153,7 @@ def test_one_command_says_that_the_fit_is_worse_as_tune_does(tmp_path: Path, mon
     assert {"run.toml", "summary.json"} < names(tmp_path)
 
 
+@pytest.mark.long
 def test_one_command_says_where_no_arm_was_found(tmp_path: Path) -> None:
     """An encoder that is at each command in the same row; with commands that are gone on from, as is advised, it is."""
     rng, time = np.random.default_rng(1), 0.1 * np.arange(300)

@@ -104,6 +104,7 @@ def test_what_reading_notices_is_said_once(tmp_path: Path) -> None:
     assert len(set(lines)) == len(lines)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("early", [0.05, later(0.31)])
 def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path: Path) -> None:
     """Fuse and latency refuse it in one line; with the shift_s that this names its lag is the guess."""

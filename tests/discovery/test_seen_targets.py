@@ -93,6 +93,7 @@ def test_a_motion_that_is_only_alike_is_not_fused(tmp_path: Path) -> None:
         survey(log)
 
 
+@pytest.mark.long
 def test_what_cannot_be_registered_leaves_a_run_toml_to_be_mended(tmp_path: Path) -> None:
     """A frame that drifts: registering is refused, and what was read is written, says where, and can be read."""
     log, time = tmp_path / "log", np.arange(0.0, 40.0, 0.02)

@@ -191,6 +191,7 @@ RATIOS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "ratio", "tolerance"), RATIOS)
 def test_estimates_are_right_while_priors_are_wide(kind: str, ratio: float, tolerance: float) -> None:
     """Up to 1e5 times a measurement's noise to 1e-9, to 1e6 times to 1e-6.

@@ -257,7 +257,7 @@ CASES = {
 @pytest.mark.parametrize(
     ("case", "mode"),
     [
-        pytest.param(case, mode, id=f"{name}-{mode}")
+        pytest.param(case, mode, id=f"{name}-{mode}", marks=[] if mode == "filtered" else pytest.mark.long)
         for name, case in CASES.items()
         for mode in MODES
         if mode != "as_live" or not any(seen.sensor.latency_sd for seen in case.seen.values())

@@ -43,6 +43,7 @@ def error(config: Path, name: str) -> float:
     return float(np.degrees((Rotation.from_rotvec(sensor.frame.rotation) * true.inv()).magnitude()))
 
 
+@pytest.mark.long
 def test_init_registers_sensors_in_frames_of_their_own(tmp_path: Path) -> None:
     """Where speeds follow and axes do not, frames are found and written, and ``latency`` says what to do instead."""
     done = pumafuse("init", log(tmp_path / "log", "commands", "mocap", "tracker"), "-o", tmp_path / "found")

@@ -47,6 +47,7 @@ def table(search: ArmSearch, gain: float) -> tuple[np.ndarray, np.ndarray, np.nd
     return log.reshape(len(delays), len(lags)), delays, lags
 
 
+@pytest.mark.long
 def test_odds_of_models_are_those_of_the_integrals(search: ArmSearch) -> None:
     """A gain of 1 against one that is 1 ± 0.1: ∫ L over dead time and lag, and over the gain, too; to 0.3."""
     log, delays, lags = table(search, 1.0)

@@ -149,7 +149,10 @@ def test_a_fit_is_a_maximum_and_its_information_the_curvature() -> None:
         assert np.mean(lower) == pytest.approx(expected, rel=0.05), name
 
 
-@pytest.mark.parametrize(("number", "kind"), [(0, "walk"), (1, "smooth"), (2, "rough")])
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [(0, "walk"), pytest.param(1, "smooth", marks=pytest.mark.long), pytest.param(2, "rough", marks=pytest.mark.long)],
+)
 def test_what_an_arm_leaves_is_found(number: int, kind: str) -> None:
     """A walk, a smooth and a rough disturbance with white noise: of the last two the right one is likelier."""
     true = {"walk": Rest(np.array([2e-3]), 5e-3), "smooth": Rest(np.array([2e-3]), 1e-6, 0.02, 0.3, 1.5)}
@@ -213,6 +216,7 @@ def test_jitter_is_white_noise_beside_a_smooth_motion() -> None:
     assert Measured([still], T, ["a", "b"]).jitter(Arm(0.0, 0.1)) == pytest.approx([1e-4, 1e-3], rel=0.1)
 
 
+@pytest.mark.long
 def test_threads_change_no_weight() -> None:
     """Axes are searched in threads: what others do with memory in the meantime changes no bit of a weight."""
     rest, arms = RESTS[2], [arm._replace(gain=1.0) for arm in ARMS]

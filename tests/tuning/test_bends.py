@@ -90,6 +90,7 @@ def wandering(seed: int, comes_back: float, smooth: int) -> Measured:
     return Measured([one._replace(value=value)], period, ["encoder"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "comes_back", "smooth"), [(0, 0.3, 3), (6, 0.3, 3), (16, 1.0, 2)])
 def test_an_arm_that_wanders_smoothly_gets_neither(seed: int, comes_back: float, smooth: int) -> None:
     """An error that goes on for long is alike in both halves, so that play seems to predict it."""

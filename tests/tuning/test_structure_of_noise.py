@@ -286,6 +286,7 @@ def lever(command: np.ndarray, period: float) -> np.ndarray:
     return np.array(path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [7, 8, 9])
 def test_what_holds_a_ringing_lever_off_does_not_swing_back(seed: int) -> None:
     """Tuned on a sine that gets faster, its error on slow ramps is at most a degree, and its bars hold there.
