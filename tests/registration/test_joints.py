@@ -55,6 +55,7 @@ def recorded(seed: int, later: np.ndarray, *, attitude: bool, marker: np.ndarray
     return Run("arm", command, {"camera": camera}, source(fine[seen], point, "truth", quaternion))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("attitude", [True, False])
 def test_the_tool_tells_how_late_each_joint_is(attitude: bool) -> None:
     """Of an arm of which joints lag up to 60 ms apart: to 1 ms beside the earliest, and within the intervals.
