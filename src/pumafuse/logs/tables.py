@@ -171,10 +171,13 @@ def row_count(path: Path) -> int:
         return 0
 
 
-def of_text(path: Path) -> set[str]:
-    """The columns of a Parquet table that are text."""
-    schema = papq.read_schema(str(path))
-    return {field.name for field in schema if pa.types.is_string(field.type) or pa.types.is_large_string(field.type)}
+def has_slashes(path: Path, name: str) -> bool:
+    """Whether a column of a Parquet table has dates with slashes, by its first cell."""
+    kinds = {field.name: field.type for field in papq.read_schema(path)}
+    if name not in kinds or not (pa.types.is_string(kinds[name]) or pa.types.is_large_string(kinds[name])):
+        return False
+    cells = next(in_parts(path, [name])).columns[name].drop_null()
+    return len(cells) > 0 and "/" in cells[0].as_py()
 
 
 def refuse_endless(path: Path) -> None:

@@ -22,6 +22,7 @@ from ..logs.clock import stray_offsets
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..logs.run import NoCommandError, Run, clock_of, of_table, of_tables
 from ..logs.tables import Table
+from ..units import TIMES
 
 WAIT_NS = 10_000_000_000  # for rows that come late; one that comes later yet is left out
 _MOST_LATE = 100  # rows of a table that are left out; more are no strays
@@ -87,12 +88,12 @@ class Log:
 def rows_of(path: Path) -> int:
     """How many rows a run has that can be read piece by piece; 0 for one that cannot.
 
-    It can if all its tables are Parquet, each with one column of stamps, and no rows are chosen by ``where``. How dates
-    are written is told by all of a column.
+    It can if all its tables are Parquet, each with one column of stamps, and no rows are chosen by ``where``. Of dates
+    with slashes all of a column tells how to read them.
     """
     if path.suffix == ".parquet":
         count = tables.row_count(path)
-        return 0 if count and any(name.startswith("time_") for name in tables.of_text(path)) else count
+        return 0 if count and any(tables.has_slashes(path, f"time{unit}") for unit in TIMES) else count
     if not (listed := manifest.file_of(path)).is_file() or listed.suffix != ".toml":
         return 0
     entries = list(manifest.load(listed).entries.values())
@@ -102,7 +103,7 @@ def rows_of(path: Path) -> int:
     if len(clocks) > len(files) or chosen:
         return 0
     counts = [tables.row_count(file) for file in files.values()]
-    if not all(counts) or any(entry.time.column in tables.of_text(files[entry.rows]) for entry in entries):
+    if not all(counts) or any(tables.has_slashes(files[entry.rows], entry.time.column) for entry in entries):
         return 0
     return sum(counts)
 
