@@ -1409,3 +1409,14 @@ def test_a_clock_of_whole_seconds_says_how_many_rows_a_second_has(form: str, tmp
     assert "time is no clock: 20 distinct stamps, one every 1 s, in 1000 rows with x_" in said
     assert "stands still: 50 rows a second); if rows come at a constant rate, give it to init as --rate HZ" in said
     assert survey(tmp_path / "log.csv", rate=50.0).run.sensors
+
+
+@pytest.mark.parametrize("late", [0.1, -0.012])
+def test_what_is_asked_about_a_sensor_is_not_sure(late: float, tmp_path: Path) -> None:
+    """A lag that is a little less than none is asked about, and decided accordingly."""
+    t, u, _ = recorded_at_once()
+    write(tmp_path / "log.csv", {"t_s": t, "target_x_mm": 1e3 * u[:, 0], "actual_x_mm": 1e3 * path(t - late)[:, 0]})
+    found = survey(tmp_path / "log.csv")
+    (sure,) = [sure for what, _, sure in decisions(found) if what == "actual follows"]
+    assert sure == ("sure" if late > 0.0 else "a question")
+    assert any("ahead of the commands on x" in one for one in asked(found)) is (late < 0.0)

@@ -11,12 +11,12 @@ import numpy as np
 
 from ..errors import printable
 from ..logs.frames import CARTESIAN
-from ..logs.run import Source
+from ..logs.run import Run, Source
 from ..units import MS
-from .following import LATEST
+from .following import LATEST, Following
 from .guesses import SensorGuess
 from .roles import another_clock
-from .survey import AHEAD, FOLLOWS, Survey
+from .survey import FOLLOWS, Survey
 
 _SAME = 0.8  # correlation of changes from which one follows another for sure
 _OTHER_UNIT, _ABOUT_ONE = 3.0, 1.25  # factors by which a sensor may move less or more than its command
@@ -43,11 +43,12 @@ def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
         moved = [one.name for one in streams if "follow" in one.why]
         yield "who is who", f"{roles.command.part.label} is commanded, {who}", _sure(moved, "by how they move")
     for name in found.run.sensors:
-        mine = [one for (source, _), one in found.relations.items() if source == name]
+        mine = {axis: one for (source, axis), one in found.relations.items() if source == name}
         if mine:
-            lag, gain = (float(np.median([getattr(one, key) for one in mine])) for key in ("lag", "slope"))
-            least = min(abs(one.correlation) for one in mine)
-            as_it_should = least >= _SAME and _is_one(gain) and -AHEAD < lag < _LONG
+            lag, gain = (float(np.median([getattr(one, key) for one in mine.values()])) for key in ("lag", "slope"))
+            least = min(abs(one.correlation) for one in mine.values())
+            moves_as_far = all(_moves_as_far(found.run, name, axis, one) for axis, one in mine.items())
+            as_it_should = least >= _SAME and moves_as_far and all(0.0 <= one.lag <= _LONG for one in mine.values())
             told = f"{lag * MS:.0f} ms late, gain {gain:.3g}, correlation {least:.3f}"
             yield f"{name} follows", told, "sure" if as_it_should else "a question"
 
@@ -91,7 +92,7 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
                 most = " or more" if one.lag >= LATEST else ""
                 late = f"{one.lag * MS:.0f} ms{most} late"
                 yield f"{name} is {late} on {axis}, as hardly an arm is: is its clock another one?"
-            if not _is_one(size) and not _is_one(_reach(run.measured[name], axis) / _reach(run.command, axis)):
+            if not _moves_as_far(run, name, axis, one):
                 unit = (
                     "is its unit right" if not 1.0 / _OTHER_UNIT < size < _OTHER_UNIT else "is that its gear, or a unit"
                 )
@@ -119,6 +120,11 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
 def _is_one(gain: float) -> bool:
     """Whether a gain is about 1, whatever its sign."""
     return 1.0 / _ABOUT_ONE < abs(gain) < _ABOUT_ONE
+
+
+def _moves_as_far(run: Run, name: str, axis: str, one: Following) -> bool:
+    """Whether a sensor moves about as far as it is told to, whatever its sign."""
+    return _is_one(one.slope) or _is_one(_reach(run.measured[name], axis) / _reach(run.command, axis))
 
 
 def _reach(source: Source, axis: str) -> float:
