@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import pumafuse as pf
-from executable import FUSION, SCAN, names, pumafuse, refused
+from executable import DATA, FUSION, SCAN, names, pumafuse, refused
 from pumafuse.cli.fuse import _folders
 
 AXES = ("tangential", "radial", "vertical")
@@ -148,6 +148,8 @@ def test_only_an_earlier_result_is_replaced_and_only_with_force(with_tracker: Pa
     [
         (("fuse", "none", "-c", FUSION, "-o", "out"), "none: no such file"),
         (("fuse", SCAN, "-c", "none.toml", "-o", "out"), "none.toml: no such file"),
+        *((words, "has no run.toml; `pumafuse init") for words in (("latency", DATA), ("register", DATA))),
+        (("tune", DATA, "-c", FUSION, "-o", "out"), "has no run.toml; `pumafuse init"),
         ((*FUSE_SCAN, "-o", "out", "--sensors", "trackr"), "did you mean 'tracker'?"),
         (("compare", SCAN), "no result folder"),
         (("discretize", "puma761"), "not a preset (puma560-internal, puma560-external)"),

@@ -135,8 +135,9 @@ def test_a_wrong_manifest_is_refused_in_one_line(folder: Path, case: str) -> Non
 
 
 def test_a_path_without_a_run_is_refused(tmp_path: Path) -> None:
-    for name in ("absent", "absent.toml", "absent.csv", ""):
+    for name in ("absent", "absent.toml", "absent.csv"):
         assert "no such file" in refusal(lambda name=name: Run.read(tmp_path / name))
+    assert refusal(lambda: Run.read(tmp_path)).startswith(f"{tmp_path}: has no run.toml; `pumafuse init ")
 
 
 def test_a_single_table_holds_every_source(tmp_path: Path) -> None:

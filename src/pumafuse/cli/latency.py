@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from ..errors import ConfigError
 from ..folders import write_file
 from ..logs.run import Run
 from ..tuning.latency import Latency, latency
@@ -59,11 +58,7 @@ def _told(
     """What was found, after it is written and its answers printed; None if that was JSON, which is all then."""
     if report is not None:
         reports.check_writable(report, force)
-    runs: list[Run] = []
-    for path in paths:
-        if path.is_dir() and not (path / "run.toml").exists():
-            raise ConfigError(f"{path}: has no run.toml; `pumafuse init {path}` looks at the log and writes one")
-        runs.append(Run.read(path).between(*part))
+    runs = [Run.read(path).between(*part) for path in paths]
     with Console(stderr=True).status("looking at how motion follows the commands"):
         found = latency(runs, sensor=sensor)
     if output is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
@@ -265,6 +266,9 @@ def file_of(run: Path) -> Path:
 
 def load(path: Path) -> Manifest:
     """Read ``run.toml``."""
+    if path.name == "run.toml" and path.parent.is_dir() and not path.exists():
+        log = shlex.quote(str(path.parent))
+        raise ConfigError(f"{path.parent}: has no run.toml; `pumafuse init {log}` looks at the log and writes one")
     return of_tables(toml.read(path), str(path))
 
 
