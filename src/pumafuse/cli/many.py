@@ -5,7 +5,6 @@ joblib runs the jobs; ``joblib.parallel_config`` around :func:`run_jobs` chooses
 
 from __future__ import annotations
 
-import signal
 import warnings
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
@@ -36,19 +35,6 @@ def progress_bar(what: str, total: float = 1.0) -> Generator[Callable[[float], N
         yield lambda done: bar.update(task, completed=done)
 
 
-@contextmanager
-def _uninterrupted() -> Generator[None]:
-    """Processes that are started here never take notice of Ctrl-C, which would end them with a traceback each.
-
-    They end with this process, which takes notice of it from then on.
-    """
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def run_jobs(
     what: str, jobs: Mapping[str, Callable[[], R]], places: Iterable[Path]
 ) -> tuple[dict[str, R], dict[str, str]]:
@@ -60,8 +46,7 @@ def run_jobs(
     failed: dict[str, str] = {}
     parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
     work = (delayed(_guarded)(name, job) for name, job in jobs.items())
-    with _uninterrupted():
-        outcomes = cast(Generator[tuple[str, R | None, str | None]], parallel(work))
+    outcomes = cast(Generator[tuple[str, R | None, str | None]], parallel(work))
     try:
         with progress_bar(what, len(jobs)) as move:
             for name, result, problem in outcomes:
