@@ -1340,7 +1340,9 @@ def test_a_clock_may_be_any_column_that_alone_goes_on(log: Path) -> None:
     kept = np.random.default_rng(2).random(len(t)) > 0.02
     for name, time, values in (("command", t[kept], u[kept]), ("camera", s, z)):
         rows = np.column_stack([values, time + 400.0])
-        (log / f"{name}.csv").write_text("\n".join(",".join(f"{one:.6f}" for one in row) for row in rows) + "\n")
+        lines = [",".join(f"{one:.6f}" for one in row) for row in rows]
+        lines[7] = lines[7].rpartition(",")[0] + ","  # a stamp that is missing
+        (log / f"{name}.csv").write_text("\n".join(lines) + "\n")
     found = survey(log)
     assert "is column 4 the clock of camera.csv? It alone rises from row to row" in asked(found)
     lags = [one.lag for one in found.relations.values()]

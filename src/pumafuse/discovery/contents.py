@@ -594,8 +594,13 @@ def _rising(table: Table, stroke: float, counts: Container[str]) -> Clock | None
     found = list[str]()
     for name in (one for one in table.columns if one not in counts):
         with suppress(RunError):
-            steps = np.diff(table.plain(name)[0])
-            if len(steps) >= _MANY_ROWS and (steps >= 0.0).all() and (steps > 0.0).mean() >= _IN_ORDER:
+            values = table.plain(name)[0]
+            steps = np.diff(values[np.isfinite(values)])
+            if (
+                len(steps) >= max(_MANY_ROWS, _IN_ORDER * table.rows)
+                and (steps >= 0.0).all()
+                and (steps > 0.0).mean() >= _IN_ORDER
+            ):
                 found.append(name)
     clock = _clock_of(table, found[0], stroke) if len(found) == 1 else None
     what = f"is {found[0]} the clock of {table.path.name}? It alone rises from row to row" if clock else ""
