@@ -163,14 +163,16 @@ def test_a_command_that_is_constant_but_for_rounding_leads_nothing() -> None:
 
 
 def test_of_a_run_that_mostly_rests_the_motion_tells_the_gain() -> None:
-    """Steps of a third of the time, in whole counts, 0.3 s late with a lag of 0.1 s: at rest any gain would do."""
-    t = 0.1 * np.arange(400)
-    told = np.where(t % 3.0 < 1.0, 500.0, 0.0)
+    """Steps in whole counts at 10 Hz: at rest, two rows of three, any gain would do, and 0.74 was found.
+
+    It is 1; changes over half a second, of commands that are logged up to 0.1 s late, see 0.92 of it.
+    """
     fine = 0.001 * np.arange(40_000)
-    held = told[np.maximum(np.arange(40_000) // 100 - 2, 0)]
-    moved = lfilter([0.01], [1.0, -0.99], held)
-    found = following((stamped(t), told), (stamped(t), np.rint(np.interp(t, fine, moved))))
+    told = np.where((fine > 4.0) & ((fine - 4.0) % 3.0 < 1.0), 500.0, 0.0)
+    moved = lfilter([1.0 / 110.0], [1.0, 1.0 / 110.0 - 1.0], np.append(np.zeros(190), told[:-190]))
+    stamp = stamped(fine[::100])
+    found = following((stamp, told[::100]), (stamp, np.rint(moved[::100])))
     assert found is not None
-    assert found.slope == pytest.approx(1.0, abs=0.1)
-    assert found.correlation > 0.95
-    assert found.misfit > 1.0
+    assert found.slope == pytest.approx(0.92, abs=0.03)
+    assert found.correlation > 0.98
+    assert found.misfit > 10.0

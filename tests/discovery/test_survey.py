@@ -1347,6 +1347,10 @@ def test_a_clock_may_be_any_column_that_alone_goes_on(log: Path) -> None:
     assert "is column 4 the clock of camera.csv? It alone rises from row to row" in asked(found)
     lags = [one.lag for one in found.relations.values()]
     assert len(lags) == 3 and lags == pytest.approx([LAG] * 3, abs=0.005)
+    for name in ("command", "camera"):
+        text = (log / f"{name}.csv").read_text()
+        (log / f"{name}.csv").write_text("".join(f"{line},{n}.5\n" for n, line in enumerate(text.splitlines())))
+    assert "no clock" in one_line(RunError, lambda: survey(log))  # of two, nothing tells which
     both = log / "command.csv"
     both.write_text("\n".join(f"{n},{n + 0.5 * (n % 2)}" for n in np.arange(0.0, 300.0, 0.3)))
     (part,) = parts_of(both)
@@ -1365,16 +1369,16 @@ def test_columns_without_words_are_what_their_file_is_called(log: Path) -> None:
     """A torque follows, too. A file of commands, of a sensor or of times is none of these."""
     t, u, s, z = recorded()
     write(log / "command.csv", {"time": t, "value": u[:, 0]})
-    for name, sign in (("torque", 0.5), ("reward", -1.0), ("encoder", 1.0), ("time_series", 1.0)):
+    for name, sign in (("torque", 0.5), ("measured_load", -1.0), ("encoder", 1.0), ("time_series", 1.0)):
         write(log / f"{name}.csv", {"time": s, "value": sign * z[:, 0]})
     left_out = {part.file.stem: [*part.left_out.values()] for part in parts_of(log)}
     assert left_out["torque"] == ["torque, as torque.csv is called"]
-    assert left_out["reward"] == ["reward, as reward.csv is called"]
+    assert left_out["measured_load"] == ["load, as measured_load.csv is called"]
     assert left_out["encoder"] == left_out["time_series"] == left_out["command"] == []
     for name in ("encoder", "time_series"):
         (log / f"{name}.csv").unlink()
     said = one_line(RunError, lambda: survey(log))
-    assert "nothing that measures where they lead: reward.csv: reward, as reward.csv is called; torque.csv: " in said
+    assert "nothing that measures where they lead: measured_load.csv: load, as measured_load.csv is called; tor" in said
 
 
 def test_the_best_pairs_of_axes_come_first(tmp_path: Path) -> None:
@@ -1392,6 +1396,24 @@ def test_the_best_pairs_of_axes_come_first(tmp_path: Path) -> None:
     (sensor,) = found.roles.sensors
     assert {axis: one[0].column for axis, one in sensor.axes.items()} == {f"q{n}": f"was_q{n}" for n in range(3)}
     assert found.parts[0].left_out == {f"cmd_qd{place}": "velocity" for place in range(3)}
+
+
+def test_an_axis_whose_name_ends_as_that_of_a_command_is_that(tmp_path: Path) -> None:
+    """``p_RS_R_x`` is x, if it moves alike, though another command moves more alike."""
+    t, u, z = recorded_at_once()
+    y = u[:, 0] + 0.08 * np.sin(1.3 * t)
+    columns = {
+        "t_s": t,
+        "cmd_x_m": u[:, 0],
+        "cmd_y_m": y,
+        "p_RS_R_x_m": np.roll(y, 5),
+        "p_RS_R_y_m": np.roll(y, 5) + z[:, 2],
+    }
+    write(tmp_path / "log.csv", {name: value[10:] for name, value in columns.items()})
+    found = survey(tmp_path / "log.csv")
+    assert found.roles is not None
+    (sensor,) = found.roles.sensors
+    assert {axis: one[0].column for axis, one in sensor.axes.items()} == {"x": "p_RS_R_x_m", "y": "p_RS_R_y_m"}
 
 
 def test_a_sensor_whose_command_rests_is_said_to_be_that(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from pumafuse.filter.response import response
 from pumafuse.model.arm import AxisModel, Gain
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.arms import Arm, Measured, Recording
+from pumafuse.tuning.latency import AxisLag, _doubted
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.plain import Doubt, PlainArm, doubts, off, plain_arm, with_plain_arm
 from pumafuse.tuning.stage import Plan
@@ -80,6 +81,18 @@ def test_nothing_is_said_of_an_axis_at_rest_or_hardly_measured() -> None:
     assert found_in(one._replace(command=np.full(len(one.command), 0.5))) is None
     assert found_in(one.of(slice(5))) is None
     assert found_in() is None
+
+
+def test_an_angle_whose_arm_is_replaced_is_still_one() -> None:
+    """Of the likelihood's arm nothing else stays."""
+    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), 0.055, 1e-3, *[Measured([], T, [])] * 2)
+    ends = {"lag_ci95": (0.07, 0.09), "delay_ci95": (0.0, 0.1), "shared_delay": True}
+    lag = AxisLag(
+        sensor="camera", lag=0.08, delay=0.01, plant="second-order", gain=0.9, damping=0.4, kind="angle", **ends
+    )
+    found = _doubted(lag, Doubt(arm, 1e-3, lag=0.08, is_beaten=True), "why")
+    assert (found.kind, found.sensor, found.plant, found.damping) == ("angle", "camera", "first-order", None)
+    assert (found.lag, found.lag_ci95, found.notes) == (pytest.approx(0.055), (0.05, 0.06), ["why"])
 
 
 def test_a_right_arm_is_not_refuted_and_a_wrong_one_is() -> None:

@@ -189,7 +189,7 @@ def no_position(column: str) -> str | None:
 def no_position_by_place(place: str, columns: Iterable[str]) -> str | None:
     """What the columns of a file or topic are by its name, if they have no words of their own and are no positions."""
     silent = all(axis_of(column, []) == "position" and not role_words(column) for column in columns)
-    why = no_position(place) if silent and role_of(place) is None else None
+    why = no_position(place) if silent else None
     return None if why is None or why in _TELLING or has_word(place, _POSITIONS) else why
 
 
