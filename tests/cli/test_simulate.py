@@ -252,6 +252,27 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are listed there")
+@pytest.mark.parametrize("later", [0.0, 0.05, 0.1, 0.2, 0.4])
+def test_workers_that_only_start_end_without_a_word(later: float, tmp_path: Path) -> None:
+    """Ctrl-C reaches them, too, while they import; and it is not lost while they are started."""
+    words = [str(EXECUTABLE), "simulate", str(SCENARIOS / "step-campaign.toml"), "-o", str(tmp_path), "--runs", "300"]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what ignores it hands that on
+    process = subprocess.Popen(
+        [*words, "--force"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    signal.signal(signal.SIGINT, before)
+    children, give_up = Path(f"/proc/{process.pid}/task/{process.pid}/children"), time.monotonic() + 100.0
+    while time.monotonic() < give_up and not children.read_text().split():
+        time.sleep(0.001)
+    time.sleep(later)
+    os.killpg(process.pid, signal.SIGINT)
+    _, message = process.communicate(timeout=100)
+    assert process.returncode == 130
+    assert message.startswith("interrupted: ") and len(message.splitlines()) == 1
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("kill", [os.killpg, os.kill], ids=["terminal", "one"])
 def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(
     kill: Callable[[int, int], None], tmp_path: Path

@@ -19,6 +19,7 @@ from ..discovery.survey import FOLLOWS, Survey, early, survey, too_early
 from ..errors import RunError
 from ..fusion import results
 from ..fusion.config import FusionConfig
+from ..fusion.consistency import Finding
 from ..fusion.estimates import Mode
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
@@ -35,7 +36,6 @@ from .tune import WORSE, end, fitting, show_lags
 
 _STRAYS_FAR = 2.0  # times as far off as the path through the commands: no arm was found
 _NOTHING = 1e-3  # of the range that is measured, by which it is off at least
-_STRAYS = 1.5  # times its sd, by which a sensor errs from what is predicted where the arm strays, too
 _BAGS = (".mcap", ".db3")  # which ROS 2 records
 _FITTED_ARM: Sequence[Fit] = ("delay", "plant", "gain")  # whose intervals the error bars count
 _FITTED: Sequence[Fit] = ("noise", *_FITTED_ARM)
@@ -77,13 +77,14 @@ def run(
     with fitting() as progress:
         fitted = tune(recorded, begun, fit=_FITTED, intervals=_FITTED_ARM, progress=progress)
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)
+    est = replace(est, fitted=True)
     results.check_fused(est.counts, est.config)
     extras = partial(draw, est=est, recorded=recorded, rrd=rrd, figures=figures)
     summary = results.write(est, output, force, extras, texts["run.toml"])
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
     strays = _off_the_path(found, summary)
-    for line in [*strays, *_told_by_one(summary, est.config)]:
+    for line in [*strays, *_told_by_one(summary)]:
         say(line)
     for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
         say(taken(name, 0.0))
@@ -123,13 +124,12 @@ def _off_the_path(found: Survey, summary: Summary) -> list[str]:
     return [line for axis, line in lines.items() if axis not in follows]
 
 
-def _told_by_one(summary: Summary, config: FusionConfig) -> list[str]:
-    """A sentence on each sensor that is alone on axes, and errs by less there than the arm strays, as it was fitted."""
+def _told_by_one(summary: Summary) -> list[str]:
+    """A sentence on each sensor that is alone on axes where its noise is told from the arm's by being white alone."""
     found = dict[str, list[str]]()
     for axis, part in summary.axes.items():
-        measuring = {name: one.innovation_sd for name, one in part.sensors.items() if one.innovation_sd}
-        for name, expected in measuring.items():
-            if len(measuring) == 1 and expected > _STRAYS * (config.sensors[name].sd_of(axis) or 0.0):
+        for name, one in part.sensors.items():
+            if one.finding == Finding.UNTESTED.value:
                 found.setdefault(name, []).append(axis)
     return [
         f"{name} alone measures {', '.join(axes)}: what strays there is taken for the arm. If {name} filters its"

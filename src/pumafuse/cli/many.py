@@ -5,6 +5,8 @@ joblib runs the jobs; ``joblib.parallel_config`` around :func:`run_jobs` chooses
 
 from __future__ import annotations
 
+import signal
+import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
@@ -35,6 +37,27 @@ def progress_bar(what: str, total: float = 1.0) -> Generator[Callable[[float], N
         yield lambda done: bar.update(task, completed=done)
 
 
+@contextmanager
+def _not_told_of_ctrl_c() -> Generator[None]:
+    """Processes that are started here never take notice of Ctrl-C, which would end them with a traceback each.
+
+    They end with this one, which takes notice of it afterwards: what is blocked waits, also where it is ignored.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    resource_tracker.ensure_running()  # as it starts it ends the blocking
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+
+
 def run_jobs(
     what: str, jobs: Mapping[str, Callable[[], R]], places: Iterable[Path]
 ) -> tuple[dict[str, R], dict[str, str]]:
@@ -46,8 +69,10 @@ def run_jobs(
     failed: dict[str, str] = {}
     parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
     work = (delayed(_guarded)(name, job) for name, job in jobs.items())
-    outcomes = cast(Generator[tuple[str, R | None, str | None]], parallel(work))
+    outcomes: Generator[tuple[str, R | None, str | None]] | None = None
     try:
+        with _not_told_of_ctrl_c():
+            outcomes = cast(Generator[tuple[str, R | None, str | None]], parallel(work))
         with progress_bar(what, len(jobs)) as move:
             for name, result, problem in outcomes:
                 if problem is None:
@@ -62,12 +87,19 @@ def run_jobs(
         kept = f"{len(results)} of {len(jobs)} runs are done and kept"
         raise PumafuseError(f"a worker process died (out of memory?): {kept}") from None
     finally:
+        told, threading.excepthook = threading.excepthook, _unsaid
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of work that is not used
-            outcomes.close()  # only now does no worker write any more
+            if outcomes is not None:
+                outcomes.close()  # only now does no worker write any more
+        threading.excepthook = told
         sweep(places)
     done = {name: results[name] for name in jobs if name in results}
     return done, {name: failed[name] for name in jobs if name in failed}
+
+
+def _unsaid(_: threading.ExceptHookArgs) -> None:
+    """Of a thread of joblib's that is ended as it starts."""
 
 
 def report_failures(failed: Mapping[str, str], count: int, where: Path) -> None:

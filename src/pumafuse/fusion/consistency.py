@@ -27,6 +27,7 @@ LAGS = 20
 _FEW = 30  # fewer components get no verdict
 _COLOURED = 0.01  # p-value below which innovations are not white
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
+_STRAYS = 1.5  # times its sd, by which an estimate is away from the response: if that is the sensor, 81 % are in 95
 MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
 
 
@@ -36,6 +37,7 @@ class Finding(enum.Enum):
     FEW = "few"  # too few to tell
     REJECTED = "rejected"  # many were: the others were selected to fit
     CONSISTENT = "consistent"
+    UNTESTED = "untested"  # as expected, but fitted to this run, and what strays may be the sensor or the arm
     AT_BOUND = "at bound"  # consistent, but no measurement determined the noise
     NOT_WHITE = "not white"  # as large as expected, but correlated
     TOO_LARGE = "too large"  # innovations, for their predicted sd
@@ -55,6 +57,7 @@ class Consistency:
     sensor: str = ""
     kind: Kind = "length"  # of the axis
     at_bound: bool = False  # whether the sensor's sd is at a bound of what can be fitted
+    untested: bool = False  # whether nothing tells its noise from what the arm strays
     evidence: Callable[[], Evidence] = dict  # of causes, looked for where it makes a difference
 
     @cached_property
@@ -69,7 +72,9 @@ class Consistency:
             return Finding.TOO_LARGE if self.nis > high else Finding.TOO_SMALL
         if self.whiteness < _COLOURED and abs(self.correlation[self.strongest_lag - 1]) > _NOTABLE:
             return Finding.NOT_WHITE
-        return Finding.AT_BOUND if self.at_bound else Finding.CONSISTENT
+        if self.at_bound:
+            return Finding.AT_BOUND
+        return Finding.UNTESTED if self.untested else Finding.CONSISTENT
 
     @cached_property
     def causes(self) -> tuple[Suspect, ...]:
@@ -158,5 +163,23 @@ def consistency(
         sensor=sensor,
         kind=est.config.arm.axes[axis].kind,
         at_bound=known.is_at_bound(axis),
+        untested=est.fitted and _is_told_by_one(est, sensor, axis),
         evidence=evidence or (lambda: evidence_of(est, axis)),
     )
+
+
+def _is_told_by_one(est: Estimates, sensor: str, axis: str) -> bool:
+    """Whether a sensor is alone on an axis, and tells that the arm strays from its commands.
+
+    A fit tells the noise of such a sensor from what the arm strays by one thing alone: that it is white. Filtered
+    values, or a noise that lasts, are taken for the arm then, and the innovations are as expected.
+    """
+    others = (name for name in est.measurements.sensors if name != sensor)
+    if any(len(est.measurements.of(name, axis).value) for name in others):
+        return False
+    strays, time = est[axis].position.copy(), est.origin + np.rint(est.time * 1e9).astype(np.int64)
+    for number, segment in enumerate(est.segments):
+        rows = est.segment == number
+        strays[rows] -= segment.led(est.config.arm, axis, time[rows])
+        strays[rows] -= strays[rows].mean()
+    return float(np.std(strays)) > _STRAYS * float(np.median(est[axis].position_sd))

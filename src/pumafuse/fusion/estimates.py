@@ -164,6 +164,7 @@ class Estimates:
         rate: Of the even grid of estimates [Hz]; None: one for each command.
         selected: The sensors that were asked for; None: all that are configured.
         placed: The frame in which the axes are, if there is one.
+        fitted: Whether the configuration was fitted to this very run, so that the run is no test of it.
     """
 
     run: str
@@ -189,6 +190,7 @@ class Estimates:
     rate: float | None = None
     selected: tuple[str, ...] | None = None
     placed: Placed | None = None
+    fitted: bool = False
 
     def __getitem__(self, axis: str) -> AxisEstimate:
         """The estimates of one axis.

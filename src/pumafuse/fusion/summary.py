@@ -80,6 +80,7 @@ class SensorSummary(toml.Reported, frozen=True, kw_only=True):
         correlation: Autocorrelation of the innovations at lags 1, 2, …
         correlation_band: White innovations' autocorrelations lie within ± this in 95 % of cases.
         whiteness_p: Ljung-Box p-value; small: the innovations are not white.
+        finding: What the numbers say, in a word: the verdict as data.
         verdict: In words, with the likely cause and the key to change.
         causes: Those in it, the likeliest first; any of them may be the one.
         bias: The estimated bias in the log's coordinates [m or rad]; null where none is estimated.
@@ -96,6 +97,7 @@ class SensorSummary(toml.Reported, frozen=True, kw_only=True):
     correlation: list[float] = msgspec.field(default_factory=list[float])
     correlation_band: float | None = None
     whiteness_p: float | None = None
+    finding: str | None = None
     verdict: str = "nothing fused"
     causes: list[FoundCause] = msgspec.field(default_factory=list[FoundCause])
     bias: float | None = msgspec.field(name="bias_mm", default=None)
@@ -403,6 +405,7 @@ def sensor_summary(
         correlation=found.correlation.tolist(),
         correlation_band=found.correlation_band,
         whiteness_p=found.whiteness,
+        finding=found.finding.value,
         verdict=sentence(found),
         causes=[_found_cause(axis, one, found) for one in found.causes],
         bias=None if bias is None else bias.value,
