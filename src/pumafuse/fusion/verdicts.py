@@ -88,7 +88,7 @@ def sentence(found: Consistency) -> str:
         case Finding.AT_BOUND:
             return f"{nis}, but {sd} is at a bound of what can be fitted: error bars need not hold; configure it"
         case Finding.UNTESTED:
-            return f"{nis}: as fitted, no test: {found.sensor} alone measures this axis"
+            return f"{nis}: untested"
         case Finding.CONSISTENT:
             return f"{nis}: consistent"
         case _:
