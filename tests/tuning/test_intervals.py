@@ -318,16 +318,16 @@ def shares(
 
 
 @pytest.mark.long
-def test_coverage_of_noise_over_200_runs() -> None:
+def test_coverage_of_noise_over_100_runs() -> None:
     """A camera with outliers, fitted from noise that is wrong by factors of 2 to 3.
 
-    One standard deviation of a share of 95 % in 200 is 1.5 %: each number's is in 90 to 99.5 %, and all together in
-    93.5 to 97.5 %: more for a noise that is 0.
+    One standard deviation of a share of 95 % in 100 is 2.2 %: each number's is at least 88.5 %, and all together are in
+    93 to 98 %: more for a noise that is 0.
     """
-    each, together = shares("panel-vision", range(1, 201), ("noise",), spoiled)
+    each, together = shares("panel-vision", range(1, 101), ("noise",), spoiled)
     assert len(each) == 10
-    assert all(0.90 <= share <= 0.995 for share in each.values()), each
-    assert 0.935 <= together <= 0.975, each
+    assert all(share >= 0.885 for share in each.values()), each
+    assert 0.93 <= together <= 0.98, each
 
 
 @pytest.mark.long
