@@ -128,7 +128,8 @@ def divisor(unit: str) -> float:
 
 def si_of(values: FloatArray, unit: str) -> FloatArray:
     """An array of numbers in the unit of an ending, in SI."""
-    return values / divisor(unit)
+    with np.errstate(invalid="ignore"):  # a table may have NaNs that signal
+        return values / divisor(unit)
 
 
 def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,6 +22,7 @@ import typer
 import pumafuse as pf
 from executable import DATA, names, pumafuse, refused
 from pumafuse.cli import from_log
+from pumafuse.discovery.survey import survey
 from pumafuse.filter.response import response
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -227,6 +228,20 @@ def test_one_command_says_what_one_sensor_alone_does_not_show(
     told = json.loads((tmp_path / "out" / "summary.json").read_text())["axes"]["x"]["sensors"]["tracker"]
     assert told["finding"] == ("untested" if fault else "consistent")
     assert told["verdict"].endswith(": untested" if fault else ": consistent")
+
+
+@pytest.mark.parametrize(("fitted", "play", "said"), [(118.0, 0.0, False), (373.0, 0.0, True), (373.0, 1e-3, False)])
+def test_a_lag_far_from_that_of_the_first_look_is_not_to_be_trusted(fitted: float, play: float, said: bool) -> None:
+    """As of an arm that sticks and was fitted as a slow one; what has play lags otherwise with each motion."""
+    found = survey(EXAMPLES / "my-run")
+    axes = {axis: pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05), play=play) for axis in found.run.axes}
+    lags = {"x": pf.FittedLag(before_ms=118.0, lag_ms=fitted, lag_ms_ci95=(None, None))}
+    lines = from_log.otherwise_than_at_first(
+        found, lags, pf.ArmModel(name="arm", update_period=0.028, delay=0.06, axes=axes)
+    )
+    assert ["do not trust the lag of x (118 ms at the first look, 373 fitted)" in line for line in lines] == [
+        True
+    ] * said
 
 
 @pytest.mark.parametrize("more", [[EXAMPLES / "trunk-servo" / "0g"], ["--resume"]])

@@ -596,7 +596,7 @@ def test_joints_and_a_pose_that_no_command_moves(tmp_path: Path) -> None:
     assert run.kinds == {"shoulder": "angle", "elbow": "angle"}
     assert tuple(run.sensors) == ("joint_states",)
     text = (tmp_path / "out" / "run.toml").read_text()
-    assert "# Not used: no command moves x, y, z (a length) at the same time" in text
+    assert "# Not used: none of the commands that were taken is a length, as x, y, z are" in text
     assert '# x = { column = "pose.position.x", unit = "m" }' in text
     assert pf.fuse(run, config).measurements.counts() == {"fused": 800}
 
@@ -1146,6 +1146,51 @@ def test_stamps_of_a_headerless_table_may_repeat(tick: float, every: float, tmp_
     assert any("is no clock: 40 distinct stamps, one every 1 s" in note for note in coarse.notes)
 
 
+def test_rows_that_a_clock_of_ticks_gets_may_vary(tmp_path: Path) -> None:
+    """Three to five rows of a logger in each tick of 5 ms; a table of commands and measurements without a header."""
+    rows = np.random.default_rng(1).choice([3, 4, 5], 2000, p=[0.17, 0.58, 0.25])
+    t = np.repeat(0.36 + 0.005 * np.arange(2000), rows)
+    np.savetxt(tmp_path / "shoulder.csv", np.column_stack([t, path(t)[:, 0], path(t - LAG)[:, 0]]), "%.6f", ",")
+    (part,) = parts_of(tmp_path / "shoulder.csv")
+    assert part.clock is not None and part.clock.time.column == "column 1"
+
+
+def test_an_empty_array_beside_others_is_left_out(tmp_path: Path) -> None:
+    """With the reason; alone it is refused."""
+    t, u, z = recorded_at_once()
+    np.savez(tmp_path / "arm.npz", time=t, target=u, actual=z)
+    np.save(tmp_path / "attitude.npy", np.zeros(0))
+    parts = parts_of(tmp_path)
+    assert [note for one in parts for note in one.notes] == ["no table in it: nothing has rows of numbers"]
+    assert {one.file.name for one in parts if one.signals} == {"arm.npz"}
+    with pytest.raises(RunError, match="no table in it"):
+        parts_of(tmp_path / "attitude.npy")
+
+
+def test_what_is_called_an_error_is_no_position(tmp_path: Path) -> None:
+    """However alike it moves."""
+    t, u, z = recorded_at_once()
+    columns = {"time": t, "target_y_m": u[:, 1], "robot_y_m": z[:, 1], "robot_y_err": z[:, 1] - u[:, 1]}
+    write(tmp_path / "log.csv", columns | {"errs_y_m": 0.9 * z[:, 1]})
+    (part,) = parts_of(tmp_path / "log.csv")
+    assert {one.column for one in part.signals} == {"target_y_m", "robot_y_m"}
+
+
+def test_one_coordinate_of_a_point_is_a_joint_only_where_it_moves_as_that_does(tmp_path: Path) -> None:
+    """An instrument that slides in and turns: its tip goes about as far along z as it slides, and is not the slide."""
+    t, u, z = recorded_at_once()
+    told = {"time": t, "cmd.insertion_m": u[:, 0], "cmd.yaw_rad": u[:, 1]}
+    seen = {"state.insertion_m": z[:, 0], "state.yaw_rad": z[:, 1]}
+    write(tmp_path / "robot.csv", told | seen)
+    for share, followed in ((0.5, False), (0.0, True)):
+        tip = {"time": t, "x_m": 0.3 + z[:, 2], "y_m": np.sin(2.0 * t), "z_m": z[:, 0] + share * z[:, 2]}
+        write(tmp_path / "tip.csv", tip)
+        found = survey(tmp_path)
+        assert found.roles is not None
+        of_tip = [one for one in found.roles.sensors if one.axes["insertion"][0].column == "z_m"]
+        assert bool(of_tip) is followed
+
+
 @pytest.mark.parametrize("restart", ["within a turn until then", "a turn less in motion", "a turn more at rest"])
 def test_an_angle_goes_on_over_a_restart_of_what_counts_its_turns(restart: str, tmp_path: Path) -> None:
     t = np.arange(0.0, 50.0, 0.02)
@@ -1279,7 +1324,7 @@ def test_the_same_axes_under_another_word_are_another_sensor(tmp_path: Path) -> 
     assert found.roles is not None
     assert sorted(one.axes["x"][0].column for one in found.roles.sensors) == ["x_data_m", "x_m"]
     (left,) = [why for one, why in found.roles.left_out if "battery" in one.axes]
-    assert "none moves alike" in left
+    assert "no command is left that is called so or moves alike" in left
 
 
 def test_joints_at_rest_do_not_hide_the_one_that_moves(tmp_path: Path) -> None:

@@ -80,6 +80,14 @@ def test_an_axis_may_not_be_called_as_a_part_of_a_line() -> None:
         LineDecoder({"t": "length"}, framed=False)
 
 
+@pytest.mark.parametrize("name", ["a\\b", 'the "tip"', "x\x1b[31m"])
+def test_an_axis_that_no_line_can_name_is_refused(name: str) -> None:
+    """In one line, and so is a joint."""
+    for axes, joints in (({name: "length"}, {}), ({"x": "length"}, {name: "angle"})):
+        with pytest.raises(pf.ConfigError, match="no quotes, backslashes or control characters"):
+            LineDecoder(axes, framed=False, joints=joints)
+
+
 def test_an_estimate_is_one_line() -> None:
     """Position, sd and velocity of each axis, x, y, z in a frame, stale axes, and ns where the stream has them."""
     config = pf.FusionConfig(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,9 @@ from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import described
 from ..model.arm import ArmModel
+from ..tuning.arms import BENDS
 from ..tuning.parameters import Fit
+from ..tuning.summary import FittedLag
 from ..tuning.tune import tune
 from ..units import MS, SCREEN
 from . import init
@@ -36,6 +38,8 @@ from .tune import WORSE, end, fitting, show_lags
 
 _STRAYS_FAR = 2.0  # times as far off as the path through the commands: no arm was found
 _NOTHING = 1e-3  # of the range that is measured, by which it is off at least
+_OTHERWISE = 1.0  # times the smaller of two lags, by which they differ at least to be another one
+_SAME_LAG_MS = 50.0  # and by which a lag of any size does
 _BAGS = (".mcap", ".db3")  # which ROS 2 records
 _FITTED_ARM: Sequence[Fit] = ("delay", "plant", "gain")  # whose intervals the error bars count
 _FITTED: Sequence[Fit] = ("noise", *_FITTED_ARM)
@@ -84,7 +88,11 @@ def run(
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
     strays = _off_the_path(found, summary)
-    for line in [*strays, *_told_by_one(summary)]:
+    for line in [
+        *strays,
+        *otherwise_than_at_first(found, fitted.details.lags, fitted.config.arm),
+        *_told_by_one(summary),
+    ]:
         say(line)
     for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
         say(taken(name, 0.0))
@@ -122,6 +130,27 @@ def _off_the_path(found: Survey, summary: Summary) -> list[str]:
             " run.toml), or were these given earlier than they are stamped (shift_s)?"
         )
     return [line for axis, line in lines.items() if axis not in follows]
+
+
+def otherwise_than_at_first(found: Survey, lags: Mapping[str, FittedLag], arm: ArmModel) -> list[str]:
+    """A sentence on the axes whose fitted lag is far from that of the first look, which needs no arm.
+
+    What has play or a fastest speed lags otherwise with each motion: its numbers say so themselves.
+    """
+    seen = {axis for (_, axis), one in found.relations.items() if abs(one.correlation) >= FOLLOWS}
+    others = [
+        f"{axis} ({one.before_ms:.0f} ms at the first look, {one.lag_ms:.0f} fitted)"
+        for axis, one in lags.items()
+        if axis in seen
+        and not any(getattr(arm.axes[axis], bend) for bend in BENDS)
+        and abs(one.lag_ms - one.before_ms) > max(_OTHERWISE * min(one.lag_ms, one.before_ms), _SAME_LAG_MS)
+    ]
+    if not others:
+        return []
+    return [
+        f"do not trust the lag of {', '.join(others)}: an axis that sticks or carries a load is taken for a slow one,"
+        " or the look was at too little. Fit where it moves more (--from, --to), and look at fused.png (--figures)"
+    ]
 
 
 def _told_by_one(summary: Summary) -> list[str]:

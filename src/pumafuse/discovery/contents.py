@@ -175,7 +175,13 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
         elif tables.is_recording(path):
             found += _recorded(path)
         else:
-            several = formats.names(path) if path.name.endswith(formats.ENDINGS) else ("",)
+            try:
+                several = formats.names(path) if path.name.endswith(formats.ENDINGS) else ("",)
+            except RunError as error:  # beside others it may be anything
+                if path == log:
+                    raise
+                found.append(Part(path, notes=(str(error).removeprefix(f"{path}: "),)))
+                continue
             found += [part for name in several for part in _tabled(path, rate, name)]
         if len(found) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
@@ -617,7 +623,7 @@ def _ticks(steps: FloatArray) -> bool:
     if len(rows) < _FEWEST_ROWS or ticks.min() <= 0.0:
         return False
     alike = (np.abs(ticks / np.median(ticks) - 1.0) < _OF_TICK).mean() >= _IN_ORDER
-    return bool(alike and (np.abs(rows - rows.mean()) <= 1.0).mean() >= _IN_ORDER)
+    return bool(alike and (np.abs(rows - rows.mean()) <= 1.5).mean() >= _IN_ORDER)
 
 
 def _counted(table: Table, rate: float) -> Clock:

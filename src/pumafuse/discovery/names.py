@@ -52,12 +52,12 @@ _NO_POSITIONS = words_in(
     " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tor tq tau moment moments force forces"
     " wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts power pwm duty load"
     " pressure kp ki kd mode scaling bits temperature temperatures temp quality confidence covariance orientation"
-    " rotation quaternion quat twist index id seq sequence count status valid std sd sigma latency duration error"
-    " header stamp nanosec layout frame done reward task episode tick time timestamp reset lat lon latitude"
+    " rotation quaternion quat twist index id seq sequence count status valid std sd sigma latency duration error err"
+    " errs header stamp nanosec layout frame done reward task episode tick time timestamp reset lat lon latitude"
     " longitude var variance yawspeed rollspeed pitchspeed good innov"
 )
 _FINGERS = words_in("index rotation")  # of a hand: beside words of roles, at the end, these are joints
-_SPREADS = words_in("std sd sigma error covariance")  # in the unit of a position, and none
+_SPREADS = words_in("std sd sigma error err errs covariance")  # in the unit of a position, and none
 _CHANGES = words_in("delta relative rel incremental increment diff")
 # Words that are something else only without a number and without a unit: ax1 and az_deg are axes.
 _WHOLE = {
@@ -85,7 +85,9 @@ _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _BRACKETED = re.compile(rf"[\[(] *(mm|m|um|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
-SLIDING = words_in("slide slider prismatic linear rail gantry")  # joints in metres, where others turn
+SLIDING = words_in(
+    "slide slider prismatic linear rail gantry insertion telescope telescopic elevator"
+)  # joints in metres, where others turn
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
     **dict.fromkeys(words_in("m meter meters metre metres"), "m"),

@@ -29,6 +29,7 @@ from .names import Role
 from .orientations import Attitude, in_order
 from .own_frames import speeds_follow
 
+_OF_POINT = 0.98  # correlation from which a joint moves one coordinate of a point alone, as a rail does
 _SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
 _ALIKE, _LEVEL = 0.98, 0.1  # correlation of columns of one axis, and share of their range by which their ends differ
 _NAMELESS = FIRST.split()[:1]  # of the words that a column is called that has no name
@@ -190,7 +191,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             used = {id(some) for some in axes.values()}
             others = {axis: some for axis, some in stream.axes.items() if id(some) not in used}
             for held in (True, False):
-                why_not = "its command never moves" if held else "no command is called so, and none moves alike"
+                why_not = "its command never moves" if held else "no command is left that is called so or moves alike"
                 if some := {axis: columns for axis, columns in others.items() if (axis in resting) == held}:
                     left_out.append((replace(stream, axes=some), why_not))
         else:
@@ -577,6 +578,8 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
         for own, axis in product(others, [axis for axis in command.axes if axis not in fits])
         if _same_kind(command, axis, stream, own) and (one := _relation(command, axis, stream, own)) is not None
     }
+    points = [own for own in others if own in CARTESIAN]
+    pairs = {pair: one for pair, one in pairs.items() if one >= _OF_POINT or len(points) < 2 or pair[0] not in points}
     named = {pair for pair in pairs if pair[0].rpartition("_")[2] == pair[1]}  # p_RS_R_x is x, if that moves alike
     for own, axis in sorted(pairs, key=lambda pair: (pair in named, pairs[pair]), reverse=True):
         if pairs[own, axis] >= _SAME and axis not in fits and own in others:
@@ -584,7 +587,7 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
             others.remove(own)
     if fits or not pairs:
         kinds = sorted({AN[stream.kind(axis)] for axis in stream.axes})
-        return fits, f"no command moves {', '.join(stream.axes)} ({' or '.join(kinds)}) at the same time"
+        return fits, f"none of the commands that were taken is {' or '.join(kinds)}, as {', '.join(stream.axes)} are"
     most = max(pairs, key=pairs.__getitem__)
     alike = f"at most {pairs[most]:.2f}, {most[1]}"
     return fits, f"its axes are called otherwise than the commands', and follow none ({alike})"

@@ -323,7 +323,7 @@ def _check_axes(run: Run, arm: ArmModel) -> None:
         if axis in arm.axes and kind != arm.axes[axis].kind:
             raise RunError(
                 f"run '{run.name}': {axis} is {AN[kind]}, the arm '{arm.name}' says {AN[arm.axes[axis].kind]}; give"
-                f' [axes.{axis}] kind = "{kind}", or columns of the other unit'
+                f' [axes.{axis}] kind = "{kind}", or columns of the other unit; without -c `fuse` fits an arm anew'
             )
     for name, source in run.sensors.items():
         if any(axis in CARTESIAN and axis not in run.axes for axis in source.values):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, cast
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from ..errors import ConfigError
+from ..errors import ConfigError, printable
 from ..logs.frames import CARTESIAN
 from ..space.rotations import TURNING
 from ..units import MM, SCREEN, Kind
@@ -85,9 +85,13 @@ class LineDecoder:
         self._turns = _QUATERNION not in kinds or set(TURNING) <= kinds.keys()
         self._names = (*_NAMES, _QUATERNION) if self._turns else _NAMES
         for axis in self._axes:
+            what = f"{'joint' if axis in joints else 'axis'} {printable(axis)!r}"
             if axis in self._names:
-                what, every_name = "joint" if axis in joints else "axis", ", ".join(self._names)
-                raise ConfigError(f"{what} '{axis}': lines of a stream call something else so ({every_name})")
+                raise ConfigError(f"{what}: lines of a stream call something else so ({', '.join(self._names)})")
+            if not axis.isprintable() or set(axis) & set('\\"'):
+                raise ConfigError(
+                    f"{what}: names in lines of a stream have no quotes, backslashes or control characters"
+                )
         fields: list[tuple[str, Any, Any]] = [
             (f"axis_{number}", float | UnsetType | None, UNSET) for number in range(len(self._axes))
         ]

@@ -716,6 +716,7 @@ def _source(
             if units.setdefault(axis, kind) != kind:
                 raise RunError(
                     f"{table.path}: column '{column.column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
+                    " in run.toml: in another source, or in its start"
                 )
         values[axis] = np.sum([numbers for numbers, _ in parts], 0)
         found.extend(note for _, note in parts)

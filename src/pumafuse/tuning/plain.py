@@ -50,8 +50,9 @@ class LagStep(NamedTuple):
 
     def __str__(self) -> str:
         """A sentence."""
+        digits = 0 if self.time >= 2.0 else 1
         return (
-            f"by least squares the lag is {self.before * MS:.0f} ms until about {self.time:.0f} s and"
+            f"by least squares the lag is {self.before * MS:.0f} ms until about {self.time:.{digits}f} s and"
             f" {self.after * MS:.0f} ms from then on, and no one arm explains both: did a latency step? Use parts,"
             " --to and --from"
         )
