@@ -85,9 +85,8 @@ _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _BRACKETED = re.compile(rf"[\[(] *(mm|m|um|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
-SLIDING = words_in(
-    "slide slider prismatic linear rail gantry insertion telescope telescopic elevator"
-)  # joints in metres, where others turn
+# Joints in metres, where others turn.
+SLIDING = words_in("slide slider prismatic linear rail gantry insertion telescope telescopic elevator")
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
     **dict.fromkeys(words_in("m meter meters metre metres"), "m"),

@@ -178,8 +178,8 @@ def _is_told_by_one(est: Estimates, sensor: str, axis: str) -> bool:
     if any(len(est.measurements.of(name, axis).value) for name in others):
         return False
     strays, time = est[axis].position.copy(), est.origin + np.rint(est.time * 1e9).astype(np.int64)
-    for number, segment in enumerate(est.segments):
+    for number in np.unique(est.segment).tolist():
         rows = est.segment == number
-        strays[rows] -= segment.led(est.config.arm, axis, time[rows])
+        strays[rows] -= est.segments[number].led(est.config.arm, axis, time[rows])
         strays[rows] -= strays[rows].mean()
     return float(np.std(strays)) > _STRAYS * float(np.median(est[axis].position_sd))
