@@ -39,9 +39,9 @@ def progress_bar(what: str, total: float = 1.0) -> Generator[Callable[[float], N
 
 @contextmanager
 def _not_told_of_ctrl_c() -> Generator[None]:
-    """Processes that are started here never take notice of Ctrl-C, which would end them with a traceback each.
+    """Processes that are started here block Ctrl-C, which would end them with a traceback each.
 
-    They end with this one, which takes notice of it afterwards: what is blocked waits, also where it is ignored.
+    They end with this one, which takes notice afterwards of what came meanwhile.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
@@ -50,11 +50,9 @@ def _not_told_of_ctrl_c() -> Generator[None]:
 
     resource_tracker.ensure_running()  # as it starts it ends the blocking
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
