@@ -601,8 +601,8 @@ def test_joints_and_a_pose_that_no_command_moves(tmp_path: Path) -> None:
     assert pf.fuse(run, config).measurements.counts() == {"fused": 800}
 
 
-def joints(log: Path) -> None:
-    """Commands and states of two joints, whose order changes, and the pose of a tool."""
+def joints(log: Path, first: str = "shoulder", second: str = "elbow", alike: bool = False) -> None:
+    """Commands and states of two joints, whose order changes, and the pose of a tool, which may move as these do."""
     from mcap_ros2.writer import Writer
 
     t = 0.02 * np.arange(400)
@@ -615,13 +615,13 @@ def joints(log: Path) -> None:
         for k, (told, there) in enumerate(zip(path(t), path(t - LAG), strict=True)):
             ns = START * 10**9 + 20_000_000 * k
             header = {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": "base"}
-            names_, places = (["elbow", "shoulder"], [1, 0]) if k % 2 else (["shoulder", "elbow"], [0, 1])
+            names_, places = ([second, first], [1, 0]) if k % 2 else ([first, second], [0, 1])
             seen = there + draw.normal(scale=2e-4, size=3)
             for topic, value in (("/joint_commands", told), ("/joint_states", seen)):
                 position = [float(value[place]) for place in places]
                 message = {"header": header, "name": names_, "position": position, "velocity": [], "effort": []}
                 writer.write_message(topic, schemas[topic], message, log_time=ns, publish_time=ns)
-            point = dict(zip("xyz", np.cos(3.0 * there).tolist(), strict=True))
+            point = dict(zip("xyz", (there if alike else np.cos(3.0 * there)).tolist(), strict=True))
             pose = {"position": point, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
             message = {"header": header, "pose": pose}
             writer.write_message("/tool/pose", schemas["/tool/pose"], message, log_time=ns, publish_time=ns)
@@ -1189,6 +1189,15 @@ def test_one_coordinate_of_a_point_is_a_joint_only_where_it_moves_as_that_does(t
         assert found.roles is not None
         of_tip = [one for one in found.roles.sensors if one.axes["insertion"][0].column == "z_m"]
         assert bool(of_tip) is followed
+
+
+def test_a_guessed_unit_of_one_joint_makes_no_length_of_another(tmp_path: Path) -> None:
+    """A message's joints are in rad but for the slide, a guess; a coordinate that moves as a turn is no angle."""
+    joints(tmp_path / "drive.mcap", "yaw", "insertion", alike=True)
+    found = survey(tmp_path / "drive.mcap")
+    assert found.run.kinds == {"insertion": "length", "yaw": "angle"}
+    assert set(found.run.sensors["joint_states"].values) == {"yaw", "insertion"}
+    assert all("yaw" not in one.values for name, one in found.run.sensors.items() if name != "joint_states")
 
 
 @pytest.mark.parametrize("restart", ["within a turn until then", "a turn less in motion", "a turn more at rest"])

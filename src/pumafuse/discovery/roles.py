@@ -595,7 +595,8 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
 
 def _same_kind(command: Stream, axis: str, stream: Stream, own: str) -> bool:
     """Whether two axes can be the same by their units."""
-    return command.kind(axis) == stream.kind(own) or command.guessed or stream.guessed
+    both = (*command.axes[axis], *stream.axes[own])
+    return command.kind(axis) == stream.kind(own) or any(one.basis == "range" for one in both)
 
 
 def _renamed(streams: Sequence[Stream]) -> list[Stream]:
