@@ -74,6 +74,10 @@ struct Arm {
         fast = value_of(plant.order == 1 ? plant.rate : plant.omega);
         const double turning = square(value_of(plant.omega)) - square(value_of(plant.sigma));
         half_swing = turning > 0.0 ? 3.0 / std::sqrt(turning) : std::numeric_limits<double>::infinity();  // 3 < pi
+        const bool may_turn = plant.order == 2 || value_of(plant.decay) > 0.0;  // between two commands
+        cut_by_play = may_turn && value_of(half_play) > 0.0, cut_by_limit = may_turn && value_of(max_speed) > 0.0;
+        overshoot = turning > 0.0 ? 1.0 / std::tanh(0.5 * std::numbers::pi * value_of(plant.sigma) / std::sqrt(turning))
+                                  : 1.0;
     }
 
     Real gain_error(double step) const { return (slope * (std::fabs(step) / period) + intercept - 1.0) * step; }
@@ -101,9 +105,9 @@ struct Arm {
         else free(d, plant.over(dt), dt);
         const Motion m = motion(before, side), n = motion(d, side);
         const auto slope_then = [&] { return later_slope(side, m, d, plant.over(dt)); };
-        if (value_of(dt) > half_swing || this->side(d) != side ||
-            (value_of(half_play) > 0.0 && turns(m, m.rate, n.rate, slope_then)) ||
-            (value_of(max_speed) > 0.0 && turns(m, m.closing, n.closing, slope_then)))
+        if ((side == 0 && value_of(dt) > half_swing) || this->side(d) != side ||
+            (cut_by_play && turns(m, m.rate, n.rate, slope_then)) ||
+            (cut_by_limit && turns(m, m.closing, n.closing, slope_then)))
             d = before, in_pieces(d, slack, dt);
         else slack = pushed(slack, before, d);
     }
@@ -115,7 +119,9 @@ struct Arm {
     Real lag;           // L [s]
     double farthest;    // L V [m]: a gap that asks for more than the limit is larger
     double fast;        // 1/tau or omega [1/s]
-    double half_swing;  // s; within it a free plant turns once at most
+    bool cut_by_play, cut_by_limit;  // where the drive turns, or its gap no longer closes
+    double overshoot;   // times as far as an input it goes at most: the integral of |g| omega^2
+    double half_swing;  // s; within it a free plant turns once at most, and a drive at its limit whenever
 
     // 1 or -1 where the drive is asked for more than V, that way; else 0.
     int side(const Drive<Real>& d) const {
@@ -129,10 +135,14 @@ struct Arm {
         return plant.order == 1 ? plant.rate * d.gap() : d.gap() / lag;
     }
 
-    // No gap is larger within t: what the drive swings, and what a gain error adds to that.
-    double swing(const Drive<Real>& d, double t) const {
-        return std::fabs(value_of(d.x) - d.u) + std::fabs(value_of(d.rate)) / fast +
-               std::fabs(value_of(d.error)) * (1.0 + fast * t);
+    // Where the drive comes to rest, u or, where a gain error stays, u + e.
+    double aim(const Drive<Real>& d) const { return d.u + (value_of(plant.decay) == 0.0 ? value_of(d.error) : 0.0); }
+
+    // No gap is ever larger: what the drive swings about its aim, by its energy, which only falls, and what a gain error
+    // that decays adds to that.
+    double swing(const Drive<Real>& d) const {
+        const double swings = std::hypot(value_of(d.x) - aim(d), value_of(d.rate) / fast);
+        return swings + (value_of(plant.decay) == 0.0 ? 0.0 : std::fabs(value_of(d.error)) * (1.0 + overshoot));
     }
 
     // x <- u + Phi (x - u) + Gamma_e e
@@ -189,9 +199,10 @@ struct Arm {
         Real left = dt;
         for (int pieces = 1; !is_zero(left); ++pieces) {
             const Drive<Real> before = d;
-            const double most = swing(d, value_of(left));
-            const double tool = std::fabs(value_of(d.x + slack) - d.u), h = value_of(half_play);
-            const bool apart = most <= farthest && (h == 0.0 || tool + most <= h);  // of the limit, of the tool
+            const double most = swing(d);
+            const double tool = std::fabs(value_of(d.x + slack) - aim(d)), h = value_of(half_play);
+            // Of the limit, and of the tool: where the drive has just turned it swings up to the tool, but for rounding.
+            const bool apart = most <= farthest && (h == 0.0 || tool + most <= h + STILL);
             left = left - piece(d, left, apart || most < STILL || pieces == MOST_PIECES);
             slack = pushed(slack, before, d);
         }
@@ -207,10 +218,14 @@ struct Arm {
             else free(then, plant.computed(t), t);
             return then;
         };
-        Real taken = whole || value_of(left) <= half_swing ? left : Real(half_swing);
+        Real taken = whole || side != 0 || value_of(left) <= half_swing ? left : Real(half_swing);
         Drive<Real> then = moved(taken);
+        if (whole) {
+            d = then;
+            return taken;
+        }
         const auto up_to_change_of = [&](auto f, double last) {
-            if (whole || !changes(f(0.0), last)) return;
+            if (!changes(f(0.0), last)) return;
             taken = behind_change(f, value_of(taken), last);
             then = moved(taken);
         };
@@ -223,9 +238,9 @@ struct Arm {
                 up_to_change_of(slope_at, slope_at(end));
             up_to_change_of(rate, motion(then, side).*of);
         };
-        if (value_of(half_play) > 0.0) up_to_turn(&Motion::rate);
+        if (cut_by_play) up_to_turn(&Motion::rate);
+        if (cut_by_limit) up_to_turn(&Motion::closing);
         if (value_of(max_speed) > 0.0) {
-            up_to_turn(&Motion::closing);
             const auto beyond = [&](const Drive<Real>& at) {
                 const double gap = value_of(at.gap());
                 return (side == 0 ? std::fabs(gap) : side * gap) - farthest;
