@@ -15,7 +15,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray
 from ..units import Screen
-from .arms import BENDS, BEYOND, SAG, Arm, Limits, Measured, Recording, lonely
+from .arms import BENDS, BEYOND, SAG, Arm, Fit, Limits, Measured, Recording, lonely
 from .plain import FOLLOWS, PlainArm, independent
 
 _ANY = {"delay": (0.0, 10.0), "lag": (1e-4, 4.0), "damping": (0.2, 8.0), "gain": (0.3, 3.0)}
@@ -110,7 +110,7 @@ class _Search:
         self._start = given._replace(delay=plain.arm.delay, lag=plain.arm.lag, play=0.0, max_speed=0.0)
         if "gain" in free:
             self._start = self._start._replace(gain=plain.arm.gain, recovery=0.0, slope=0.0)
-        self._linear: Arm | None = None
+        self._wholes: dict[tuple[str, ...], Arm] = {}
         self._starts: dict[str, dict[str, float]] = {}
         self._free = free
         self.halves = _halves(self.measured)
@@ -178,34 +178,32 @@ class _Search:
         return all(apart(columns, here) < _KNEED * apart(columns[:, :2], here) for here in (self._rows, ~self._rows))
 
     def whole(self, kinds: Sequence[str]) -> Arm:
-        """The arm of least squares with these bends of all of the motion."""
-        if kinds:
-            return self.fitted(self.measured, kinds)
-        self._linear = self._linear or self.fitted(self.measured, [])
-        return self._linear
+        """The arm of least squares with these bends of all of the motion, of first or second order."""
+        if (key := tuple(kinds)) not in self._wholes:
+            start = self._start._replace(**{name: size for kind in kinds for name, size in self._starts[kind].items()})
+            found = [self._fitted(self.measured, start._replace(damping=0.0), kinds)]
+            first = found[0].arm
+            for earlier in _EARLIER if "damping" in self._names else ():  # dead time and plant make up for each other
+                by = earlier * first.delay
+                second = first._replace(delay=first.delay - by, lag=first.lag + by, damping=1.0)
+                found.append(self._fitted(self.measured, second, kinds))
+            self._wholes[key] = max(found, key=lambda one: one.log_posterior).arm
+        return self._wholes[key]
 
     def off(self, kinds: Sequence[str]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
         first, second = self.halves
         pairs = (first, second), (second, first)
-        return np.array([_square(there, self.fitted(here, kinds)) for here, there in pairs])
+        return np.array([_square(there, self._fitted(here, self.whole(kinds), kinds).arm) for here, there in pairs])
 
-    def fitted(self, measured: Measured, kinds: Sequence[str]) -> Arm:
-        """The arm of least squares with these bends, of first or second order."""
-        start = self._start._replace(**{name: size for kind in kinds for name, size in self._starts[kind].items()})
+    def _fitted(self, measured: Measured, near: Arm, kinds: Sequence[str]) -> Fit:
+        """The arm of least squares with these bends near one of the same order."""
         bends = [name for kind in kinds for name in self._starts[kind] if name != "gain"]
-        names: list[str] = [*(name for name in self._names if name != "damping"), *bends]
-        limits = self._limits
+        limits, names = self._limits, [name for name in self._names if name != "damping" or near.damping]
         if "stops" in kinds:  # between them is the middle of what is commanded
             sides = {"knee": (self._middle, self._high), "knee_below": (self._low, self._middle)}
             limits = limits._replace(bounds={**limits.bounds, **sides})
-        found = [measured.fitted(start._replace(damping=0.0), names, self._rest, limits)]
-        first = found[0].arm
-        for earlier in _EARLIER if "damping" in self._names else ():  # dead time and plant make up for each other
-            by = earlier * first.delay
-            second = first._replace(delay=first.delay - by, lag=first.lag + by, damping=1.0)
-            found.append(measured.fitted(second, [*names, "damping"], self._rest, limits))
-        return max(found, key=lambda one: one.log_posterior).arm
+        return measured.fitted(near, [*names, *bends], self._rest, limits)
 
 
 def _best_knees(level: FloatArray, left: FloatArray, count: int, middle: float) -> list[float]:
