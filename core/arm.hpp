@@ -76,6 +76,7 @@ struct Arm {
         half_swing = turning > 0.0 ? 3.0 / std::sqrt(turning) : std::numeric_limits<double>::infinity();  // 3 < pi
         const bool may_turn = plant.order == 2 || value_of(plant.decay) > 0.0;  // between two commands
         cut_by_play = may_turn && value_of(half_play) > 0.0, cut_by_limit = may_turn && value_of(max_speed) > 0.0;
+        drawn = value_of(plant.drawn());
         overshoot = turning > 0.0 ? 1.0 / std::tanh(0.5 * std::numbers::pi * value_of(plant.sigma) / std::sqrt(turning))
                                   : 1.0;
     }
@@ -120,7 +121,8 @@ struct Arm {
     double farthest;    // L V [m]: a gap that asks for more than the limit is larger
     double fast;        // 1/tau or omega [1/s]
     bool cut_by_play, cut_by_limit;  // where the drive turns, or its gap no longer closes
-    double overshoot;   // times as far as an input it goes at most: the integral of |g| omega^2
+    double drawn;       // c: times an input that decays it follows; 0: not for ever, its decay is close to a pole
+    double overshoot;   // times an input it goes at most: the integral of |g| omega^2
     double half_swing;  // s; within it a free plant turns once at most, and a drive at its limit whenever
 
     // 1 or -1 where the drive is asked for more than V, that way; else 0.
@@ -135,14 +137,20 @@ struct Arm {
         return plant.order == 1 ? plant.rate * d.gap() : d.gap() / lag;
     }
 
-    // Where the drive comes to rest, u or, where a gain error stays, u + e.
-    double aim(const Drive<Real>& d) const { return d.u + (value_of(plant.decay) == 0.0 ? value_of(d.error) : 0.0); }
-
-    // No gap is ever larger: what the drive swings about its aim, by its energy, which only falls, and what a gain error
-    // that decays adds to that.
-    double swing(const Drive<Real>& d) const {
-        const double swings = std::hypot(value_of(d.x) - aim(d), value_of(d.rate) / fast);
-        return swings + (value_of(plant.decay) == 0.0 ? 0.0 : std::fabs(value_of(d.error)) * (1.0 + overshoot));
+    // Whether the drive goes on without its limit, and neither turns against its tool nor leaves it: no cut is needed.
+    //
+    // It swings about u + c e, which an input that decays draws it along. The energy of that only falls, which bounds how
+    // large a gap and how far from its tool it gets. Where the decay is close to a pole there is no such path: then the
+    // gain error adds what it can at most.
+    bool undisturbed(const Drive<Real>& d, const Real& slack) const {
+        const double e = value_of(d.error), along = drawn * e, forced = drawn == 0.0 ? overshoot * std::fabs(e) : 0.0;
+        const double x = value_of(d.x) - d.u, rate = value_of(d.rate) + value_of(plant.decay) * along;
+        const double swing = std::hypot(x - along, plant.order == 1 ? 0.0 : rate / fast) + forced;
+        const double gap = swing + std::fabs(e - along), tool = x + value_of(slack);
+        if (gap < STILL) return true;
+        // Where it has just turned it swings up to the tool, but for rounding.
+        const double apart = value_of(half_play) + STILL - std::max(std::fabs(tool), std::fabs(tool - along));
+        return gap <= farthest && (!cut_by_play || swing < STILL || swing <= apart);
     }
 
     // x <- u + Phi (x - u) + Gamma_e e
@@ -199,11 +207,7 @@ struct Arm {
         Real left = dt;
         for (int pieces = 1; !is_zero(left); ++pieces) {
             const Drive<Real> before = d;
-            const double most = swing(d);
-            const double tool = std::fabs(value_of(d.x + slack) - aim(d)), h = value_of(half_play);
-            // Of the limit, and of the tool: where the drive has just turned it swings up to the tool, but for rounding.
-            const bool apart = most <= farthest && (h == 0.0 || tool + most <= h + STILL);
-            left = left - piece(d, left, apart || most < STILL || pieces == MOST_PIECES);
+            left = left - piece(d, left, undisturbed(d, slack) || pieces == MOST_PIECES);
             slack = pushed(slack, before, d);
         }
     }

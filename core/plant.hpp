@@ -102,6 +102,9 @@ class Plant {
         return {omega * omega * h, omega * omega * (f.f12 - decay * h), left};
     }
 
+    // c: what decays is followed to c times itself, once the plant's own motion has faded. 0 where it is close to a pole.
+    Real drawn() const { return close ? Real(0.0) : order == 1 ? share : omega * omega * share; }
+
   private:
     // g, g', ∫ g^2 and h = ∫ g(s) exp(-decay (t - s)) ds; h only where the decay is close to a pole of the plant.
     using Free = std::array<Real, 4>;
