@@ -85,6 +85,29 @@ def test_several_steps_go_on() -> None:
     assert np.abs(found.command.stamp - right.command.stamp).max() <= 3
 
 
+@pytest.mark.parametrize(("back", "rates"), [(0.03, RATES), (0.04, RATES), (0.05, {"tracker": 100.0})])
+def test_a_step_of_one_command_is_seen_where_a_sensor_is_dense(back: float, rates: dict[str, float]) -> None:
+    """One command alone is behind, at once with three rows or more of a sensor."""
+    found, notes = going_on(logged({8.0: back}, rates=rates))
+    assert len(notes) == 1
+    assert np.abs(found.command.stamp - logged().command.stamp).max() <= 1
+    assert going_on(logged({8.0: back}, rates={"camera": 25.0}))[1] == []
+
+
+@pytest.mark.parametrize("rate", [1000.0, 100.0, 10.0])
+@pytest.mark.parametrize("back", [0.1, 0.3, 0.9])
+@pytest.mark.parametrize("is_set", [True, False])
+def test_a_reference_may_have_a_clock_that_goes_on(rate: float, back: float, is_set: bool) -> None:
+    """Then its stamps are left as they are, which is said."""
+    (right,) = logged(rates={"truth": rate}).sensors.values()
+    (stepped,) = logged({8.0: back}, rates={"truth": rate}).sensors.values()
+    found, (note,) = going_on(replace(logged({8.0: back}), reference=stepped if is_set else right))
+    assert note.endswith("stamps go on from there" if is_set else "; that of the reference is not")
+    assert found.reference is not None
+    assert np.abs(found.reference.stamp - right.stamp).max() <= 1
+    assert np.abs(found.command.stamp - logged().command.stamp).max() <= 1
+
+
 @pytest.mark.parametrize("back", [0.06, 0.3, 0.9])
 def test_one_sensor_alone_is_named_and_left(back: float) -> None:
     run = logged({8.0: back}, only="tracker")

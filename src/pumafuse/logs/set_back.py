@@ -17,7 +17,7 @@ from .run import Run, Source
 
 _FARTHEST_NS = 1_000_000_000  # by which rows are out of order; beyond it there is another segment
 _IN_ORDER = 20  # rows in order before a step
-_LEAST, _OF_ALL, _OF_ONE = 2, 3, 5  # rows behind: of each source; of one at least, if all step back; if one does alone
+_LEAST, _OF_ALL, _OF_ONE = 1, 3, 5  # rows behind: of each source; of one at least, if all step back; if one does alone
 _MANY = 100  # intervals of which the usual one is the median
 _HOLE, _HOLE_OF_STEP = 1.5, 0.25  # of the usual interval, or of the step: a longer interval is a hole
 _REGULAR = 0.8  # of the rows that are expected where it was covered before, and is again
@@ -43,13 +43,16 @@ def going_on(run: Run) -> tuple[Run, list[str]]:
         common = next(filter(None, (_common(run, one, steps) for one in _candidates(steps))), None)
         if common is None:
             return run, [*notes, *_alone(run, steps)]
-        back, newest = common
+        back, newest = common.back, common.newest
         later = _rows_after(run.command, newest, back)
         row = f" in row {later[0] + 1}" if len(later) else ""
+        apart = run.reference is not None and not _shows(run.reference.stamp, common)
+        but = "; that of the reference is not" if apart else ""
         notes.append(
-            f"{run.command.label}: all clocks are set back by {back / 1e9:.3f} s{row}: stamps go on from there"
+            f"{run.command.label}: all clocks are set back by {back / 1e9:.3f} s{row}: stamps go on from there{but}"
         )
-        run = _moved(run, newest, back)
+        moved = _moved(run, newest, back)
+        run = replace(moved, reference=run.reference) if apart else moved
     return run, notes
 
 
@@ -85,7 +88,8 @@ def _step(stamp: TimeArray, begin: int, row: int, end: int) -> Step | None:
 
 
 def _sources(run: Run) -> dict[str, Source]:
-    return {"": run.command, **run.measured}
+    """What is commanded and sensed: a reference may have a clock of its own, that goes on."""
+    return {"": run.command, **run.sensors}
 
 
 def _candidates(steps: Mapping[str, list[Step]]) -> Iterable[Step]:
@@ -94,8 +98,8 @@ def _candidates(steps: Mapping[str, list[Step]]) -> Iterable[Step]:
     return every[:_MOST]
 
 
-def _common(run: Run, step: Step, steps: Mapping[str, list[Step]]) -> tuple[float, int] | None:
-    """By how much all clocks were set back at a step [ns], and the newest stamp before it; None where not all were."""
+def _common(run: Run, step: Step, steps: Mapping[str, list[Step]]) -> Step | None:
+    """The step back of all clocks at a step of one: the surest one; None where not all were."""
     agreeing = list[Step]()
     for name, source in _sources(run).items():
         mine = [one for one in steps[name] if _agree(one, step)]
@@ -109,7 +113,7 @@ def _common(run: Run, step: Step, steps: Mapping[str, list[Step]]) -> tuple[floa
     if not several or max(one.behind for one in agreeing) < _OF_ALL:
         return None
     surest = min(agreeing, key=lambda one: one.usual)
-    return surest.back, max(one.newest for one in agreeing)
+    return surest._replace(newest=max(one.newest for one in agreeing))
 
 
 def _agree(one: Step, other: Step) -> bool:
@@ -124,6 +128,13 @@ def _goes_on(stamp: TimeArray, step: Step) -> bool:
     if len(near) < _LEAST or not (near.min() < step.newest - step.back and near.max() > step.newest):
         return False
     return bool((np.diff(near) >= 0).all()) and float(np.median(np.diff(near))) < step.back
+
+
+def _shows(stamp: TimeArray, step: Step) -> bool:
+    """Whether an interval of a reference is shorter by about a step, where that is."""
+    known = stamp[stamp != NO_STAMP]
+    interval, near = np.diff(known), np.abs(known[1:] - step.newest) <= step.back + _FARTHEST_NS
+    return bool(near.any()) and float(interval[near].min()) < float(np.median(interval)) - 0.5 * step.back
 
 
 def _rows_after(source: Source, newest: int, back: float) -> IntArray:
