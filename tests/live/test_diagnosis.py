@@ -142,6 +142,37 @@ def test_it_says_when_a_fault_is_over() -> None:
     assert live.health().faults == () and live.estimate().doubtful == ()
 
 
+def clock_set_twice(by: float) -> tuple[list[str], pf.LiveEstimator, list[float]]:
+    """What a stream of the scan says whose tracker's clock is set ahead twice [s], and when that is."""
+    run, config = pf.Run.read(SCAN), tracked()[1]
+    run, begin = replace(run, sensors={"tracker": run.sensors["tracker"]}, reference=None), run.command.stamp[0]
+    notices = list[str]()
+    live = pf.LiveEstimator(config, on_notice=notices.append)
+    steps = [begin + round(at * 1e9) for at in (12.0, 22.0)]
+    for event in events_of(run):
+        if event.stamp < begin + round(45e9):
+            later = sum(event.stamp >= at for at in steps) * round(by * 1e9) if event.sensor else 0
+            feed(live, event._replace(stamp=event.stamp + later))
+    assert not [one for one in notices if "shows no more" in one]
+    return [one for one in notices if "was its clock set" in one], live, [at / 1e9 for at in steps]
+
+
+@pytest.mark.parametrize("by", [0.1, 0.2, 0.8])
+def test_a_clock_that_is_set_ahead_is_named_within_ten_seconds(by: float) -> None:
+    """Once each time, by a look at what came since; that it is over nobody knows."""
+    told, live, steps = clock_set_twice(by)
+    assert len(told) == 2
+    for one, at in zip(told, steps, strict=True):
+        assert 0.0 < float(one.rsplit("(by ", 1)[1].split(" s)")[0]) - at < 10.0 + 2.0 * by
+    assert live.estimate().doubtful
+
+
+def test_a_clock_that_is_set_back_is_said_once_by_its_stamps_or_by_its_motion() -> None:
+    """At once where stamps alone show it, as of 20 rows of 10 ms, which is said the first time; 4 rows do not."""
+    assert ["go on there" in one for one in clock_set_twice(-0.2)[0]] == [True]
+    assert ["go on there" in one for one in clock_set_twice(-0.045)[0]] == [False, False]
+
+
 def test_at_rest_nothing_shows_that_a_fault_is_over() -> None:
     """The commands stop: the sensor may be as wrong as before."""
     run, config = tracked()

@@ -154,6 +154,21 @@ def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple
     return float(lag[late]) + _between(left, late) * step
 
 
+def lateness(measured: Mapping[str, FloatArray], led: Mapping[str, FloatArray], grid: Grid) -> FloatArray:
+    """Log of the share of a sensor's motion that its own axes' commands leave unexplained at each shift, summed, (S,).
+
+    As of :func:`matches`; motion against the commands is not explained.
+    """
+    fits = [_fits(value, (led[axis] - led[axis].mean())[None], grid.margin) for axis, value in measured.items()]
+    return np.sum([np.where(one.slope[0] > 0.0, one.unexplained[0], 0.0) for one in fits], axis=0)
+
+
+def best_shift(unexplained: FloatArray, grid: Grid) -> float:
+    """The shift at which least is left [s]; of those that are about as good the one nearest to none."""
+    place = _nearest(unexplained, np.arange(len(unexplained)))
+    return (place - grid.margin + _between(unexplained, place)) * grid.step
+
+
 def slope_of_pieces(measured: FloatArray, led: FloatArray) -> tuple[float, float]:
     """Slope of measured over commanded motion in short pieces of a run, each about its mean, and its standard error."""
     seen = np.isfinite(measured)

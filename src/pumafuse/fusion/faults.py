@@ -23,6 +23,7 @@ from ..logs.frames import CARTESIAN
 from ..model.arm import CANONICAL_AXES
 from ..space.rotations import nearest
 from ..units import DEG, MM, OF_KIND, Kind, mistaken, wraps
+from .clock_steps import ClockStep, clock_steps
 from .config import FusionConfig
 from .segments import Segment
 from .setup import turn_of
@@ -48,7 +49,8 @@ _HARDLY = 1e-3  # of the motion along its main direction, below which other dire
 _MOVE = 1e9  # ns, of the moves that are compared: less is noise, over more noise wanders
 _PARTS = 8  # of a run, each of which is left out once: as the angle scatters then, so uncertain it is
 
-_Cause: TypeAlias = Literal["turns", "unit", "columns", "sign", "clock", "frame", "nothing", "motion", "zero"]
+_OF_CLOCKS = "clock", "nothing"  # how a clock that was set looks over all of a run
+_Cause: TypeAlias = Literal["turns", "unit", "columns", "sign", "clock", "set", "frame", "nothing", "motion", "zero"]
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,13 @@ class Fault:
     sensors: tuple[str, ...]
     axes: tuple[str, ...]  # on which they are not
     cause: _Cause  # what is wrong
-    # how late they are [s], by how much they are turned [rad] or off [m or rad], how many times as far they move, or
-    # how often they turn
+    # how late they are or by how much their clock was set ahead [s], by how much they are turned [rad] or off [m or
+    # rad], how many times as far they move, or how often they turn
     size: float
     sentence: str  # what shows it, and what to write instead
     refused: bool = False  # whether estimates would be wrong by construction
     lost: bool = False  # whether they follow the commands so little that nothing can be fitted to them
+    at: int = 0  # the stamp since when, of a clock that was set [ns]
 
     def is_like(self, other: Fault) -> bool:
         """Whether the other fault, also of another sensor, may come from the same commands."""
@@ -80,11 +83,21 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
     return [one.sentence for one in faults]
 
 
-def faults_of(segment: Segment, config: FusionConfig) -> list[Fault]:
-    """What is wrong with angles within a turn, and with sensors that do not follow or are off by a constant."""
+def faults_of(segment: Segment, config: FusionConfig, origin: int | None = None) -> list[Fault]:
+    """What is wrong with angles within a turn, and with sensors that do not follow or are off by a constant.
+
+    Times are told since ``origin`` [ns], or the segment's.
+    """
     given = _given(segment, config)
     trackings = _trackings(segment, config, given)
-    faults = _not_following(segment, config, given, trackings)
+    clocks = _clocks_set(segment, config, given, segment.origin if origin is None else origin)
+    named = {name for one in clocks for name in one.sensors}
+    faults = [
+        one
+        for one in _not_following(segment, config, given, trackings)
+        if one.cause not in _OF_CLOCKS or named.isdisjoint(one.sensors)
+    ]
+    faults = [*clocks, *faults]
     named = {name for one in faults for name in one.sensors}
     quiet = {name: mine for name, mine in trackings.items() if name not in named}
     return [*within_a_turn(segment, config), *faults, *_moving_alone(config, quiet), *_off(segment, config, quiet)]
@@ -312,6 +325,32 @@ def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
         for axis, one in mine.items()
         if one.own_motion
     ]
+
+
+# ---- a clock that was set in mid-run ---------------------------------------------------------------------------------
+
+
+def _clocks_set(segment: Segment, config: FusionConfig, given: _Given, origin: int) -> list[Fault]:
+    """A fault for each time that the clock of a sensor was set; ``origin`` [ns] is time 0."""
+    rows = segment.rows_by_sensor()
+    return [
+        Fault((name,), tuple(mine), "set", step.by, _set(name, step, origin), at=step.leap.first)
+        for name, mine in given.items()
+        for step in clock_steps(segment, config, name, rows[name].stamp, mine)
+    ]
+
+
+def _set(name: str, step: ClockStep, origin: int) -> str:
+    """What shows that a clock was set, and what to do; rows that are stamped as they arrive leap with their latency."""
+    leap, later, slower, more = (
+        ("leap ahead", "later", "slower", "more") if step.by > 0.0 else ("step back", "earlier", "faster", "less")
+    )
+    return (
+        f"sensor '{name}': its stamps {leap} by {abs(step.by):.3f} s at {(step.leap.first - origin) / 1e9:.2f} s, and"
+        f" from there on it follows the commands {abs(step.change):.3f} s {later} than before: was its clock set, or is"
+        f" it {slower} since? Correct its stamps, or use parts (--to, --from), with {abs(step.by) * 1e3:.0f} {more}"
+        " latency_ms in the later one"
+    )
 
 
 # ---- a sensor that does not follow ----------------------------------------------------------------------------------

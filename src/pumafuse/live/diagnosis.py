@@ -28,7 +28,8 @@ _SPAN_NS = 20_000_000_000  # of the past in which faults are looked for: within 
 _SHORTEST_NS = 5_000_000_000  # of the past below which nothing is looked for
 _APART_NS = 2_500_000_000, 5_000_000_000  # between two looks for faults, of 5 to 10 ms each: at first, and later
 _FINEST_NS = 8_000_000  # between two rows of a sensor that are kept: faults are looked for by 500 of a span
-_TWICE = 2  # looks in a row that find a fault, or do not, until that is said
+_TWICE = 2  # looks in a row that find a fault, or do not, until that is said; that a clock was set is said at once
+_BEFORE_NS = 2_000_000_000  # before rows go on where stamps step back, that was said of them
 _MOVED = 0.5  # of the commanded motion that showed a fault, without which nothing shows that it is over
 
 _SECOND_NS, _QUARTER_NS = 1_000_000_000, 250_000_000  # over which innovations are judged, and how often
@@ -49,7 +50,7 @@ _SHOWS = {
     "zero": "another zero",
 }
 
-_Key: TypeAlias = tuple[tuple[str, ...], str]  # sensors, and the cause of their fault
+_Key: TypeAlias = tuple[tuple[str, ...], str, int]  # sensors, the cause of their fault, and when that was
 
 
 class Recent:
@@ -123,7 +124,7 @@ class _Trouble:
     @property
     def is_said(self) -> bool:
         """Whether it was found often enough."""
-        return self.found >= _TWICE
+        return self.found >= (1 if self.fault.cause == "set" else _TWICE)
 
 
 class Diagnosis:
@@ -144,6 +145,7 @@ class Diagnosis:
         self._troubles = dict[_Key, _Trouble]()
         self._large = dict[str, dict[str, int]]()  # by sensor and axis, when innovations were last too large [ns]
         self._reacquired = dict[str, int]()  # when each sensor was taken again [ns]
+        self.set_back = dict[str, int]()  # when it was said of a sensor that its stamps step back [ns]
 
     @property
     def shown(self) -> tuple[str, ...]:
@@ -179,31 +181,38 @@ class Diagnosis:
         if segment is None:
             return
         travel = {axis: float(np.ptp(segment.given(axis)[1])) for axis in segment.axes}
-        explained = {name for (names, _), one in self._troubles.items() if one.is_said for name in names}
+        explained = {name for (names, *_), one in self._troubles.items() if one.is_said for name in names}
         faults = [
             one
-            for one in faults_of(segment, self._config)
+            for one in faults_of(segment, self._config, origin=0)
             if one.cause != "nothing" or explained.isdisjoint(one.sensors)
         ]
         for fault in faults:
-            trouble = self._troubles.setdefault((fault.sensors, fault.cause), _Trouble(fault))
+            key = _key(fault)
+            trouble = self._troubles.setdefault(key, _Trouble(fault))
+            was_said = trouble.is_said
             trouble.fault, trouble.missed, trouble.found = fault, 0, trouble.found + 1
             trouble.travel = max(travel[axis] for axis in fault.axes)
-            if trouble.found == _TWICE:
-                self._log.write(f"{fault.sensors} {fault.cause}", f"{fault.sentence} (by {now / 1e9:.3f} s)")
-        found, named = {(one.sensors, one.cause) for one in faults}, {name for one in faults for name in one.sensors}
+            if trouble.is_said and not was_said and not self._is_set_back(fault):
+                self._log.write(str(key), f"{fault.sentence} (by {now / 1e9:.3f} s)")
+        found, named = set(map(_key, faults)), {name for one in faults for name in one.sensors}
         for key in [one for one in self._troubles if one not in found]:
             self._not_found(key, travel, not named.isdisjoint(key[0]), now)
 
+    def _is_set_back(self, fault: Fault) -> bool:
+        """Whether stamps alone have shown, and it was said, that a clock was set back."""
+        told = [self.set_back.get(name, ALWAYS) for name in fault.sensors]
+        return fault.cause == "set" and fault.size < 0.0 and max(told) > fault.at - _BEFORE_NS
+
     def _not_found(self, key: _Key, travel: Mapping[str, float], is_replaced: bool, now: int) -> None:
         """Count that a fault does not show, and say so where the commands would show it, unless another one does."""
-        (sensors, cause), trouble = key, self._troubles[key]
+        (sensors, cause, _), trouble = key, self._troubles[key]
         moved = max((travel.get(axis, 0.0) for axis in trouble.fault.axes), default=0.0)
         trouble.missed += moved >= _MOVED * trouble.travel
         if trouble.is_said and trouble.missed < _TWICE:
             return
         del self._troubles[key]
-        if trouble.is_said and not is_replaced:
+        if trouble.is_said and not is_replaced and cause in _SHOWS:
             self._log.write(f"{key} over", f"{_named(sensors)}: {_SHOWS[cause]} shows no more at {now / 1e9:.3f} s")
 
     # ---- innovations ------------------------------------------------------------------------------------------------
@@ -266,6 +275,10 @@ class Diagnosis:
                 " the estimate goes over to where it sees the arm",
             )
         return {self._axes[axis] for axis in np.flatnonzero(again.any(axis=0)).tolist()}
+
+
+def _key(fault: Fault) -> _Key:
+    return fault.sensors, fault.cause, fault.at
 
 
 def _innovations(sensor: str, axes: Mapping[str, int] | Sequence[str]) -> str:

@@ -345,6 +345,7 @@ class LiveEstimator:
         """Say that a sensor's clock was set back within the window, and start anew where all clocks were."""
         stamp, sensor, values = event
         if sensor is not None and (back := self._set_back.of_sensor(self._sensors[sensor])):
+            self._diagnosis.set_back[sensor] = stamp
             self._log.write(
                 f"{sensor} set back",
                 f"sensor '{sensor}': its stamps step back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s and go on there:"

@@ -1,0 +1,165 @@
+"""A sensor whose clock is set in mid-run is named, with when and by how much; outages and rest are no clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.fusion.clock_steps import leaps
+from pumafuse.fusion.faults import Fault, faults_of
+from pumafuse.fusion.placing import in_base
+from pumafuse.fusion.segments import build
+from pumafuse.logs.run import Source
+from pumafuse.tuning.parameters import changed
+from tuning_runs import SCENARIOS
+
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+SCAN = Path(__file__).parents[2] / "src" / "pumafuse" / "data" / "scan"
+AT = 30.0  # s after the first command
+STEPS = [0.05, 0.2, 0.8, -0.1, -0.2, -0.8]  # s
+
+
+@cache
+def scan() -> tuple[pf.Run, pf.FusionConfig]:
+    return replace(pf.Run.read(SCAN), reference=None), pf.FusionConfig.load(SCAN / "fusion.toml")
+
+
+def clock_set(run: pf.Run, sensor: str, by: float, at: float = AT) -> pf.Run:
+    """The run with the clock of a sensor set ahead by so much from an instant after the first command on [s]."""
+    source, when = run.sensors[sensor], run.command.stamp[0] + round(at * 1e9)
+    stamp = np.where(source.stamp >= when, source.stamp + round(by * 1e9), source.stamp)
+    return replace(run, sensors={**run.sensors, sensor: replace(source, stamp=stamp)})
+
+
+def named(run: pf.Run, config: pf.FusionConfig) -> list[Fault]:
+    in_place, _, config = in_base(run, config)
+    return [one for one in faults_of(build(in_place, config), config) if one.cause == "set"]
+
+
+def lost(source: Source, begin: float, end: float) -> Source:
+    """A sensor without its rows between two instants [s]."""
+    return source.rows((source.stamp < begin * 1e9) | (source.stamp >= end * 1e9))
+
+
+def with_outages(run: pf.Run, seed: int) -> pf.Run:
+    """Every sensor is lost ten times for 40 ms to 1 s, as it likes."""
+    rng = np.random.default_rng(seed)
+
+    def change(source: Source) -> Source:
+        for begin in rng.uniform(source.stamp[0] / 1e9, source.stamp[-1] / 1e9, 10):
+            source = lost(source, begin, begin + rng.uniform(0.04, 1.0))
+        return source
+
+    return replace(run, sensors={name: change(one) for name, one in run.sensors.items()})
+
+
+@pytest.mark.parametrize("by", STEPS)
+@pytest.mark.parametrize("sensor", ["tracker", "vision", "range"])
+def test_a_clock_that_is_set_is_named_with_when_and_by_how_much(sensor: str, by: float) -> None:
+    """Of each sensor of the shipped scan alone, also where it loses rows just then, as vision does."""
+    run, config = scan()
+    (fault,) = named(clock_set(run, sensor, by), config)
+    assert fault.sensors == (sensor,)
+    assert abs(fault.size - by) < 0.015
+    assert abs((fault.at - run.command.stamp[0]) / 1e9 - AT - max(by, 0.0)) < 0.1
+
+
+def test_what_is_said_has_time_amount_and_what_to_do() -> None:
+    run, config = scan()
+    (note,) = [one for one in pf.fuse(clock_set(run, "tracker", 0.2), config).notes if "was its clock set" in one]
+    assert note.startswith(
+        "sensor 'tracker': its stamps leap ahead by 0.200 s at 30.21 s, and from there on it follows"
+    )
+    assert note.endswith("with 200 more latency_ms in the later one")
+    (note,) = [one for one in pf.fuse(clock_set(run, "tracker", -0.1), config).notes if "was its clock set" in one]
+    assert "step back by 0.100 s at 30.01 s" in note and "with 100 less latency_ms" in note
+
+
+def test_a_clock_that_is_set_twice_is_named_twice() -> None:
+    run, config = scan()
+    faults = named(clock_set(clock_set(run, "vision", 0.3, 20.0), "vision", -0.1, 40.0), config)
+    assert [round(one.size, 1) for one in faults] == [0.3, -0.1]
+
+
+@pytest.mark.parametrize("delay", [-0.05, 0.1])
+def test_an_arm_with_a_wrong_delay_has_sensors_with_right_clocks(delay: float) -> None:
+    """Only what changes tells of a clock."""
+    run, config = scan()
+    config = delayed(config, delay)
+    assert named(with_outages(run, 1), config) == []
+    (fault,) = named(clock_set(run, "tracker", 0.2), config)
+    assert abs(fault.size - 0.2) < 0.01
+
+
+def delayed(config: pf.FusionConfig, more: float) -> pf.FusionConfig:
+    """The configuration with an arm that has a longer dead time [s]."""
+    return changed(config, ("arm", "delay"), config.arm.delay + more)
+
+
+@cache
+def logged(name: str) -> tuple[pf.Run, pf.FusionConfig]:
+    """The shipped scan, or a run of a scenario."""
+    if name == "scan":
+        return scan()
+    found = pf.simulate(pf.Scenario.load(SCENARIOS / f"{name}.toml"), 1)
+    return found.run, found.config
+
+
+RUNS = ("scan", "panel-tracker-outage", "panel-vision", "mismatched-arm", "saturating-servo", "smooth-disturbance")
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_outages_are_no_clock(name: str) -> None:
+    """Stamps leap by as much, and what is measured goes on as it was."""
+    run, config = logged(name)
+    for seed in range(1, 6):
+        assert named(with_outages(run, seed), config) == []
+
+
+def test_a_sensor_that_comes_back_with_another_zero_has_its_clock() -> None:
+    run, config = scan()
+    tracker, when = run.sensors["tracker"], run.command.stamp[0] + round(AT * 1e9)
+    found = lost(tracker, when / 1e9, when / 1e9 + 0.3)
+    values = {axis: value + 0.01 * (found.stamp > when) for axis, value in found.values.items()}
+    moved = replace(run, sensors={**run.sensors, "tracker": replace(found, values=values)})
+    assert named(moved, config) == []
+
+
+def test_at_rest_no_clock_is_named() -> None:
+    """Nothing tells a clock from an outage there."""
+    period, rng = 0.028, np.random.default_rng(2)
+    given, seen = np.arange(0.0, 60.0, period), np.arange(0.1, 60.0, 0.01)
+    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05))
+    arm = pf.ArmModel(name="an arm", update_period=period, delay=0.06, axes={"x": axis})
+    config = pf.FusionConfig(arm=arm, process={"x": pf.Process(drift=1e-4)}, sensors={"tracker": pf.Sensor(sd=2e-4)})
+    measured = {"x": 0.5 + 2e-4 * rng.standard_normal(len(seen))}
+    run = pf.Run.from_arrays(given, {"x": np.full(len(given), 0.5)}, {"tracker": (seen, measured)})
+    assert len(leaps(clock_set(run, "tracker", 0.3).sensors["tracker"].stamp)) == 1
+    assert named(clock_set(run, "tracker", 0.3), config) == []
+
+
+def test_leaps_are_as_long_as_time_went_by_without_rows() -> None:
+    """Ahead where rows are missing, back where some lie between each other; what scatters is none."""
+    rng = np.random.default_rng(1)
+    even = np.arange(0.0, 20.0, 0.033)
+    stamp = np.rint((even + rng.uniform(0.0, 0.01, len(even))) * 1e9).astype(np.int64)
+    assert leaps(stamp) == []
+    for by in (0.05, 0.2, 0.9, -0.05, -0.2, -0.9):
+        (leap,) = leaps(np.sort(np.where(even >= 10.0, stamp + round(by * 1e9), stamp)))
+        assert abs(leap.by - by) < 0.033
+        assert abs(leap.last / 1e9 - 10.0 - min(by, 0.0)) < 0.1
+    assert leaps(stamp[:: len(stamp)]) == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("name", [*RUNS, "wrong-latency", "tool-with-play", "sagging-lever"])
+def test_no_outage_of_many_is_a_clock(name: str, seed: int) -> None:
+    run, config = logged(name)
+    for more in (0.0, 0.1):
+        assert named(with_outages(run, 100 + seed), delayed(config, more)) == []
