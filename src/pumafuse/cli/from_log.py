@@ -23,9 +23,8 @@ from ..fusion.consistency import Finding
 from ..fusion.estimates import Mode
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
-from ..logs.run import described
+from ..logs.run import Source, described
 from ..model.arm import ArmModel
-from ..tuning.arms import BENDS
 from ..tuning.parameters import Fit
 from ..tuning.summary import FittedLag
 from ..tuning.tune import tune
@@ -135,15 +134,20 @@ def _off_the_path(found: Survey, summary: Summary) -> list[str]:
 def otherwise_than_at_first(found: Survey, lags: Mapping[str, FittedLag], arm: ArmModel) -> list[str]:
     """A sentence on the axes whose fitted lag is far from that of the first look, which needs no arm.
 
-    What has play or a fastest speed lags otherwise with each motion: its numbers say so themselves.
+    What has play or a fastest speed lags otherwise with each motion. So much play as explains it does, and no less.
     """
     seen = {axis for (_, axis), one in found.relations.items() if abs(one.correlation) >= FOLLOWS}
     others = [
         f"{axis} ({one.before_ms:.0f} ms at the first look, {one.lag_ms:.0f} fitted)"
         for axis, one in lags.items()
         if axis in seen
-        and not any(getattr(arm.axes[axis], bend) for bend in BENDS)
-        and abs(one.lag_ms - one.before_ms) > max(_OTHERWISE * min(one.lag_ms, one.before_ms), _SAME_LAG_MS)
+        and not arm.axes[axis].max_speed
+        and abs(one.lag_ms - one.before_ms)
+        > max(
+            _OTHERWISE * min(one.lag_ms, one.before_ms),
+            _SAME_LAG_MS,
+            MS * (arm.axes[axis].play or 0.0) / _speed(found.run.command, axis),
+        )
     ]
     if not others:
         return []
@@ -151,6 +155,12 @@ def otherwise_than_at_first(found: Survey, lags: Mapping[str, FittedLag], arm: A
         f"do not trust the lag of {', '.join(others)}: an axis that sticks or carries a load is taken for a slow one,"
         " or the look was at too little. Fit where it moves more (--from, --to), and look at fused.png (--figures)"
     ]
+
+
+def _speed(command: Source, axis: str) -> float:
+    """How fast an axis is told to move, over all of a run [m/s or rad/s]; above 0."""
+    way = float(np.abs(np.diff(command.values[axis])).sum())
+    return max(way * 1e9 / max(int(np.ptp(command.stamp)), 1), 1e-12)
 
 
 def _told_by_one(summary: Summary) -> list[str]:
