@@ -212,3 +212,70 @@ def test_each_of_a_list_of_trials_is_a_table(tmp_path: Path) -> None:
     assert first.notes == ("19 tables of other trials left out: data[1] …",)
     path.write_text(json.dumps([{"t": 0.1 * place, "q": told[:26].tolist()} for place in range(300)]))
     assert formats.names(path) == [""] and tables.read(path).rows == 300
+
+
+def test_arrays_of_a_folder_are_columns_beside_the_one_that_is_their_clock(tmp_path: Path) -> None:
+    """Files as long as a clock are its columns, also in another folder; settings and what is no array are none."""
+    log = tmp_path / "log"
+    for folder, time, name, values in (("arm", TIME, "goal_deg", TOLD), ("tracker", LATER, "seen_deg", SEEN)):
+        (log / folder).mkdir(parents=True)
+        np.save(log / folder / "epoch.npy", 1e3 * (1_790_000_000 + time))
+        np.save(log / folder / f"{name}.npy", np.rad2deg(values))
+    np.save(log / "arm" / "gains.npy", np.ones(7))
+    np.save(log / "arm" / "about.npy", np.array([{"robot": "ur5"}]), allow_pickle=True)
+    found = survey(log)
+    run, _ = written(found, tmp_path / "out")
+    for read in (found.run, run):
+        assert read.command.stamp.tolist() == pytest.approx((1e9 * (1_790_000_000 + TIME)).tolist(), abs=1e3)
+        np.testing.assert_allclose(np.column_stack(list(read.command.values.values())), TOLD, atol=1e-12)
+        (sensor,) = read.sensors.values()
+        np.testing.assert_allclose(np.column_stack(list(sensor.values.values())), SEEN, atol=1e-12)
+    assert any("cannot be read" in note for part in found.parts for note in part.notes if part.label == "about.npy")
+
+
+@pytest.mark.parametrize("stamps", [[], ["time_cmd", "time_enc"]])
+def test_arrays_of_a_folder_without_one_clock_stay_apart(stamps: list[str], tmp_path: Path) -> None:
+    """Where none rises, or two do as clocks, nothing says whose it is: a rate is asked for, and taken."""
+    arrays = {"goal_rad": path(TIME), "encoder_rad": path(TIME - LAG), **dict.fromkeys(stamps, TIME)}
+    for name, values in arrays.items():
+        np.save(tmp_path / f"{name}.npy", values)
+    assert "give it to init as --rate HZ" in one_line(RunError, lambda: survey(tmp_path))
+    assert [one.lag for one in survey(tmp_path, 50.0).relations.values()] == [pytest.approx(LAG, abs=2e-3)] * 2
+
+
+@pytest.mark.parametrize("kind", ["npy", "mat", "mat, not turned", "csv", "txt", "named", "no clock"])
+def test_rows_that_are_signals_are_columns(kind: str, tmp_path: Path) -> None:
+    """Arrays and texts of few rows of many numbers are read turned, which is said; an array may hold its clock."""
+    time, told, seen = 20.0 * np.arange(600), np.rad2deg(path(TIME)), np.rad2deg(path(TIME - LAG))
+    whole = np.vstack([time, told.T, seen.T])[kind == "no clock" :]
+    file = tmp_path / f"log.{kind[:3] if kind[:3] in ('npy', 'mat', 'txt') else 'csv'}"
+    if file.suffix == ".npy":
+        np.save(file, whole)
+    elif file.suffix == ".mat":
+        savemat(file, {"recorded": whole.T if "not" in kind else whole})
+    else:
+        names = ["clock", "goal_a", "goal_b", "pv_a", "pv_b"] if kind == "named" else [""] * len(whole)
+        cell = " " if file.suffix == ".txt" else "; "
+        rows = [[name, *map("{:.9f}".format, row)] for name, row in zip(names, whole, strict=True)]
+        file.write_text("".join(f"{cell.join(filter(None, row))}\n" for row in rows))
+    said = f"{file.name}: has {len(whole)} rows of 600 numbers: read turned, each row as a column"
+    if kind == "no clock":
+        assert "--rate HZ" in one_line(RunError, lambda: survey(file))
+    found = survey(file, 50.0 if kind == "no clock" else 0.0)
+    assert (said in found.parts[0].notes) == (kind != "mat, not turned")
+    run, _ = written(found, tmp_path / "out")
+    assert found.roles is not None
+    for stream, values in zip(found.roles.streams, (told, seen), strict=True):
+        read = np.column_stack([columns[0].plain for columns in stream.axes.values()])
+        np.testing.assert_allclose(read, values, atol=1e-8)
+    np.testing.assert_allclose(run.command.stamp / 1e9, TIME, atol=1e-9)
+    for axis, value in found.run.command.values.items():
+        assert np.array_equal(run.command.values[axis], value)
+
+
+def test_rows_of_a_wide_table_are_rows(tmp_path: Path) -> None:
+    """Scans of a range finder: smooth along a row, and as smooth from one to the next."""
+    bearing = np.linspace(0.0, 3.0, 720)
+    scans = [3.0 + np.sin(bearing + 0.01 * n) + 0.2 * np.cos(5.0 * bearing) for n in range(30)]
+    np.savetxt(tmp_path / "scans.csv", scans, delimiter=",")
+    assert len(tables.read(tmp_path / "scans.csv").names) == 720

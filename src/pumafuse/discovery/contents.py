@@ -176,7 +176,7 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
             found += _recorded(path)
         else:
             try:
-                several = formats.names(path) if path.name.endswith(formats.ENDINGS) else ("",)
+                several = formats.names(path) if formats.has_tables(path) else ("",)
             except RunError as error:  # beside others it may be anything
                 if path == log:
                     raise
@@ -224,9 +224,22 @@ def _files(log: Path) -> list[Path]:
     if (log / "meta" / "info.json").is_file():  # LeRobot: many files of many episodes
         inside = [path for path in inside if log / "data" in path.parents][:1]
     found = [path for path in inside if path.name.endswith(_TABLES + _TEXTS) or tables.is_recording(path)]
-    found = found or [path for path in inside if path.name.endswith(formats.ENDINGS)]
+    found = found or _gathered([path for path in inside if path.name.endswith(formats.ENDINGS)])
     if not found:
         raise RunError(f"{log}: no log in it that can be read; {_ACCEPTED}")
+    return found
+
+
+def _gathered(files: Sequence[Path]) -> list[Path]:
+    """Files; for the arrays of a folder, of which one alone is a clock of others as long, the folder: a table."""
+    found = list(files)
+    for folder in sorted({one.parent for one in files if one.suffix == formats.ARRAY}):
+        with suppress(RunError):  # none of them is an array
+            every = [tables.read(folder, topic=name) for name in formats.names(folder)]
+            clocks = [len(_risers(one, one.columns)) for one in every if len(one.columns) > 1]
+            inside = {folder / f"{name}{formats.ARRAY}" for one in every for name in one.columns}
+            if max(clocks, default=0) == 1 and inside <= {*found}:
+                found = [folder, *(one for one in found if one not in inside)]
     return found
 
 
@@ -597,20 +610,25 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
 
 def _rising(table: Table, stroke: float, counts: Container[str]) -> Clock | None:
     """The one column but counts that goes on from row to row, whatever it is called; None of none or several."""
-    found = list[str]()
-    for name in (one for one in table.columns if one not in counts):
-        with suppress(RunError):
-            values = table.plain(name)[0]
-            steps = np.diff(values[np.isfinite(values)])
-            if (
-                len(steps) >= max(_MANY_ROWS, _IN_ORDER * table.rows)
-                and (steps >= 0.0).all()
-                and (steps > 0.0).mean() >= _IN_ORDER
-            ):
-                found.append(name)
+    within = table.columns if len(table.columns) > 1 else _numeric_paths(table)  # of one array its elements
+    found = [name for name in _risers(table, within) if name not in counts]
     clock = _clock_of(table, found[0], stroke) if len(found) == 1 else None
     what = f"is {found[0]} the clock of {table.path.name}? It alone rises from row to row" if clock else ""
     return clock and replace(clock, doubt=clock.doubt or what)
+
+
+def _risers(table: Table, columns: Iterable[str]) -> list[str]:
+    """Columns that go on from row to row, as clocks do; those alone that are called so, where there are any."""
+    found = list[str]()
+    for name in columns:
+        with suppress(RunError):
+            values = table.plain(name)[0]
+            steps = np.diff(values[np.isfinite(values)])
+            fewest = _FEWEST_ROWS if names.is_time(name) else _MANY_ROWS
+            enough = len(steps) >= max(fewest, _IN_ORDER * table.rows)
+            if enough and (steps >= 0.0).all() and (steps > 0.0).mean() >= _IN_ORDER:
+                found.append(name)
+    return [name for name in found if names.is_time(name)] or found
 
 
 def _ticks(steps: FloatArray) -> bool:

@@ -416,7 +416,11 @@ def _apart(stream: Stream) -> list[Stream]:
 def _led(stream: Stream) -> list[Stream]:
     """A stream of columns without names, taken apart where some follow others: as far, at the same level, and later."""
     source, columns = stream.source, list(stream.axes)
-    if len(columns) > _MOST_APART or not all(names.words(one)[:1] == _NAMELESS for one in columns):
+    clock = stream.part.clock.time.column if stream.part.clock else ""
+    array, bracket, _ = clock.partition("[")  # which has its clock in it
+    mine = [one.column for some in stream.axes.values() for one in some]
+    nameless = all(names.words(one)[:1] == _NAMELESS or (bracket and one.startswith(f"{array}[")) for one in mine)
+    if len(columns) > _MOST_APART or not nameless:
         return [stream]
     leads = dict[str, dict[str, float]]()  # of those that follow it, how late they do
     ends = {one: np.quantile(value, (0.0, 0.5, 1.0)) for one, value in source.values.items()}

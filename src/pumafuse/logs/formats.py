@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import lru_cache
@@ -16,33 +17,56 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from ..errors import RunError, one_line, unknown_part, warn
+from ..errors import RunError, counted, one_line, unknown_part, warn
 
 Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 
 SHEETS = ".xlsx"
 ENDINGS = (".mat", ".npy", ".npz", ".json", ".ulg", SHEETS)
+ARRAY = ".npy"
 _FEWEST = 2  # rows: one number is a setting
+
+
+def has_tables(path: Path) -> bool:
+    """Whether a file is of these formats; a folder of .npy is, as if these were arrays of one file."""
+    return path.name.endswith(ENDINGS) or (os.path.isdir(path) and any(path.glob(f"*{ARRAY}")))  # noqa: PTH112
 
 
 def names(path: Path) -> list[str]:
     """What the tables of a file are called: the only one is called nothing."""
-    return list(_tables(path, path.stat().st_mtime_ns if path.is_file() else 0))
+    return list(_tables(path, _written(path)))
 
 
 def table(path: Path, name: str) -> pa.Table | bytes:
     """A table of a file; of a sheet its cells as CSV."""
-    found = _tables(path, path.stat().st_mtime_ns if path.is_file() else 0)
+    found = _tables(path, _written(path))
     if name not in found:
         raise unknown_part(path, "topic", name, dict.fromkeys(found, "a table"), ())
     return found[name]
 
 
+def turned_note(signals: int, numbers: int) -> str:
+    """What to say of a table that is read turned."""
+    return f"has {counted(signals, 'row')} of {counted(numbers, 'number')}: read turned, each row as a column"
+
+
+def _written(path: Path) -> int:
+    """When a file, or the last of a folder, was written [ns since 1970]."""
+    files = [*path.glob(f"*{ARRAY}")] if path.is_dir() else [path] if path.is_file() else []
+    return max((one.stat().st_mtime_ns for one in files), default=0)
+
+
 @lru_cache(maxsize=1)
 def _tables(path: Path, _written: int) -> dict[str, pa.Table | bytes]:
     """The tables of a file by name; a file is read once for all of them."""
-    with one_line(path, "'pumafuse[formats]'"), path.open("rb") as file:
-        found = {SHEETS: _sheets, ".ulg": _topics}.get(path.suffix, _arrays)(path, file)
+    with one_line(path, "'pumafuse[formats]'"):
+        if path.is_dir():
+            found = _of_value(_loaded(path))
+        elif path.is_file() and not path.stat().st_size:
+            raise RunError(f"{path}: the file is empty")
+        else:
+            with path.open("rb") as file:
+                found = {SHEETS: _sheets, ".ulg": _topics}.get(path.suffix, _arrays)(path, file)
     if not found:
         raise RunError(f"{path}: no table in it: nothing has rows of numbers")
     return {"": next(iter(found.values()))} if len(found) == 1 else found
@@ -91,6 +115,20 @@ def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     else:
         loaded: Any = np.load(file, allow_pickle=False)
         value = dict(loaded) if path.suffix == ".npz" else loaded
+    return _of_value(value)
+
+
+def _loaded(folder: Path) -> Arrays:
+    """The arrays of a folder by the names of their files; a file that is none is for others to say."""
+    found = Arrays()
+    for path in sorted(folder.glob(f"*{ARRAY}")):
+        with contextlib.suppress(ValueError, OSError, EOFError):
+            found[path.stem] = np.load(path, allow_pickle=False)
+    return found
+
+
+def _of_value(value: Any) -> dict[str, pa.Table | bytes]:
+    """The tables in a value of arrays, structs and lists."""
     found = dict[str, pa.Table | bytes]()
     for name, one in _apart(value, ""):
         found.update(_by_length(one, name))
@@ -153,16 +191,19 @@ def _by_length(value: Any, name: str) -> dict[str, pa.Table]:
     """Tables of arrays that are equally long, called after their first array where there are several."""
     columns = dict(_columns(value, ""))
     lengths = {len(one) for one in columns.values() if one.ndim == 1}
-    groups = dict[int, Arrays]()
+    groups, turned = dict[int, Arrays](), dict[str, str]()
     for key, one in columns.items():
-        along = one.shape[0] in lengths or (not lengths and one.shape[0] >= one.shape[-1])
-        one = one if one.ndim == 1 or along else one.T
+        along = one.shape[0] in lengths or (one.shape[-1] not in lengths and one.shape[0] >= one.shape[-1])
+        if one.ndim == 2 and not along:
+            turned |= {} if lengths else {"note": turned_note(*one.shape)}
+            one = one.T
         groups.setdefault(len(one), {})[key] = one
     groups = {rows: group for rows, group in groups.items() if rows >= _FEWEST}
     titles = (
         [name] if len(groups) == 1 else [".".join(filter(None, (name, next(iter(one))))) for one in groups.values()]
     )
-    return {title: _table(group) for title, group in zip(titles, groups.values(), strict=True)}
+    made = (_table(group).replace_schema_metadata(turned) for group in groups.values())
+    return dict(zip(titles, made, strict=True))
 
 
 def _table(arrays: Arrays) -> pa.Table:

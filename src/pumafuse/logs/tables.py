@@ -15,6 +15,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial, reduce
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -25,7 +26,7 @@ import pyarrow.csv as pacsv
 import pyarrow.json as pajson
 import pyarrow.parquet as papq
 
-from ..arrays import BoolArray
+from ..arrays import BoolArray, FloatArray
 from ..errors import RunError, UnknownNameError, counted, shortened
 from . import formats
 from .columns import BLANK, NUMBER, SENTINELS, Table, find, largest, longest, prefixes, sentinel_among
@@ -45,6 +46,9 @@ _DEEPEST, _LONG_LINE = 100, 4096  # levels of a line of JSON; bytes below which 
 _STEPS = np.zeros(256, dtype=np.int8)  # of the depth, by character
 _STEPS[list(b"[{")], _STEPS[list(b"]}")] = 1, -1
 _WIDE = 2_000  # columns of a text, beyond which only those asked for are read: pyarrow needs 10 to 20 kB for each
+_MOST_SIGNALS, _LONG = 64, 10  # lines of a text that are signals; times as many cells as lines that each then has
+_RISES = 0.95  # share of the steps of a clock that are forwards
+_SMOOTH, _ROUGH = 0.1, 0.5  # roughness of what follows from cell to cell; of what does not, 1
 _BESIDE = 3  # rows of numbers that make the line above them a header
 _COMMENT = re.compile(r"\s*(#|%|//)\s*")
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
@@ -84,7 +88,7 @@ def read(
     refuse_endless(path)
     if is_recording(path):
         return _recording(path, topic, entity, listed, where)
-    of_several = path.name.endswith(formats.ENDINGS)
+    of_several = formats.has_tables(path)
     if (topic and not of_several) or entity:
         key = "topic" if topic else "entity"
         raise RunError(
@@ -101,7 +105,8 @@ def read(
             elif isinstance(whole := formats.table(path, topic), bytes):
                 whole, names, notes = _of_csv(path, whole, choice)
             else:
-                names, notes = whole.column_names, []
+                said: dict[bytes, bytes] = whole.schema.metadata or {}
+                names, notes = whole.column_names, [f"{path.name}: {note.decode()}" for note in said.values()]
             table = _only(path, whole, where)
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
@@ -192,7 +197,8 @@ def refuse_endless(path: Path) -> None:
 
 def is_recording(path: Path) -> bool:
     """Whether a file or folder is an MCAP, a bag or a Rerun recording, which has topics or entities."""
-    return path.suffix in _RECORDINGS or os.path.isdir(path)  # noqa: PTH112 - raises on a long name
+    is_folder = os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises on a long name
+    return path.suffix in _RECORDINGS or (is_folder and not formats.has_tables(path))
 
 
 def write(table: pa.Table, path: Path) -> None:
@@ -349,6 +355,9 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     if (match := _BARE_LIST.search(text, 0, _HEAD)) and b'"' not in text[: match.start()]:
         text = _BARE_LIST.sub(rb'"\1"', text)
     text = _transforms_apart(text) if text.startswith(_TRANSFORMS) else text
+    if (turned := _turned(text)) is not None:
+        note = formats.turned_note(turned.num_columns, turned.num_rows)
+        return turned, [], [f"{path.name}: {note}"]
     layout = _layout(text)
     if layout.separator == " ":
         text = re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)|(?<=[ \t])[ \t]+", b"", text)
@@ -398,6 +407,54 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     if table.num_rows == 0:  # not the kind of table that it should be
         raise RunError(f"{path}: the table has no rows; {note}")
     return table, names, [note, *notes]
+
+
+def _turned(text: bytes) -> pa.Table | None:
+    """The table in a text whose lines are signals, each with or without its name in front; None of any other.
+
+    So it is where a line, and only one, rises from cell to cell as a clock does, or where lines are smooth and columns
+    of them are not.
+    """
+    if len([*islice(re.finditer(b"\n", text), _MOST_SIGNALS + 1)]) > _MOST_SIGNALS:
+        return None
+    lines = [one.strip() for one in text.removeprefix(codecs.BOM_UTF8).split(b"\n")]
+    lines = [one for one in lines if one and not _COMMENT.match(one[:4].decode("latin-1"))]
+    if len(lines) < 2:
+        return None
+    separator = _separator(lines[0].decode())
+    given = None if separator == " " else separator.encode()
+    least = _LONG * len(lines)
+    if min(len(one) for one in lines) < least or len({len(one.split(given)) for one in lines}) > 1:
+        return None
+    begins = [_cells(one[:_LONG_LINE].decode(), separator)[0] for one in lines]
+    named = not any(map(_NUMBER.fullmatch, begins))
+    columns = list[pa.ChunkedArray]()
+    for line in lines:
+        below = b"\n".join(line.split(given))
+        one = pacsv.read_csv(
+            pa.BufferReader(below),
+            pacsv.ReadOptions(use_threads=False, column_names=["one"], skip_rows=int(named), block_size=len(below)),
+            pacsv.ParseOptions(delimiter=separator, ignore_empty_lines=False),
+            pacsv.ConvertOptions(null_values=BLANK, decimal_point=_point(text[:_HEAD], separator)),
+        )
+        columns.append(one.column(0))
+    if not all(pa.types.is_floating(one.type) or pa.types.is_integer(one.type) for one in columns):
+        return None
+    filled = [one.cast(pa.float64()).fill_null(np.nan).combine_chunks() for one in columns]
+    value = np.array(list(map(np.from_dlpack, filled)), dtype=np.float64)
+    steps = np.diff(value)
+    clocks = (np.mean(steps > 0.0, axis=1) >= _RISES) & ~(steps < 0.0).any(axis=1)
+    is_smooth = _roughness(value) < _SMOOTH and _roughness(value.T) > _ROUGH
+    if value.shape[1] < least or not (clocks.sum() == 1 or is_smooth):
+        return None
+    return pa.table(columns, begins if named else list(map(_column, range(len(lines)))))
+
+
+def _roughness(value: FloatArray) -> float:
+    """Of the rows of an array, half the mean square of steps in it over the variance: 1 of numbers without order."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        each = np.nanmean(np.diff(value) ** 2, axis=1) / (2.0 * np.nanvar(value, axis=1))
+    return float(np.nanmedian(each))
 
 
 def _transforms_apart(text: bytes) -> bytes:
