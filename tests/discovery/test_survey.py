@@ -27,7 +27,7 @@ from pumafuse.discovery.drafts import drafts
 from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.questions import decisions, questions
 from pumafuse.discovery.survey import Survey, survey
-from pumafuse.errors import RunError
+from pumafuse.errors import ConfigError, RunError
 from pumafuse.space.kinematics import Chain
 from pumafuse.units import wraps
 from px4_files import write_ulg
@@ -293,6 +293,61 @@ def test_axes_and_sources_in_rows_of_their_own(kind: str, header: str, axes: Seq
     lines = [header, *(",".join(row) for row in long_rows(kind))]
     (tmp_path / "log.csv").write_text("\n".join([*lines, ""]))
     check_fuses(tmp_path / "log.csv", tmp_path / "out", tuple(axes))
+
+
+@pytest.mark.parametrize("kind", ["signals", "joints", "words behind, no header", "words in front, no header", "dates"])
+def test_signals_one_below_another(kind: str, tmp_path: Path) -> None:
+    """As pandas melts a table: a column tells which signal a row is of, and the clock begins anew with each."""
+    t, u, z = recorded_at_once()
+    rows = list[list[str]]()
+    for number, axis in enumerate("xyz" if kind == "joints" else ""):
+        both = zip(t, u[:, number], z[:, number], strict=True)
+        rows += [[f"{a:.4f}", f"{told:.7f}", f"{seen:.7f}", axis] for a, told, seen in both]
+    for time, value, role in ((t, u, "demand"), (t[::2], z[::2], "vicon")) if kind != "joints" else ():
+        for number, axis in enumerate("xyz"):
+            cells = [f"{a:.4f}" if kind != "dates" else f"2026-02-03T04:05:{a:07.4f}" for a in time]
+            rows += [[a, f"{one:.7f}", f"{role}_{axis}"] for a, one in zip(cells, value[:, number], strict=True)]
+    rows = [row[::-1] for row in rows] if "front" in kind else rows
+    header = {"joints": "t_s,target_m,reached_m,axis", "signals": "t_s,val_m,variable", "dates": "when,number,tag"}
+    lines = [header[kind]] if kind in header else []
+    (tmp_path / "log.csv").write_text("\n".join([*lines, *map(",".join, rows), ""]))
+    found = survey(tmp_path / "log.csv")
+    run, _ = written(found, tmp_path / "out")
+    (sensor,) = run.sensors.values()
+    for number, axis in enumerate(run.axes):
+        for source, value in ((run.command, u), (sensor, z if kind == "joints" else z[::2])):
+            stamp, read = source.series(axis)
+            assert (np.diff(stamp) > 0).all()
+            np.testing.assert_allclose(read, value[:, number], atol=1e-6)
+    assert {round(one.lag, 2) for one in found.relations.values()} == {LAG}
+
+
+def test_trials_one_below_another_are_no_signals(tmp_path: Path) -> None:
+    """Where each part holds commands and measurements of the same axes, the words beside them tell runs apart."""
+    t, u, z = recorded_at_once()
+    twice = {
+        name: np.concatenate([value, value]) for name, value in {**xyz(u, "goal.{}_m"), **xyz(z, "pv.{}_m")}.items()
+    }
+    write(tmp_path / "log.csv", {"t_s": np.tile(t, 2), "load": np.repeat(["empty", "full"], len(t)), **twice})
+    assert survey(tmp_path / "log.csv").run.axes == ("x", "y", "z")
+
+
+def test_signals_that_nothing_tells_apart_are_described_and_no_column_is_both(tmp_path: Path) -> None:
+    """The refusal says what the table looks like; what it says to add makes it a log; a column measures not itself."""
+    t, u, z = recorded_at_once()
+    stacked = {"stamp_ms": np.tile(1e3 * t, 2), "reading_mm": 1e3 * np.concatenate([u[:, 0], z[:, 0]])}
+    write(tmp_path / "log.csv", stacked)
+    said = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    assert "the clock of log.csv begins anew in row 1001: if its rows are signals one below another, add" in said
+    for name, (first, second) in {"log": ("command_x", "measured_x"), "other": ("soll_x", "ist_x")}.items():
+        write(tmp_path / f"{name}_2.csv", {**stacked, "signal": np.repeat([first, second], len(t))})
+        check_fuses(tmp_path / f"{name}_2.csv", tmp_path / name, ("x_reading",))
+    both = 'file = "log.csv"\ntime = "stamp_ms"\nx = "reading_mm"\n'
+    (tmp_path / "run.toml").write_text(f"[command]\n{both}[sensors.arm]\n{both}")
+    refusal = one_line(ConfigError, lambda: pf.Run.read(tmp_path))
+    assert "sensors.arm.x is the column 'reading_mm' of log.csv, and so is command.x" in refusal
+    (tmp_path / "run.toml").write_text("[command\n")
+    assert "run.toml" in one_line(ConfigError, lambda: survey(tmp_path))
 
 
 def test_a_status_that_changes_all_the_time_tells_nothing_apart(tmp_path: Path) -> None:

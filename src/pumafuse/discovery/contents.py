@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as papq
 from msgspec import structs
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import NO_STAMP, FloatArray, IntArray, TimeArray
 from ..errors import RunError, counted, printable
 from ..logs import formats, recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, sentinel, without
@@ -50,6 +50,7 @@ _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows, or of blocks, of a clock that are not before the row or block above
 _BLOCK = 20  # rows; who writes from several threads writes some of them out of order
 _OF_TICK = 0.02  # of a tick, by which ticks of a clock differ: stamps of 15.6 ms that are written with 4 decimals
+_MOST_LEFT = 0.5  # share of what a clock has told, from which it may begin anew
 _MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
 RANGES: dict[Kind, tuple[str, str, float]] = {  # small and large unit, and beyond which number it is the large one
     "length": ("m", "mm", 10.0),
@@ -341,7 +342,8 @@ def _joints(table: Table, paths: Sequence[str]) -> dict[str, str]:
 def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
     """Which rows are whose, where a column tells axes or sources of a table apart; else all, once.
 
-    Such a column changes from row to row. Of numbers it has to be called so: ``id``. A ``status`` is none.
+    Such a column changes from row to row, or tells signals one below another. Of numbers it has to be called so:
+    ``id``. A ``status`` is none.
     """
     for name, column in table.columns.items():
         whose, words = (
@@ -354,9 +356,23 @@ def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
         keys = {one["values"].as_py(): one["counts"].as_py() for one in counts} if len(counts) <= _MOST_KEYS else {}
         if len(keys) < 2 or min(keys.values()) < _FEWEST_ROWS:
             continue
-        if pc.mean(pc.not_equal(column[1:], column[:-1])).as_py() > _IN_TURNS:
+        changed = pc.fill_null(pc.not_equal(column[1:], column[:-1]), True).cast(pa.uint8())
+        changes = np.from_dlpack(changed.combine_chunks())
+        others = [one for one in table.columns if one != name]
+        is_below = changes.sum() == len(keys) - 1 and (whose or not any(map(names.role_words, others)))
+        if changes.mean() > _IN_TURNS or (is_below and _begins_anew(table, others, np.flatnonzero(changes) + 1)):
             return [{name: key} for key in keys]
     return [{}]
+
+
+def _begins_anew(table: Table, columns: Iterable[str], rows: IntArray) -> bool:
+    """Whether one of some columns goes on as a clock does, but for some rows, in each of which it begins anew."""
+    for name in columns:
+        with suppress(RunError):
+            values = table.stamps(name)[0] if table.is_dated(name) else table.plain(name)[0]
+            if np.array_equal(falls_back(values), rows):
+                return True
+    return False
 
 
 def _labelled(path: str, listed: list[str]) -> str:
@@ -611,14 +627,17 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
 def _rising(table: Table, stroke: float, counts: Container[str]) -> Clock | None:
     """The one column but counts that goes on from row to row, whatever it is called; None of none or several."""
     within = table.columns if len(table.columns) > 1 else _numeric_paths(table)  # of one array its elements
-    found = [name for name in _risers(table, within) if name not in counts]
+    found = [name for name in _risers(table, within, below=_axes_in_rows(table) != [{}]) if name not in counts]
     clock = _clock_of(table, found[0], stroke) if len(found) == 1 else None
     what = f"is {found[0]} the clock of {table.path.name}? It alone rises from row to row" if clock else ""
     return clock and replace(clock, doubt=clock.doubt or what)
 
 
-def _risers(table: Table, columns: Iterable[str]) -> list[str]:
-    """Columns that go on from row to row, as clocks do; those alone that are called so, where there are any."""
+def _risers(table: Table, columns: Iterable[str], *, below: bool = False) -> list[str]:
+    """Columns that go on from row to row, as clocks do; those alone that are called so, where there are any.
+
+    With signals one ``below`` another they may begin anew.
+    """
     found = list[str]()
     for name in columns:
         with suppress(RunError):
@@ -626,9 +645,22 @@ def _risers(table: Table, columns: Iterable[str]) -> list[str]:
             steps = np.diff(values[np.isfinite(values)])
             fewest = _FEWEST_ROWS if names.is_time(name) else _MANY_ROWS
             enough = len(steps) >= max(fewest, _IN_ORDER * table.rows)
-            if enough and (steps >= 0.0).all() and (steps > 0.0).mean() >= _IN_ORDER:
+            goes_on = (steps >= 0.0).all() or (below and len(falls_back(values)))
+            if enough and goes_on and (steps > 0.0).mean() >= _IN_ORDER:
                 found.append(name)
     return [name for name in found if names.is_time(name)] or found
+
+
+def falls_back(stamp: TimeArray | FloatArray) -> IntArray:
+    """Rows in which stamps begin anew: they fall by most of what they rose by since the last such row.
+
+    None where anything else falls, or where hardly any rises.
+    """
+    steps = np.diff(stamp)
+    rows = np.flatnonzero(steps < 0) + 1
+    first, last = stamp[np.append(0, rows)[:-1]], stamp[rows - 1]
+    whole = (stamp[rows] - first <= _MOST_LEFT * (last - first)).all() and (steps > 0).sum() >= _IN_ORDER * len(steps)
+    return rows if whole and len(rows) <= _MOST_KEYS else rows[:0]
 
 
 def _ticks(steps: FloatArray) -> bool:
@@ -853,6 +885,11 @@ def no_commands(parts: Iterable[Part]) -> str:
                 " docs/own-log.md does under 'Commands that are velocities'"
             )
         found += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
+        if part.clock and len(rows := falls_back(part.clock.stamp)):
+            found.append(
+                f"the clock of {part.label} begins anew in row {rows[0] + 1}: if its rows are signals one below"
+                " another, add a column of words that say which signal a row is of, such as command_x and measured_x"
+            )
     return "".join(f"{printable(one, 300)}; " for one in found) + ("or " if found else "")
 
 

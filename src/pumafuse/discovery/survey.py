@@ -72,8 +72,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     """Look at a log of any kind that can be read; ``rate`` is that of rows without stamps [Hz], or 0."""
     described = log if log.name == "run.toml" else log / "run.toml"
     if os.path.isfile(described):  # noqa: PTH113 - Path.is_file raises on a name that is too long
-        manifest = tomllib.loads(described.read_text(encoding="utf-8"))
         run = without_strays(Run.read(described))
+        manifest = tomllib.loads(described.read_text(encoding="utf-8"))
         aside = own_frames(run)
         run = _along_axes(run, aside)
         run, related = _followed(run, relations(run))

@@ -11,6 +11,7 @@ import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
@@ -162,7 +163,18 @@ class Source:
         return replace(self, values=values)
 
     def pivoted(self) -> Source:
-        """The source with axes that have rows of their own beside each other, where these have one stamp."""
+        """The source with axes that have rows of their own beside each other, where these have one stamp.
+
+        Axes that stand one below another, each with stamps that begin anew, are brought into the order of time first.
+        """
+        mine = self.rows(self.has_value)
+        inside = [np.flatnonzero(np.isfinite(value)) for value in mine.values.values()]
+        ends = sorted((int(rows[0]), int(rows[-1])) for rows in inside if len(rows))
+        reach = accumulate((end for _, end in ends), max)
+        begins = {begin for (begin, _), end in zip(ends[1:], reach, strict=False) if begin > end}
+        falls = np.flatnonzero(np.diff(mine.stamp) < 0) + 1
+        if len(falls) and begins.issuperset(falls.tolist()):
+            return mine.rows(np.argsort(mine.stamp, kind="stable")).pivoted()
         known = {axis: np.isfinite(value) for axis, value in self.values.items()}
         group = np.cumsum(np.diff(self.stamp, prepend=self.stamp[:1]) != 0)
         first = np.searchsorted(group, group)
