@@ -105,7 +105,7 @@ def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")
     return found
 
 
-@pytest.mark.parametrize("kind", ["csv", "parquet"])
+@pytest.mark.parametrize("kind", ["csv", "parquet", "json"])
 def test_among_thousands_of_columns_names_tell_who_is_who(tmp_path: Path, kind: str) -> None:
     t, u, z = (one[:300] for one in recorded_at_once())
     told = {"cmd_x": u[:, 0], "meas_x": z[:, 0], "time": t}
@@ -113,7 +113,10 @@ def test_among_thousands_of_columns_names_tell_who_is_who(tmp_path: Path, kind: 
     found = list[Survey]()
     for name, columns in (("few", told), ("many", {**others, **told})):
         file = tmp_path / f"{name}.{kind}"
-        write(file, columns) if kind == "csv" else papq.write_table(pa.table(columns), file)
+        if kind == "json":
+            file.write_text(json.dumps({key: value.tolist() for key, value in columns.items()}))
+        else:
+            write(file, columns) if kind == "csv" else papq.write_table(pa.table(columns), file)
         found.append(survey(file))
     few, many = found
     assert many.relations == few.relations
@@ -322,6 +325,93 @@ def test_signals_one_below_another(kind: str, tmp_path: Path) -> None:
     assert {round(one.lag, 2) for one in found.relations.values()} == {LAG}
 
 
+@pytest.mark.parametrize(
+    ("told", "seen", "roles"),
+    [
+        ("goal{}", "measured{}", ("command", "sensor")),
+        ("{}soll", "{}ist", ("command", "sensor")),
+        ("setpoint{}", "actual{}", ("command", "sensor")),
+        ("reference{}", "{}", ("reference", None)),
+        ("target{}2", "real{}2", ("command", "sensor")),
+    ],
+)
+def test_words_of_roles_need_no_separator(told: str, seen: str, roles: tuple[str | None, ...], tmp_path: Path) -> None:
+    """Before or behind an axis; what is no position is none then, either."""
+    t, u, z = recorded_at_once()
+    others = {told.format("vel"): u[:, 0], seen.format("torque"): z[::-1, 1]}
+    write(tmp_path / "arm.csv", {"t_s": t, **xyz(z, seen), **xyz(u, told), **others})
+    found = survey(tmp_path / "arm.csv")
+    assert (
+        found.roles is not None and [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=5e-3)] * 3
+    )
+    assert tuple(names.column_role(form.format("y")) for form in (told, seen)) == roles
+    for stream, form in zip(found.roles.streams, (told, seen), strict=True):
+        assert [one[0].column for one in stream.axes.values()] == [form.format(axis) for axis in "xyz"]
+    assert set(found.parts[0].left_out) >= set(others)
+
+
+@pytest.mark.parametrize(
+    "word", ["comx", "wristx", "realtime", "preset_x", "offset", "dataset", "desk", "refine", "isty2k"]
+)
+def test_words_that_only_look_so_are_one(word: str) -> None:
+    """A centre of mass, a joint, a clock: no role."""
+    assert not names.role_words(word)
+
+
+@pytest.mark.parametrize("first", ["beacon", "measured"])
+def test_columns_beside_the_commands_are_called_by_what_stands_before_their_axes(first: str, tmp_path: Path) -> None:
+    """In whatever order they stand, and where all of them have it; what is called measured keeps its name."""
+    t, u, z = recorded_at_once()
+    seen = {"beacon": path(t - 0.14), "measured": z}
+    columns = [xyz(seen[name], f"{name}_{{}}_m") for name in sorted(seen, key=lambda name: name != first)]
+    write(tmp_path / "log.csv", {"t_s": t, **xyz(u, "goal_{}_m"), **columns[0], **columns[1]})
+    lags = {name: one.lag for (name, _), one in survey(tmp_path / "log.csv").relations.items()}
+    assert lags == {"beacon": pytest.approx(0.14, abs=5e-3), "measured": pytest.approx(LAG, abs=5e-3)}
+    write(tmp_path / "log.csv", {"t_s": t, **xyz(u, "goal_{}_m"), "one_x_m": z[:, 0], "other_y_m": z[:, 1]})
+    assert set(survey(tmp_path / "log.csv").run.sensors) == {"measured"}
+
+
+@pytest.mark.parametrize(
+    ("raw", "filtered"),
+    [
+        ("{}", "{}_lowpass"),
+        ("{}_raw", "{}_smoothed"),
+        ("encoder_{}", "encoder_{}_filt"),
+        ("measured_{}", "ekf_{}"),
+        ("pv_{}", "estimated_{}"),
+        ("pose_raw.csv", "pose_filtered.csv"),
+    ],
+)
+def test_of_raw_and_filtered_numbers_of_one_quantity_the_raw_ones_are_the_sensor(
+    raw: str, filtered: str, tmp_path: Path
+) -> None:
+    """Whichever follows the commands more closely, and it is said; alone, filtered ones are a sensor."""
+    t, u, z = recorded_at_once()
+    smooth = {"t_s": t, **xyz(path(t - 0.02), f"{filtered}_m" if "csv" not in filtered else "{}_m")}
+    rough = {"t_s": t, **xyz(z, f"{raw}_m" if "csv" not in raw else "{}_m")}
+    (tmp_path / "log").mkdir()
+    for name, beside in (("both", rough), ("alone", {})):
+        if "csv" in raw:
+            write(tmp_path / "log" / "goal.csv", {"t_s": t, **xyz(u)})
+            write(tmp_path / "log" / filtered, smooth)
+            (write if beside else lambda file, _: file.unlink())(tmp_path / "log" / raw, beside)
+        else:
+            write(tmp_path / "log" / "log.csv", {**xyz(u, "goal_{}_m"), **smooth, **beside})
+        found = survey(tmp_path / "log")
+        assert found.roles is not None and len(found.run.sensors) == 1
+        lag = LAG if name == "both" else 0.02
+        assert {round(one.lag, 2) for one in found.relations.values()} == {lag}
+        said = [why for _, why in found.roles.left_out if "is filtered by its name: " in why]
+        assert len(said) == (name == "both")
+
+
+def test_a_filtered_sensor_beside_another_device_stays(tmp_path: Path) -> None:
+    t, u, z = recorded_at_once()
+    columns = {**xyz(u, "goal_{}_m"), **xyz(z, "camera_{}_m"), **xyz(path(t - LAG), "encoder_filt_{}_m")}
+    write(tmp_path / "log.csv", {"t_s": t, **columns, **xyz(z, "tracker_{}_m")})
+    assert len(survey(tmp_path / "log.csv").run.sensors) == 3
+
+
 def test_trials_one_below_another_are_no_signals(tmp_path: Path) -> None:
     """Where each part holds commands and measurements of the same axes, the words beside them tell runs apart."""
     t, u, z = recorded_at_once()
@@ -344,7 +434,7 @@ def test_signals_that_nothing_tells_apart_are_described_and_no_column_is_both(tm
         check_fuses(tmp_path / f"{name}_2.csv", tmp_path / name, ("x_reading",))
     both = 'file = "log.csv"\ntime = "stamp_ms"\nx = "reading_mm"\n'
     (tmp_path / "run.toml").write_text(f"[command]\n{both}[sensors.arm]\n{both}")
-    refusal = one_line(ConfigError, lambda: pf.Run.read(tmp_path))
+    refusal = one_line(ConfigError, lambda: survey(tmp_path))
     assert "sensors.arm.x is the column 'reading_mm' of log.csv, and so is command.x" in refusal
     (tmp_path / "run.toml").write_text("[command\n")
     assert "run.toml" in one_line(ConfigError, lambda: survey(tmp_path))

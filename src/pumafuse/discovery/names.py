@@ -38,13 +38,17 @@ _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
 _OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in a column's
+FILTERED = words_in(
+    "filt filter filtered lpf lowpass smooth smoothed kf ekf ukf kalman denoised est estimate estimated"
+)  # of columns that are computed from raw ones
 PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
 _SILENT = (
     _OF_ROLES
+    | FILTERED
     | PARTS
     | words_in(
-        "pose poses position positions pos point points data translation transform value values scalar scalars joint"
-        " jnt dof qpos controller robot arm tool tcp ee flange coordinates axis"
+        "raw pose poses position positions pos point points data translation transform value values scalar scalars"
+        " joint jnt dof qpos controller robot arm tool tcp ee flange coordinates axis"
     )
 )
 _NO_POSITIONS = words_in(
@@ -101,14 +105,26 @@ _TURNING = re.compile(
     re.IGNORECASE,
 )
 
+_KNOWN = _OF_ROLES | _SILENT | _NO_POSITIONS | _TELLING
+# Words of roles without a separator before or behind an axis or what is no position; com is a centre of mass, too.
+_ROLE = "|".join(sorted({one for one in _OF_ROLES if len(one) > 2} - {"com"} | {"act"}))
+_WHAT = rf"(?:[xyzqj]|{'|'.join(sorted((_POSITIONS | _NO_POSITIONS | {'joint'}) - _TIMES))})\d*"
+_GLUED = re.compile(rf"({_ROLE})({_WHAT})|({_WHAT})({_ROLE})")
+
 
 def words(name: str) -> list[str]:
     """The words of a name in lower case: ``goalPose_x`` is goal, pose, x; ``QTarget2`` is q, target, 2.
 
-    Numbers of devices stay with them: ``camera2`` is one word.
+    Numbers of devices stay with them: ``camera2`` is one word. ``refx`` is ref, x, and ``velcmd`` is vel, cmd.
     """
     apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
-    found = [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
+    whole = [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
+    glued = [None if word in _KNOWN else _GLUED.fullmatch(word) for word in whole]
+    found = [
+        part
+        for word, match in zip(whole, glued, strict=True)
+        for part in (filter(None, match.groups()) if match else [word])
+    ]
     numbered = [re.fullmatch(r"([a-z]+)(\d+)", word) for word in found]
     return [
         part
@@ -129,13 +145,18 @@ def may_be_seen(name: str) -> bool:
 
 
 def role_words(column: str) -> list[str]:
-    """The words of a column's name that say whose it is."""
-    return [word for word in words(leaf(column)) if word.rstrip(_DIGITS) in _OF_ROLES]
+    """The words of a column's name that say whose it is, and whether it is filtered."""
+    return [word for word in words(leaf(column)) if word.rstrip(_DIGITS) in _OF_ROLES | FILTERED]
 
 
 def column_role(column: str) -> Role | None:
     """What the name of a column says its numbers are."""
     return _role(words(leaf(column)), frozenset())
+
+
+def quantity(place: str, column: str) -> set[str]:
+    """The words of a place, and the devices of a column there, that are the same of raw and filtered numbers."""
+    return {*words(place), *_DEVICES.intersection(words(column))} - FILTERED - {"raw"}
 
 
 def has_word(name: str, known: frozenset[str]) -> bool:

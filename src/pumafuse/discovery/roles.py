@@ -146,7 +146,8 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     if not streams:
         others = [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
         clockless = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
-        there = ", ".join(printable(one, _LONGEST) for one in [*clockless, *others][:_MOST_LISTED])
+        unread = [f"{part.label} ({part.notes[0]})" for part in parts if part.notes and not part.rows]
+        there = ", ".join(printable(one, _LONGEST) for one in [*clockless, *others, *unread][:_MOST_LISTED])
         at_a_rate = " if rows come at a constant rate, give it to init as --rate HZ, else" if clockless else ""
         why = f"no columns of positions with a clock beside them{', but ' if there else ''}{there}"
         advice = f"{at_a_rate} {no_commands(parts)}say in run.toml where they are"
@@ -196,7 +197,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
                     left_out.append((replace(stream, axes=some), why_not))
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
-    command, *kept = _in_order([command, *kept], left_out)
+    command, *kept = _in_order([command, *_raw(kept, left_out)], left_out)
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
     sensors = [one for one in kept if one.role == "sensor"]
     references = [one for one in kept if one.role == "reference"]
@@ -208,6 +209,30 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     left_out += [(one, "what the controller itself reports: no measurement of where the tool is") for one in reports]
     sensors = [one for one in sensors if one not in reports]
     return _with_units(Roles(command, sensors, references[0] if references else None, left_out))
+
+
+def _raw(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
+    """Sources without the axes of filtered sensors of which the raw one is there, too."""
+    found = list[Stream]()
+    for one in streams:
+        column = next(iter(one.axes.values()))[0].column
+        beside = dict[str, str]()
+        for other in streams if one.role == "sensor" else ():
+            raw, apart = next(iter(other.axes.values()))[0].column, one.part.label != other.part.label
+            filtered, not_raw = (
+                names.has_word(f"{some.part.stem} {name}" if apart else name, names.FILTERED)
+                for some, name in ((one, column), (other, raw))
+            )
+            same = names.quantity(one.part.stem, column) == names.quantity(other.part.stem, raw)
+            if other.role == "sensor" and filtered and not not_raw and same:
+                beside |= {axis: raw if not apart else other.part.label for axis in one.axes if axis in other.axes}
+        if beside:
+            raw = ", ".join(map(printable, dict.fromkeys(beside.values())))
+            why = f"{printable(column)} is filtered by its name: {raw} beside it is raw, and is the sensor"
+            left_out.append((replace(one, axes={axis: one.axes[axis] for axis in beside}), why))
+        if axes := {axis: some for axis, some in one.axes.items() if axis not in beside}:
+            found.append(replace(one, axes=axes))
+    return found
 
 
 def _in_order(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
@@ -310,6 +335,7 @@ def streams_of(part: Part) -> list[Stream]:
         groups.setdefault((called, listed, copy, bool(measured)), []).append(signal)
     groups = {key: some for one in groups.items() for key, some in _seen_twice(*one)}
     roles = Counter(key for key, *_ in groups)
+    told = {one.axis for some in groups.values() for one in some if names.column_role(one.name) == "command"}
     of_file, of_columns = names.role_of(part.stem), {names.column_role(one[0].name) for one in groups.values()}
     of_file = None if len(groups) > 1 and of_file in of_columns else of_file  # then it is what these columns are
     found = list[Stream]()
@@ -327,13 +353,20 @@ def streams_of(part: Part) -> list[Stream]:
         role, why = next((one for one in (wanted, *order, clock, typed) if one[0]), (None, ""))
         name = key if roles[key] == 1 else names.plain(f"{listed or key or part.stem}{copy}")
         # What has no word of its own beside commands is not called after the file: another of its kind fits then.
-        rest = "measured" if roles.keys() > {""} and "command" in of_columns else names.plain(part.stem)
+        beside_commands = roles.keys() > {""} and "command" in of_columns
+        rest = _prefix(signals, told, roles.keys()) if beside_commands else names.plain(part.stem)
         name = name if len(groups) > 1 and name else rest
         axes, attitude = _axes(signals), None
         if any(axis in CARTESIAN for axis in axes):
             attitude = next((one for one in part.attitudes if key == _joined(one.role_words)), None)
         found.append(Stream(name or "log", role, why, part, axes, attitude))  # pyright: ignore[reportArgumentType]
     return found
+
+
+def _prefix(signals: Sequence[Signal], told: Set[str], taken: Set[str]) -> str:
+    """What columns beside commands are called: by what all of them have before axes that are told, else measured."""
+    own = {one.axis.removesuffix(axis) for one in signals for axis in told if f"_{one.axis}".endswith(f"_{axis}")}
+    return names.plain(own.pop()) if len(own) == 1 and own != {""} else _free("measured", taken)
 
 
 def _seen_twice(key: _Group, signals: Sequence[Signal]) -> Iterator[tuple[_Group, list[Signal]]]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..logs.axes import in_axes
 from ..logs.clock import without_strays
+from ..logs.manifest import refuse_twice
 from ..logs.run import REFERENCE, Run, Source
 from ..space.rotations import TURNING
 from ..units import MS
@@ -72,6 +73,7 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     """Look at a log of any kind that can be read; ``rate`` is that of rows without stamps [Hz], or 0."""
     described = log if log.name == "run.toml" else log / "run.toml"
     if os.path.isfile(described):  # noqa: PTH113 - Path.is_file raises on a name that is too long
+        refuse_twice(described)
         run = without_strays(Run.read(described))
         manifest = tomllib.loads(described.read_text(encoding="utf-8"))
         aside = own_frames(run)

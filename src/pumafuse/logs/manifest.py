@@ -272,6 +272,19 @@ def load(path: Path) -> Manifest:
     return of_tables(toml.read(path), str(path))
 
 
+def refuse_twice(path: Path) -> None:
+    """Refuse a ``run.toml`` in which one column is what the arm is told and what a sensor measures."""
+    listed = load(path)
+    told = {repr(column): axis for axis, columns in listed.command.axes.items() for column in columns}
+    for name, entry in listed.sensors.items() if told else ():
+        for axis, columns in entry.axes.items() if entry.rows == listed.command.rows else ():
+            if twice := next((told[repr(one)] for one in columns if repr(one) in told), None):
+                raise ConfigError(
+                    f"{path}: sensors.{name}.{axis} is the column '{columns[0].column}' of {entry.label}, and so is"
+                    f" command.{twice}: give each the column of its own, what the arm is told and what is measured"
+                )
+
+
 def of_tables(tree: dict[str, Any], where: str = "run.toml") -> Manifest:
     """What the tables of a ``run.toml`` say, with every number in SI."""
     kinds = {"command": CommandEntry, "reference": ReferenceEntry}
@@ -283,14 +296,6 @@ def of_tables(tree: dict[str, Any], where: str = "run.toml") -> Manifest:
         refuse_name(f"{where}: sensor", name)
     tree["sensors"] = {name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in named.items()}
     listed = toml.struct(tree, Manifest, where)
-    told = {repr(column): axis for axis, columns in listed.command.axes.items() for column in columns}
-    for name, entry in listed.sensors.items() if told else ():
-        for axis, columns in entry.axes.items() if entry.rows == listed.command.rows else ():
-            if twice := next((told[repr(one)] for one in columns if repr(one) in told), None):
-                raise ConfigError(
-                    f"{where}: sensors.{name}.{axis} is the column '{columns[0].column}' of {entry.label}, and so is"
-                    f" command.{twice}: give each the column of its own, what the arm is told and what is measured"
-                )
     moved = next((name for name, entry in listed.entries.items() if entry.joints), None)
     if moved and listed.robot is None:
         raise ConfigError(f"{where}: {moved} is in joints: give [robot] with its urdf, base and tip")
