@@ -185,6 +185,9 @@ def test_what_cannot_be_read_says_how_to_convert_it(tmp_path: Path, monkeypatch:
         assert f"{name}: cannot be read" in refusal(name)
     (tmp_path / "empty.json").write_text('{"version": 3, "name": "cell"}')
     assert "no table in it" in refusal("empty.json")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "run.npy").write_bytes(b"")
+    assert "run.npy (the file is empty)" in refusal("empty")
     (tmp_path / "old.xls").write_bytes(b"")
     assert "save it as .xlsx" in refusal("old.xls")
     assert "has: command_t" in one_line(RunError, lambda: tables.read(tmp_path / "log.npz"))
@@ -279,3 +282,16 @@ def test_rows_of_a_wide_table_are_rows(tmp_path: Path) -> None:
     scans = [3.0 + np.sin(bearing + 0.01 * n) + 0.2 * np.cos(5.0 * bearing) for n in range(30)]
     np.savetxt(tmp_path / "scans.csv", scans, delimiter=",")
     assert len(tables.read(tmp_path / "scans.csv").names) == 720
+
+
+@pytest.mark.parametrize("name", ["arm.log", "arm", "arm.xls", "arm.001"])
+def test_a_text_of_numbers_is_a_table_whatever_it_is_called(name: str, tmp_path: Path) -> None:
+    """As a file, and as the only one of a folder; prose and bytes are none."""
+    header = "recorded by hand\ntime_s goal.a_rad goal.b_rad pv.a_rad pv.b_rad"
+    np.savetxt(tmp_path / name, np.column_stack([TIME, TOLD, path(TIME - LAG)]), header=header, comments="")
+    (tmp_path / "README.rst").write_text("Arm\n===\nIt moved, 3 times,\nand 4 times, then.\n")
+    (tmp_path / "thumbnail").write_bytes(b"1 2\n3 4\n5 6\n\0\xff")
+    for log in (tmp_path / name, tmp_path):
+        assert [one.lag for one in survey(log).relations.values()] == [pytest.approx(LAG, abs=2e-3)] * 2
+    for other in ("README.rst", "thumbnail"):
+        assert "no log that can be read" in one_line(RunError, lambda other=other: survey(tmp_path / other))

@@ -170,7 +170,8 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
     """What a log has: a table, a recording, or a folder of them; ``rate`` is that of rows without stamps [Hz], or 0."""
     found: list[Part] = []
     for path in _files(log):
-        if path.suffix in _TEXTS and path != log:
+        is_known = path.name.endswith(_TABLES) or formats.has_tables(path) or tables.is_recording(path)
+        if path != log and not is_known:
             with suppress(RunError):  # it may be anything, if it is no table of positions with a clock of its own
                 found += [one for one in _tabled(path, rate) if one.clock and not one.clock.time.rate and one.signals]
         elif tables.is_recording(path):
@@ -216,7 +217,8 @@ def _files(log: Path) -> list[Path]:
         raise RunError(f"{log}: no such file or folder")
     tables.refuse_endless(log)
     if not log.is_dir():
-        if not (log.name.endswith(_TABLES + _TEXTS + formats.ENDINGS) or tables.is_recording(log)):
+        is_known = log.name.endswith(_TABLES + _TEXTS + formats.ENDINGS) or tables.is_recording(log)
+        if not (is_known or tables.holds_numbers(log)):
             raise RunError(f"{log}: no log that can be read; {_CONVERTED.get(log.suffix, _ACCEPTED)}")
         return [log]
     inside = sorted(path for path in log.rglob("*") if path.is_file())
@@ -226,6 +228,7 @@ def _files(log: Path) -> list[Path]:
         inside = [path for path in inside if log / "data" in path.parents][:1]
     found = [path for path in inside if path.name.endswith(_TABLES + _TEXTS) or tables.is_recording(path)]
     found = found or _gathered([path for path in inside if path.name.endswith(formats.ENDINGS)])
+    found = found or [path for path in inside if tables.holds_numbers(path)]
     if not found:
         raise RunError(f"{log}: no log in it that can be read; {_ACCEPTED}")
     return found

@@ -49,6 +49,7 @@ _WIDE = 2_000  # columns of a text, beyond which only those asked for are read: 
 _MOST_SIGNALS, _LONG = 64, 10  # lines of a text that are signals; times as many cells as lines that each then has
 _RISES = 0.95  # share of the steps of a clock that are forwards
 _SMOOTH, _ROUGH = 0.1, 0.5  # roughness of what follows from cell to cell; of what does not, 1
+_FIRST_ROWS = 100  # lines of a text, among which its rows begin
 _BESIDE = 3  # rows of numbers that make the line above them a header
 _COMMENT = re.compile(r"\s*(#|%|//)\s*")
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
@@ -107,6 +108,7 @@ def read(
             else:
                 said: dict[bytes, bytes] = whole.schema.metadata or {}
                 names, notes = whole.column_names, [f"{path.name}: {note.decode()}" for note in said.values()]
+                whole = whole if choice is None or len(names) <= _WIDE else whole.select(_used(names, choice))
             table = _only(path, whole, where)
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
@@ -195,6 +197,14 @@ def refuse_endless(path: Path) -> None:
         raise RunError(f"{path}: a pipe or a device, which may never end; write it into a file first")
 
 
+def holds_numbers(path: Path) -> bool:
+    """Whether a file begins as a text with rows of numbers does, whatever it is called."""
+    with one_line(path), path.open("rb") as file:
+        head = file.read(_HEAD)
+    lines = [] if b"\0" in head else head.decode("utf-8", errors="replace").splitlines()
+    return any(_begins(lines, place, _separator(lines[place])) for place in range(min(len(lines), _FIRST_ROWS)))
+
+
 def is_recording(path: Path) -> bool:
     """Whether a file or folder is an MCAP, a bag or a Rerun recording, which has topics or entities."""
     is_folder = os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises on a long name
@@ -264,6 +274,12 @@ def _asked(path: Path, names: Sequence[str], *, fields: Sequence[str] | Choice, 
     return prefixes(asked)
 
 
+def _used(names: Sequence[str], choice: Choice) -> list[str]:
+    """Names of columns that are chosen, in their order."""
+    chosen = set(choice(names))
+    return [name for name in names if name in chosen]
+
+
 def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
     """The table in a text; lines with the wrong number of cells, and a torn last line, are left out and noted."""
     notes = list[str]()
@@ -283,8 +299,7 @@ def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
         table = pajson.read_json(pa.BufferReader(text), pajson.ReadOptions(use_threads=False, block_size=block))
         _refuse_deep_columns(path, table)
         names = table.column_names
-        used = None if choice is None or len(names) <= _WIDE else set(choice(names))
-        return table if used is None else table.select([one for one in names if one in used]), names, notes
+        return table if choice is None or len(names) <= _WIDE else table.select(_used(names, choice)), names, notes
     table, names, more = _of_csv(path, text, choice)
     return table, names, [*more, *notes]
 
@@ -366,8 +381,8 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     names, used = list[str](), list[str]()
     if choice is not None and layout.names is not None and len(layout.names) > _WIDE:
         names, twice = _numbered(path, layout.names)
-        layout, chosen = layout._replace(names=names), set(choice(names))
-        used, notes = [name for name in names if name in chosen], [*twice, *notes]
+        layout = layout._replace(names=names)
+        used, notes = _used(names, choice), [*twice, *notes]
 
     def leave_out(row: pacsv.InvalidRow) -> str:
         wrong.append(row)
