@@ -83,9 +83,21 @@ def test_nothing_is_said_of_an_axis_at_rest_or_hardly_measured() -> None:
     assert found_in() is None
 
 
+def test_an_arm_that_goes_less_far_is_doubted_beside_the_commands_times_its_gain() -> None:
+    """Of one that goes 0.7 times as far: 120 ms instead of 80 are far worse than that, and no worse than all of them."""
+    plain = found_in(motion(0.05, 0.03, 0.7))
+    assert plain is not None
+    assert plain.delayed.gain == pytest.approx(0.7, abs=0.02)
+    assert plain.delayed.total == pytest.approx(0.08, abs=0.01)
+    wrong = Doubt(plain, off(plain.measured, Arm(0.09, 0.03, gain=0.7)), 0.12)
+    assert wrong.is_worse
+    assert not Doubt(plain, off(plain.measured, plain.arm), plain.arm.total).is_worse
+    assert off(plain.measured, plain.delayed._replace(gain=1.0)) > wrong.off
+
+
 def test_an_angle_whose_arm_is_replaced_is_still_one() -> None:
     """Of the likelihood's arm nothing else stays."""
-    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), 0.055, 1e-3, *[Measured([], T, [])] * 2)
+    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), Arm(0.054, 0.001), 1e-3, *[Measured([], T, [])] * 2)
     ends = {"lag_ci95": (0.07, 0.09), "delay_ci95": (0.0, 0.1), "shared_delay": True}
     lag = AxisLag(
         sensor="camera", lag=0.08, delay=0.01, plant="second-order", gain=0.9, damping=0.4, kind="angle", **ends
@@ -127,7 +139,7 @@ def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_t
     slow = replaced(config.arm.axes[first], delay=config.arm.delay_of(first) + 0.08 - config.arm.lag_of(first))
     slow = replaced(config, arm=replaced(config.arm, axes={**config.arm.axes, first: slow}))
     free = [one for one in free_of(Likelihood([simulated.run], slow), slow, ["delay"]) if one.axis == first]
-    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), 0.055, 1e-3, *[Measured([], T, [])] * 2)
+    arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), Arm(0.054, 0.001), 1e-3, *[Measured([], T, [])] * 2)
     doubted = {axis: Doubt(arm, off=1.5e-3, lag=0.08) for axis in config.arm.axes}
 
     def told(below: float, above: float, lost: Sequence[str] = ()) -> dict[str, tuple[float | None, float | None]]:
@@ -176,7 +188,7 @@ def test_a_lag_that_least_squares_exclude_is_said_and_its_interval_covers_both()
     assert plain is not None
     for share, said in ((1.05, False), (1.5, True)):
         low, high = share * lag, share * lag + 0.01
-        one = plain._replace(arm=Arm(low, 0.005), lag_ci95=(low, high), delayed=high, delayed_off=np.inf)
+        one = plain._replace(arm=Arm(low, 0.005), lag_ci95=(low, high), delayed=Arm(high, 0.0), delayed_off=np.inf)
         doubt = doubts({axis: one}, config)[axis]
         assert not doubt.is_worse
         assert (f"lag of {1e3 * lag:.4g} ms, least squares" in doubt.sentence(config, axis)) is said

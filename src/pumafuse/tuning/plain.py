@@ -65,7 +65,7 @@ class PlainArm(NamedTuple):
     # the lags [s] that leave no more than chance beyond the least, of so many measurements as have errors of their
     # own
     lag_ci95: tuple[float, float]
-    delayed: float  # by how much the command alone is to be delayed to leave the least [s]
+    delayed: Arm  # the command alone, as it is or times a gain, delayed so that it leaves the least
     delayed_off: float  # how far that is off where the axis moves [m]; four fifths of the measurements are nearer
     measured: Measured  # what was looked at, without outliers
     whole: Measured  # with them
@@ -118,13 +118,15 @@ def plain_arm(measured: Measured) -> PlainArm | None:
         return None
     most = 0.5 * (power * _CHANCE / number + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
-    (delayed,) = measured.likeliest([Arm(delay, float(LAGS[0])) for delay in late], rest, None, 1)
+    later = [Arm(delay, float(LAGS[0])) for delay in late]
+    each = [*measured.likeliest(later, rest, None, 1), *_fitted(measured, later, rest, 1)]
+    delayed = min(each, key=lambda one: off(measured, one))
     between = float(min(allowed)), float(max(allowed))
     step = None
     if len(whole.recordings) == 1:  # of several nothing is told
         long = len(quarters.recordings) > 1
         step = _lag_step(quarters.without_far_from(arm, _OUTLIER) if long else measured, arm, begin)
-    return PlainArm(arm, between, delayed.total, off(measured, delayed), measured, whole, step)
+    return PlainArm(arm, between, delayed, off(measured, delayed), measured, whole, step)
 
 
 def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
@@ -171,7 +173,7 @@ class Doubt(NamedTuple):
     @property
     def lag_ci95(self) -> tuple[float, float]:
         """The lags [s] that least squares allow, and that of the delayed command where it predicts better."""
-        (low, high), delayed = self.plain.lag_ci95, self.plain.delayed
+        (low, high), delayed = self.plain.lag_ci95, self.plain.delayed.total
         return (min(low, delayed), max(high, delayed)) if self.is_worse else (low, high)
 
     @property
@@ -190,10 +192,12 @@ class Doubt(NamedTuple):
         then = "The arm is that of least squares instead" if self.refutes else "The interval of its lag covers both"
         matters = self.off > _NOTHING * self.plain.measured.range
         if self.is_worse and matters:
+            delayed, far = self.plain.delayed, self.plain.delayed_off * screen.scale
+            times = "" if delayed.gain == 1.0 else f" times {delayed.gain:.3g},"
             what = (
                 "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
                 f" {self.lag * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
-                f" commands {self.plain.delayed * MS:.0f} ms later are {self.plain.delayed_off * screen.scale:.3g}"
+                f" commands{times} {delayed.total * MS:.0f} ms later are {far:.3g}"
             )
         elif (self.is_beaten and matters) or max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total:
             what = (
@@ -217,7 +221,7 @@ def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[s
     for axis, one in plain.items():
         if one is not None:
             mine = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
-            doubt, ends = Doubt(one, off(one.measured, mine), mine.total), (*one.lag_ci95, one.delayed)
+            doubt, ends = Doubt(one, off(one.measured, mine), mine.total), (*one.lag_ci95, one.delayed.total)
             allowed = min(ends) <= mine.total <= max(ends)
             if doubt.is_worse or not (allowed or mine.play or mine.max_speed or mine.slope):
                 found[axis] = doubt
