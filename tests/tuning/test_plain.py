@@ -84,7 +84,7 @@ def test_nothing_is_said_of_an_axis_at_rest_or_hardly_measured() -> None:
 
 
 def test_an_arm_that_goes_less_far_is_doubted_beside_the_commands_times_its_gain() -> None:
-    """Of one that goes 0.7 times as far: 120 ms instead of 80 are far worse than that, and no worse than all of them."""
+    """Of one that goes 0.7 times as far: 120 ms for 80 are far worse than those, and no worse than all of them."""
     plain = found_in(motion(0.05, 0.03, 0.7))
     assert plain is not None
     assert plain.delayed.gain == pytest.approx(0.7, abs=0.02)
