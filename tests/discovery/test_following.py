@@ -176,3 +176,16 @@ def test_of_a_run_that_mostly_rests_the_motion_tells_the_gain() -> None:
     assert found.slope == pytest.approx(0.92, abs=0.03)
     assert found.correlation > 0.98
     assert found.misfit > 10.0
+
+
+def test_jumps_tell_the_gain_of_counts_that_flicker() -> None:
+    """Steps of 60 counts every 12 s; below, where it buzzes, they flicker: by medians any gain would do."""
+    draw = np.random.default_rng(3)
+    t = np.arange(0.0, 240.0, 0.04)
+    u = 60.0 * (np.floor(t / 12.0) % 2.0)
+    answer = lfilter([0.5], [1.0, -0.5], np.interp(t - 0.04, t, u))
+    z = np.rint(0.9 * answer + 10.0 + draw.normal(scale=0.7, size=len(t)) * (u == 0.0))
+    found = following((stamped(t), u), (stamped(t), z))
+    assert found is not None
+    assert found.slope == pytest.approx(0.9, abs=0.03)
+    assert found.correlation > 0.98

@@ -52,14 +52,16 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     s, z = s[inside], z[inside]
     if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
         return None
-    found, noise, steps, outliers = list[Following](), scatter(z), _resolution(z), float(isolated(z).mean())
+    found, noise, steps = list[tuple[float, float, Following]](), scatter(z), _resolution(z)
+    outliers = float(isolated(z).mean())
     moves = _in_motion(z)
     for lag, correlation, slope in filter(None, (_at_span(t, u, s, z, span) for span in _SPANS)):
         led = np.interp(s - lag, t, u)
         offset, rest = float(np.median(z - math.copysign(1.0, slope) * led)), z - slope * led
         left = max(min(noise, scatter(rest)), steps)
-        found.append(Following(lag, correlation, slope, offset, left, steps, robust_sd(rest[moves]), outliers))
-    return min(found, key=lambda one: one.misfit, default=None)
+        one = Following(lag, correlation, slope, offset, left, steps, robust_sd(rest[moves]), outliers)
+        found.append((one.misfit, float(np.std(rest)), one))  # in whole counts medians are alike: what jumps decides
+    return min(found, key=lambda one: one[:2])[2] if found else None
 
 
 def _stands(value: FloatArray) -> bool:
