@@ -387,7 +387,10 @@ def test_commands_between_which_a_controller_interpolates(tmp_path: Path) -> Non
     many = {"t_s": np.arange(40_000) * 0.1, "x_m": np.zeros(40_000)}
     text = refusal(partial(read, tmp_path, 'time = "t_s"\nx = "x_m"\ninterpolation_ms = 0.1', many))
     assert "makes 40 million commands, more than 30 million" in text
-    for step in (100, 0.05):
+    for step in (100, 100.9):  # the interval itself, as it is written: nothing is between
+        whole = read(tmp_path, f'time = "t_s"\nx = "x_m"\ninterpolation_ms = {step}', columns).command
+        np.testing.assert_array_equal(whole.stamp / 1e9, np.rint(time * 1e9) / 1e9)
+    for step in (102, 0.05):
         text = refusal(partial(read, tmp_path, f'time = "t_s"\nx = "x_m"\ninterpolation_ms = {step}', columns))
         assert f"interpolation_ms = {step} is not between a thousandth of the interval of the commands, 100 ms" in text
 

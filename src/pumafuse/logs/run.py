@@ -40,6 +40,7 @@ _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
 _OUT_OF_ORDER_NS = 1_000_000_000  # by which rows are out of order without a word
 _FEW_ROWS = 10  # too few to judge a clock by
 _MOST_ROWS = 30_000_000  # of interpolated commands, all of which are in memory
+_ABOUT = 1.01  # times the interval of commands, a median of stamps that jitter, which is written with few digits
 _MOST_STEPS, PAUSE = 1000, 5.0  # between two commands; times the median interval, which is no path
 
 
@@ -214,7 +215,7 @@ class Source:
             return whole.rows(np.argsort(stamp, kind="stable")).pivoted()
         gap = np.diff(self.stamp.astype(np.float64))  # far and negative where a row has no stamp
         interval = float(np.median(gap[gap > 0.0])) if (gap > 0.0).any() else np.nan
-        if not interval / _MOST_STEPS <= step * 1e9 < interval:
+        if not interval / _MOST_STEPS <= step * 1e9 <= _ABOUT * interval:
             raise RunError(
                 f"{self.label}: interpolation_ms = {step * 1e3:g} is not between a thousandth of the interval of the"
                 f" commands, {interval / 1e6:.4g} ms, and that"
