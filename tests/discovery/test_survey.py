@@ -1159,6 +1159,45 @@ def test_clocks_are_those_that_make_sense_of_the_table(
     assert {one.column for one in part.signals}.isdisjoint({"stamp", "KRC", "ticks"})
 
 
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_clock_that_counts_its_rows_tells_no_unit(every: int, tmp_path: Path) -> None:
+    """It is asked what it is; rows at a rate that is given are so far apart. One that leaves numbers out is a clock."""
+    n = np.arange(2500)
+    told = np.sin(n / 90.0) + 0.4 * np.sin(n / 37.0)
+    write(tmp_path / "log.csv", {"stamp": 310 + every * n, "goal_x_m": told, "actual_x_m": np.roll(told, 4)})
+    found = survey(tmp_path / "log.csv")
+    assert any("a count of rows?" in one and "--rate HZ" in one for one in asked(found)) is (every == 1)
+    assert next(decisions(found)) == ("clock", "stamp: ms by motion", "a guess: stamp")
+    (part,) = parts_of(tmp_path / "log.csv", rate=40.0)
+    assert part.clock is not None
+    assert np.diff(part.clock.stamp)[0] / 1e6 == pytest.approx(25.0 if every == 1 else 2.0)
+    assert survey(tmp_path / "log.csv", 40.0).relations["actual", "x"].lag == pytest.approx(
+        0.1 if every == 1 else 8e-3, abs=2e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("begins", "lasts", "unit", "known"),
+    [
+        (12.0, 140.0, "s", "another clock"),
+        (0.01, 0.2, "ms", "motion"),  # as long in ms
+        (9000.0, 140.0, "ms", "motion"),  # at another time
+        (12.0, 2.0, "ms", "motion"),  # much longer or shorter in each
+    ],
+)
+def test_a_guessed_unit_is_one_in_which_tables_tell_one_time(
+    begins: float, lasts: float, unit: str, known: str, tmp_path: Path
+) -> None:
+    """Rows 0.125 apart on a path that takes minutes are none of a robot in s, but another table lasts as long."""
+    t, s = np.arange(0.0, 150.0, 0.125), np.linspace(0.0, lasts, 4000)
+    write(tmp_path / "goal.csv", {"time": 10.0 + t, "z_mm": 30.0 * np.sin(t / 60.0)})
+    write(tmp_path / "eye.csv", {"time_s": begins + s, "z_mm": np.sin(s)})
+    clock = next(one.clock for one in parts_of(tmp_path) if one.file.name == "goal.csv")
+    assert clock is not None and (clock.time.unit, clock.basis) == (unit, f"{unit} by {known}")
+    assert np.ptp(clock.stamp) == pytest.approx(149.875e9 if unit == "s" else 149.875e6)
+    assert bool(clock.doubt) == (known == "motion")
+
+
 def test_seconds_stay_seconds_where_the_motion_is_one_of_a_robot(tmp_path: Path) -> None:
     """Rows 0.5 s apart with strokes of ten seconds."""
     n = np.arange(400)

@@ -29,7 +29,7 @@ from ..logs.manifest import Time
 from ..logs.recordings import PATH, PATH_TIME
 from ..logs.run import Source, standing_clock
 from ..logs.stamps import packets
-from ..units import TIMES, Kind, ending, kind_of, si_of, unwrapped, wraps
+from ..units import TIMES, Kind, divisor, ending, kind_of, si_of, unwrapped, wraps
 from . import names
 from .orientations import Attitude, are_units, attitudes_in, may_be_part
 
@@ -66,6 +66,8 @@ _EVEN = 0.1  # share by which most steps of a counter may differ from the usual 
 _LONGEST_WAIT = 3.0  # packets, that a row waits: of rows that come in bursts by themselves some wait longer
 _ROUNDED, _FLOAT32 = 1.5e-6, 1.2e-7  # s, of stamps in us; share, of stamps in float32
 _ALIKE_SPANS = 1.2  # factor between the spans that two clocks of a table tell
+_GUESSED, _ANOTHER = ("interval", "motion"), "another clock"  # by which the unit of a clock is known: hardly, or well
+_SHARED = 0.5  # of the time that two tables tell, which both do if they are of one time: units are 1000 apart
 _OF_STEP = 0.01  # by which no step of a clock that was counted differs from the others
 _METRES = names.words_in(
     "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage tfMessage"
@@ -104,6 +106,7 @@ class Clock:
     stamp: TimeArray  # int64 ns, (rows,)
     notes: tuple[str, ...] = ()  # what was wrong with them, a sentence each
     doubt: str = ""  # what may be wrong with them, as a question; empty: nothing
+    counts: bool = False  # whether they may as well count the rows
 
     @staticmethod
     def of(table: Table, time: Time, basis: str, doubt: str = "") -> Clock:
@@ -187,7 +190,8 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
             found += [part for name in several for part in _tabled(path, rate, name)]
         if len(found) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
-    return _of_one_run(found)
+    found = _of_one_run(found)
+    return [one if one.clock is None else replace(one, clock=_beside(one, one.clock, found)) for one in found]
 
 
 def _of_one_run(parts: Sequence[Part]) -> list[Part]:
@@ -282,7 +286,7 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
     beside = [names.role_words(one.column) for one in signals if one.axis in CARTESIAN]
     left_out |= {path: "turning" for one in attitudes if one.role_words not in beside for path in one.columns.columns}
     clock, why_none = _clock(table, signals, sorted(counts))
-    if clock is None:
+    if clock is None or (rate and clock.counts):
         clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts)
     used = () if clock is None else tuple(clock.time.columns)
     left_out |= {path: "another clock" if clock else _no_clock(table, path) for path in times}
@@ -578,7 +582,7 @@ def _clock_of(table: Table, name: str, stroke: float, span: float = 0.0) -> Cloc
 
     A motion takes ``stroke`` rows; another clock says that the table lasts ``span`` [s], 0: none does.
     """
-    doubt = ""
+    doubt, counts = "", False
     try:
         kind = table.column(name).type
         if pa.types.is_nested(kind) or pa.types.is_temporal(kind) or table.is_dated(name):
@@ -592,12 +596,45 @@ def _clock_of(table: Table, name: str, stroke: float, span: float = 0.0) -> Cloc
         elif unit := names.time_unit_of(name):
             time, basis = Time(name, unit), f"{unit} by name"
         else:
-            unit, basis, doubt = _time_unit(table.plain(name)[0], stroke, span)
+            values = table.plain(name)[0]
+            unit, basis, doubt = _time_unit(values, stroke, span)
+            if counts := basis in _GUESSED and bool((np.diff(values) == 1.0).all()):
+                doubt = (
+                    f"a count of rows? It rises by exactly 1 in each, so it tells no unit: {unit} is a guess. If it"
+                    " counts, tell `pumafuse init` by --rate HZ how many rows a second has, and fuse what that writes"
+                )
             time, basis = Time(name, unit), f"{unit} by {basis}"
-        clock = Clock.of(table, time, basis, doubt and f"is {name} of {table.path.name} in {doubt}")
+        clock = Clock.of(table, time, basis, doubt and f"is {name} of {table.path.name} {doubt}")
     except RunError:
         return None
-    return clock if _runs(clock.stamp[clock.stamp != NO_STAMP]) else None
+    return replace(clock, counts=counts) if _runs(clock.stamp[clock.stamp != NO_STAMP]) else None
+
+
+def _beside(part: Part, clock: Clock, parts: Iterable[Part]) -> Clock:
+    """A clock; where its unit is a guess in which no other table tells the same time, in one in which one does."""
+    if not clock.basis.endswith(_GUESSED):
+        return clock
+    apart = [one.clock for one in parts if one.clock and (one.file, one.clock.time) != (part.file, clock.time)]
+    others, mine = [_ends(one) for one in apart], _ends(clock)
+
+    def shares(size: float) -> bool:
+        first, last = size * mine
+        return any(
+            min(last, to) - max(first, since) > _SHARED * (max(last, to) - min(first, since)) for since, to in others
+        )
+
+    units = {unit[1:]: divisor(clock.time.ending) / divisor(unit) for unit in TIMES}
+    fit = [unit for unit, size in units.items() if shares(size)]
+    if not fit or clock.time.unit in fit:
+        return clock
+    stamp = np.where(clock.stamp == NO_STAMP, NO_STAMP, np.rint(clock.stamp * units[fit[0]]).astype(np.int64))
+    return Clock(structs.replace(clock.time, unit=fit[0]), f"{fit[0]} by {_ANOTHER}", stamp, clock.notes)
+
+
+def _ends(clock: Clock) -> FloatArray:
+    """The first and the last stamp [ns], (2,)."""
+    known = clock.stamp[clock.stamp != NO_STAMP]
+    return np.array([known.min(initial=2**62), known.max(initial=-(2**62))], dtype=np.float64)
 
 
 def _runs(stamp: TimeArray) -> bool:
@@ -720,13 +757,13 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
     for unit, most in _INTERVALS.items():
         second = most / _INTERVALS["s"]
         if span and 1.0 / _ALIKE_SPANS < float(np.ptp(known)) / second / span < _ALIKE_SPANS:
-            return unit, "another clock", ""
+            return unit, _ANOTHER, ""
         if not span and interval <= most:
             if interval <= _SLOW * most or stroke * interval <= _LONGEST_STROKE * second:
                 return unit, "interval", ""
             slow = f"{float(np.ptp(known)) / second:.4g} s, and a stroke takes {stroke * interval / second:.3g} s"
             finer = {"s": "ms", "ms": "us", "us": "ns"}[unit]
-            return finer, "motion", f"{finer}? In {unit} the log lasts {slow} (run.toml, time)"
+            return finer, "motion", f"in {finer}? In {unit} the log lasts {slow} (run.toml, time)"
     return "ns", "interval", ""
 
 

@@ -28,9 +28,9 @@ def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
     if found.roles is not None:
         roles = found.roles
         streams = roles.streams
-        clocks = {f"{one.part.clock.time.column or 'rows'}": one.part.clock.basis for one in streams if one.part.clock}
-        guessed = [column for column, basis in clocks.items() if basis.endswith(("interval", "default"))]
-        yield "clock", ", ".join(f"{column}: {basis}" for column, basis in clocks.items()), _sure(guessed)
+        clocks = {f"{one.part.clock.time.column or 'rows'}": one.part.clock for one in streams if one.part.clock}
+        guessed = [column for column, one in clocks.items() if one.basis.endswith(("interval", "default", "motion"))]
+        yield "clock", ", ".join(f"{column}: {one.basis}" for column, one in clocks.items()), _sure(guessed)
         signals = [some[0] for one in streams for some in one.axes.values()]
         units = " and ".join(sorted({one.unit for one in signals}))
         yield "units", units, _sure([one.column for one in signals if one.basis == "range"])
