@@ -156,6 +156,34 @@ def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(descr
     )
 
 
+@pytest.mark.parametrize("others", [True, False])
+def test_an_axis_that_follows_nothing_does_not_refuse_the_others(others: bool, tmp_path: Path) -> None:
+    """Described, it is left out, and why is said; alone, it is refused with the same sentence."""
+    time, rng = np.arange(0.0, 15.0, 0.02), np.random.default_rng(9)
+    columns, lines = {"t_s": time}, dict[str, str]()
+    for axis, slower in (("tilt", 0.9), ("lift", 1.1))[: 1 + others]:
+        late = swings(slower * (time - 0.07))
+        if axis == "tilt":  # motion of its own
+            late = np.interp(time, np.arange(0.0, 16.0, 0.4), 0.3 * np.std(late) * rng.normal(size=40))
+        columns |= {f"goal_{axis}_deg": swings(slower * time)}
+        columns |= {f"gyro_{axis}_deg": late + rng.normal(0.0, 0.02, len(time))}
+    write(tmp_path / "arm.csv", columns)
+    for table, name in (("command", "goal"), ("sensors.gyro", "gyro")):
+        axes = "\n".join(f'{one[5:-4]} = "{name}{one[4:]}"' for one in columns if one.startswith("goal"))
+        lines[table] = f'[{table}]\nfile = "arm.csv"\ntime = "t_s"\n{axes}\n'
+    (tmp_path / "run.toml").write_text('name = "arm"\n' + "".join(lines.values()), encoding="utf-8")
+    what = ("fuse", tmp_path / "run.toml", "-o", tmp_path / "fused")
+    why = "sensor 'gyro' does not follow the commands of tilt (correlation "
+    if not others:
+        assert why in pumafuse(*what, code=1).stderr
+        return
+    said = " ".join(pumafuse(*what).stdout.split())
+    assert f"left out: {why}" in said and " with the model)" in said
+    axes = json.loads((tmp_path / "fused/summary.json").read_text(encoding="utf-8"))["axes"]
+    assert axes["lift"]["sensors"]["gyro"]["outcomes"]["fused"] == len(time)
+    assert "gyro" not in axes["tilt"]["sensors"] or not axes["tilt"]["sensors"]["gyro"]["outcomes"].get("fused", 0)
+
+
 @pytest.mark.parametrize("command", ["init", "fuse"])
 def test_an_exception_that_nobody_foresaw_is_a_line_for_a_report(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -25,6 +25,7 @@ from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import Source, described
 from ..model.arm import ArmModel
+from ..tuning.identifiability import LostError
 from ..tuning.parameters import Fit
 from ..tuning.summary import FittedLag
 from ..tuning.tune import tune
@@ -71,14 +72,21 @@ def run(
             raise RunError(f"{log}: {too_early(name, max(by.values()))}{advice}")
     found = replace(found, run=found.run.between(*part))  # so that latencies are those of the part
     arm, begins = guess(found)
-    texts, here = drafts(found, arm, begins, output), Path()
-    recorded = described(drafts(found, arm, begins, here)["run.toml"], here).between(*part)
     init.show(found, begins)
-    begun = init.registered(found, recorded) if found.own_frames else None
-    begun = begun or FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
-    begun.sensor_names(sensors)  # before anything is fitted
-    with fitting() as progress:
-        fitted = tune(recorded, begun, fit=_FITTED, intervals=_FITTED_ARM, progress=progress)
+    while True:
+        texts, here = drafts(found, arm, begins, output), Path()
+        recorded = described(drafts(found, arm, begins, here)["run.toml"], here).between(*part)
+        begun = init.registered(found, recorded) if found.own_frames else None
+        begun = begun or FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
+        begun.sensor_names(sensors)  # before anything is fitted
+        try:
+            with fitting() as progress:
+                fitted = tune(recorded, begun, fit=_FITTED, intervals=_FITTED_ARM, progress=progress)
+            break
+        except LostError as error:
+            found = _without(found, error)
+            say(f"left out: {error}")
+            arm, begins = guess(found)
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)
     est = replace(est, fitted=True)
     results.check_fused(est.counts, est.config)
@@ -105,6 +113,23 @@ def run(
     end(fitted.details)
     if strays:
         raise typer.Exit(WORSE)
+
+
+def _without(found: Survey, lost: LostError) -> Survey:
+    """What was found, without axes on which a sensor follows nothing; raises the error if nothing else follows."""
+    bad = {(name, axis) for name in lost.fault.sensors for axis in lost.fault.axes}
+    there = {(name, axis) for name, one in found.run.sensors.items() for axis in one.values}
+    kept = {name: [axis for mine, axis in there - bad if mine == name] for name in found.run.sensors}
+    related = {key: one for key, one in found.relations.items() if key not in bad}
+    follows = any(abs(one.correlation) >= FOLLOWS for (name, _), one in related.items() if name in kept)
+    if lost.fault.cause != "nothing" or not follows or bad.isdisjoint(there):
+        raise lost
+    sensors = {
+        name: replace(one, values={axis: value for axis, value in one.values.items() if axis in kept[name]})
+        for name, one in found.run.sensors.items()
+        if kept[name]
+    }
+    return replace(found, run=replace(found.run, sensors=sensors), relations=related)
 
 
 def _off_the_path(found: Survey, summary: Summary) -> list[str]:

@@ -489,10 +489,10 @@ def _digits(number: float, count: int) -> str:
 
 def _nothing(trackings: Mapping[str, Tracking], searched: float) -> str:
     rests = "rests and " if all(one.rests for one in trackings.values()) else ""
-    axes = ", ".join(f"{axis} (correlation {one.correlation:+.2f})" for axis, one in trackings.items())
+    axes = ", ".join(f"{axis} (correlation {one.correlation:+.2f} with the model)" for axis, one in trackings.items())
     return (
         f"{rests}does not follow the commands of {axes}, nor those of other axes or of up to {searched:.2g} s before or"
-        " after: is it that axis of this run, are both stamped by one clock, is arm.toml that of this arm?"
+        " after: is it that axis of this run, are both stamped by one clock, is arm.toml of this arm?"
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import PumafuseError
 from ..fusion.config import FusionConfig
+from ..fusion.faults import Fault
 from . import arms
 from .likelihood import Likelihood, Point
 from .maximise import derivatives
@@ -27,6 +28,15 @@ _FIXED_FIRST = ("latency", "scale", "gain", "plant", "delay")  # which kind of a
 
 class TuneError(PumafuseError):
     """Recorded runs that nothing can be fitted to."""
+
+
+class LostError(TuneError):
+    """A sensor that does not follow the commands at all on some axes."""
+
+    def __init__(self, fault: Fault) -> None:
+        """Of what was found of it."""
+        super().__init__(fault.sentence)
+        self.fault = fault
 
 
 class Correlation(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,7 +67,8 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
     """The axes that are measured and commanded to move by more than the noise.
 
     Raises:
-        TuneError: There are too few measurements, no axis moves, or a sensor does not follow the commands at all.
+        TuneError: There are too few measurements, no axis moves, or a sensor does not follow the commands at all, which
+            is a LostError.
     """
     for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True):
         if 0 < count < FEWEST:
@@ -87,7 +98,7 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
             )
     for fault in likelihood.faults(config):
         if fault.lost and not set(fault.axes).isdisjoint(found):
-            raise TuneError(fault.sentence)
+            raise LostError(fault)
     return found
 
 
