@@ -963,6 +963,36 @@ def test_columns_without_names_are_told_apart_by_which_follows_which(tmp_path: P
         survey(tmp_path / "log.txt")
 
 
+def test_of_columns_without_names_those_that_add_up_to_others_are_velocities(tmp_path: Path) -> None:
+    """Of commands and of what measures them; on a circle at 1 rad/s no coordinate is taken for the other's velocity."""
+    t, u, z = recorded_at_once()
+    smooth = path(t - LAG)
+    speeds = [np.gradient(smooth, 0.02, axis=0) + np.random.default_rng(2).normal(scale=5e-3, size=u.shape)]
+    speeds += [np.gradient(u, 0.02, axis=0)]
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, *speeds, z, u]), "%.6f")
+    found = survey(tmp_path / "log.txt")
+    assert found.roles is not None
+    told, (seen,) = found.roles.command, found.roles.sensors
+    pairs = {told.axes[axis][0].column: seen.axes[axis][0].column for axis in told.axes}
+    assert pairs == {"column 11": "column 8", "column 12": "column 9", "column 13": "column 10"}
+    assert found.parts[0].left_out["column 2"].startswith("velocity: it adds up to column 8")
+    assert set(found.parts[0].left_out) == {f"column {number}" for number in range(2, 8)}
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, np.cos(t), np.sin(t)]), "%.6f")
+    assert parts_of(tmp_path / "log.txt")[0].left_out == {}
+
+
+def test_of_columns_without_names_that_move_at_once_the_one_that_stands_is_the_command(tmp_path: Path) -> None:
+    """What follows within a row has no lag that tells it; its noise does, where the commands rest."""
+    t = 0.01 * np.arange(900)
+    told = 0.4 * np.sin(np.minimum(t, 6.0)) ** 2
+    seen = told + np.random.default_rng(3).normal(scale=2e-4, size=t.shape)
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, seen, told]), "%.6f")
+    found = survey(tmp_path / "log.txt")
+    assert found.roles is not None
+    assert [one.column for (one,) in found.roles.command.axes.values()] == ["column 3"]
+    assert [one.column for (one,) in found.roles.sensors[0].axes.values()] == ["column 2"]
+
+
 def test_columns_without_names_are_called_as_nothing(log: Path) -> None:
     """The second column of torques is not that of the commands, nor is a clock in a file of its own a joint."""
     t, u, s, z = recorded()
@@ -1064,6 +1094,14 @@ def test_a_log_without_commands_says_how_they_are_known(tmp_path: Path) -> None:
     write(tmp_path / "laser.csv", {"t_s": s, "x_m": z[:, 0] + noise})
     text = one_line(RunError, lambda: survey(tmp_path))
     assert "which numbers are the commands? None is called command, goal, target" in text
+
+
+def test_commands_that_never_move_are_named(tmp_path: Path) -> None:
+    t, _, z = recorded_at_once()
+    write(tmp_path / "log.csv", {"t_s": t, "arm": z[:, 0], "GoalTicks": np.full(len(t), 42)})
+    text = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    assert "What is called so never moves: GoalTicks, always 42, and none runs ahead" in text
+    assert "None is called" not in text
 
 
 def test_a_folder_with_many_topics_lists_what_it_does_not_use(tmp_path: Path) -> None:
@@ -1233,6 +1271,16 @@ def test_an_angle_by_the_name_of_what_measures_it_is_one(tmp_path: Path) -> None
     found = survey(tmp_path / "log.csv")
     assert set(found.run.kinds.values()) == {"angle"}
     assert found.run.command.values["theta"].max() == pytest.approx(columns["reference"].max())
+
+
+@pytest.mark.parametrize(("word", "unit", "far"), [("", "rad", 2.5), ("", "deg", 80.0), ("rail_", "m", 2.5)])
+def test_joints_that_are_called_so_before_their_axis_turn(word: str, unit: str, far: float, tmp_path: Path) -> None:
+    """``cmd_joint_pos_RL``, beside a coordinate in mm; a rail slides."""
+    t, u, z = recorded_at_once()
+    columns = {f"{what}_joint_pos_{word}RL": 2.0 * far * one[:, 0] for what, one in (("cmd", u), ("meas", z))}
+    write(tmp_path / "log.csv", {"t_s": t, **columns, "height": 900.0 * z[:, 1]} if not word else {"t_s": t, **columns})
+    (part,) = parts_of(tmp_path / "log.csv")
+    assert {one.unit for one in part.signals if one.column in columns} == {unit}
 
 
 def test_rows_in_packets_are_spread_by_what_counts_them(log: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as papq
 from msgspec import structs
 
-from ..arrays import NO_STAMP, FloatArray, IntArray, TimeArray
+from ..arrays import NO_STAMP, FloatArray, IntArray, TimeArray, median
 from ..errors import RunError, counted, printable
 from ..logs import formats, recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, sentinel, without
@@ -72,6 +72,12 @@ _OF_STEP = 0.01  # by which no step of a clock that was counted differs from the
 _METRES = names.words_in(
     "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage tfMessage"
 )
+NAMELESS = tables.FIRST.split()[:1]  # of the words that a column is called that has no name
+# s, over which a way is compared with what a velocity adds up to: beyond the digits of a position, within a motion.
+_OF_WAY = 0.1
+# Shares of the variance of the ways that a velocity explains as it is, as a correlation of 0.95 does, and the most that
+# the other way round may: on a circle at 1 rad/s each coordinate is the velocity of the other.
+_IS_VELOCITY, _EITHER = 0.9, 0.5
 _TRIAL = re.compile(r"([^\[]*)\[(\d+)\]")  # of a list of trials
 _ECHO = re.compile(r"^field\.(transforms0\.)?")
 _ECHOED = re.compile(r"field\..*(position|translation|point)\.[xyz]$")  # of a message by `rostopic echo -p`: in m, too
@@ -289,6 +295,9 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
     if clock is None or (rate and clock.counts):
         clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts)
     used = () if clock is None else tuple(clock.time.columns)
+    if clock and is_nameless(signals, clock):
+        left_out |= _velocities([one for one in signals if one.column not in used], clock.stamp)
+        signals = [one for one in signals if one.name not in left_out]
     left_out |= {path: "another clock" if clock else _no_clock(table, path) for path in times}
     mine = {path for path in left_out if path in used or path.startswith(tuple(f"{one}." for one in used))}
     return replace(
@@ -300,6 +309,38 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
         notes=(*why_none, *(() if clock is None else clock.notes), *place.notes, *table.notes, *notes),
         attitudes=tuple(one for one in attitudes if one.role_words in beside),
     )
+
+
+def is_nameless(signals: Iterable[Signal], clock: Clock) -> bool:
+    """Whether no column has a name: those of a table without a header, or of an array that has its clock in it."""
+    array, bracket, _ = clock.time.column.partition("[")
+    mine = [one.column for one in signals]
+    return all(names.words(one)[:1] == NAMELESS or (bracket and one.startswith(f"{array}[")) for one in mine)
+
+
+def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
+    """Columns that add up to another by the clock, and to which: they are its velocity, and no positions."""
+    there = stamp != NO_STAMP
+    steps = np.diff(stamp[there]) / 1e9
+    rows = max(1, round(_OF_WAY / max(median(steps), 1e-6))) if len(steps) else 1
+    if len(signals) < 2 or len(steps) - rows < _FEWEST_ROWS:
+        return {}
+    plain = np.stack([one.plain[there] for one in signals])
+    sums = np.pad(np.cumsum(0.5 * (plain[:, 1:] + plain[:, :-1]) * steps, axis=1), ((0, 0), (1, 0)))
+    ways, added = (one[:, rows:] - one[:, :-rows] for one in (plain, sums))
+    # by adding up the second, of the variance of the first
+    spread, power = np.var(ways, axis=1), np.mean(ways**2, axis=1)[:, None] + np.mean(added**2, axis=1)
+    both = ways @ added.T / ways.shape[1]
+    as_it_is, mirrored = (
+        1.0 - (power - sign * 2.0 * both) / np.maximum(spread, 1e-30)[:, None] for sign in (1.0, -1.0)
+    )
+    found = (as_it_is > _IS_VELOCITY) & ~(np.maximum(as_it_is, mirrored).T > _EITHER)
+    return {
+        signals[
+            second
+        ].name: f"velocity: it adds up to {signals[int(np.argmax(as_it_is[:, second]))].name} by the clock"
+        for second in map(int, np.flatnonzero(found.any(axis=0)))
+    }
 
 
 def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
@@ -429,8 +470,8 @@ def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
     found = list[Signal]()
     for one in signals:
         if not one.unit:
-            turns = names.is_turning(one.axis)
-            alike = [other for other in signals if not other.unit and names.is_turning(other.axis) == turns]
+            turns = names.turns(one.column, one.axis)
+            alike = [other for other in signals if not other.unit and names.turns(other.column, other.axis) == turns]
             small, large, most = RANGES["angle" if turns else "length"]
             largest = max(float(np.nanmax(np.abs(other.plain))) for other in alike)
             one = replace(one, unit=large if largest > most else small)

@@ -19,10 +19,9 @@ from ..logs.columns import leaf
 from ..logs.frames import CARTESIAN
 from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
-from ..logs.tables import FIRST
 from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
-from .contents import RANGES, RESTS, Part, Signal, no_commands, without_clock
+from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, without_clock
 from .following import LATEST, Following, following
 from .matching import far_shift
 from .names import Role
@@ -32,10 +31,10 @@ from .own_frames import speeds_follow
 _OF_POINT = 0.98  # correlation from which a joint moves one coordinate of a point alone, as a rail does
 _SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
 _ALIKE, _LEVEL = 0.98, 0.1  # correlation of columns of one axis, and share of their range by which their ends differ
-_NAMELESS = FIRST.split()[:1]  # of the words that a column is called that has no name
 _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _EVEN, _MOSTLY = 0.05, 0.9  # of a step, by which those of a clock differ, as it has digits; of the steps
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
+_TO_AND_FRO = 10  # turns at rest, from which they are noise: an arm that settles turns a few times
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
 _NEAR = -0.5, 1.5  # s, from and to which lag a sensor is on the commands' clock
 _MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that an arm is late where its clock is shifted
@@ -161,9 +160,13 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     streams = _looked_at(list(named.values()))
     if (known := _command(streams)) is None:
         what = "; ".join(f"{printable(one.part.label)}: {', '.join(list(one.axes)[:_MOST_LISTED])}" for one in streams)
-        called = "None is called command, goal, target, desired, setpoint or action, and none runs ahead of others"
+        still = [f"{one}, {why}" for part in parts for one, why in part.left_out.items() if why.startswith(RESTS)]
+        still = [one for one in still if names.column_role(one.rpartition(",")[0]) == "command"]
+        called = "None is called command, goal, target, desired, setpoint or action"
+        called = f"What is called so never moves: {printable('; '.join(still[:3]), _LONGEST)}" if still else called
         advice = f"{no_commands(parts)}say it in run.toml"
-        raise UndecidedError(log, f"which numbers are the commands? {called} ({what}); {advice}", parts)
+        why = f"{called}, and none runs ahead of others ({what}); {advice}"
+        raise UndecidedError(log, f"which numbers are the commands? {why}", parts)
     command, why = known
     resting = {names.axis_of(column, []) for column, what in command.part.left_out.items() if what.startswith(RESTS)}
     left_out: list[tuple[Stream, str]] = []
@@ -447,13 +450,13 @@ def _apart(stream: Stream) -> list[Stream]:
 
 
 def _led(stream: Stream) -> list[Stream]:
-    """A stream of columns without names, taken apart where some follow others: as far, at the same level, and later."""
+    """A stream of columns without names, taken apart where some follow others: as far, at the same level, later.
+
+    Or at once, and noisier.
+    """
     source, columns = stream.source, list(stream.axes)
-    clock = stream.part.clock.time.column if stream.part.clock else ""
-    array, bracket, _ = clock.partition("[")  # which has its clock in it
-    mine = [one.column for some in stream.axes.values() for one in some]
-    nameless = all(names.words(one)[:1] == _NAMELESS or (bracket and one.startswith(f"{array}[")) for one in mine)
-    if len(columns) > _MOST_APART or not nameless:
+    mine = [one for some in stream.axes.values() for one in some]
+    if len(columns) > _MOST_APART or not stream.part.clock or not is_nameless(mine, stream.part.clock):
         return [stream]
     leads = dict[str, dict[str, float]]()  # of those that follow it, how late they do
     ends = {one: np.quantile(value, (0.0, 0.5, 1.0)) for one, value in source.values.items()}
@@ -461,7 +464,9 @@ def _led(stream: Stream) -> list[Stream]:
         if np.abs(ends[one] - ends[other]).max() > _LEVEL * np.ptp(ends[other]):
             continue
         found = following((source.stamp, source.values[one]), (source.stamp, source.values[other]))
-        if found is not None and found.correlation > _ALIKE and found.lag > _AT_ONCE:
+        if found is None or found.correlation <= _ALIKE or found.lag <= -_AT_ONCE:
+            continue
+        if found.lag > _AT_ONCE or _stands_beside(source.values[one], source.values[other]):
             leads.setdefault(one, {})[other] = found.lag
     followers = {other for mine in leads.values() for other in mine}
     pairs = dict[str, str]()
@@ -473,9 +478,20 @@ def _led(stream: Stream) -> list[Stream]:
         return [stream]
     rest = {axis: some for axis, some in stream.axes.items() if axis not in {*pairs, *pairs.values()}}
     told, seen = {one: stream.axes[one] for one in pairs}, {one: stream.axes[other] for one, other in pairs.items()}
-    command = Stream("commanded", "command", "others follow it as far, later", stream.part, told)
+    command = Stream("commanded", "command", "others follow it as far, later or noisier", stream.part, told)
     others = {"measured": seen, "others": rest}
     return [command, *(Stream(name, None, "", stream.part, axes) for name, axes in others.items() if axes)]
+
+
+def _stands_beside(told: FloatArray, seen: FloatArray) -> bool:
+    """Whether, in the longest rest of a signal, another goes to and fro: what is commanded stands, its sensor is noisy.
+
+    An encoder of coarse counts stands, too, but where its commands go on one way.
+    """
+    changes = np.flatnonzero(np.concatenate(([True], np.diff(told) != 0.0, [True])))
+    longest = int(np.argmax(np.diff(changes)))
+    steps = np.diff(seen[changes[longest] : changes[longest + 1]])
+    return bool(np.count_nonzero(np.diff(np.sign(steps[steps != 0.0]))) >= _TO_AND_FRO)
 
 
 def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream: Stream) -> bool:
@@ -579,7 +595,7 @@ def _is_namesake(command: Stream, stream: Stream) -> bool:
 
     shared = stream.axes.keys() & command.axes.keys()
     names_of = [(called(stream.axes[axis]), called(command.axes[axis])) for axis in shared]
-    return bool(names_of) and all(one == other and one[:1] != _NAMELESS for one, other in names_of)
+    return bool(names_of) and all(one == other and one[:1] != NAMELESS for one, other in names_of)
 
 
 def _copies(command: Stream, stream: Stream) -> bool:
