@@ -193,7 +193,8 @@ class Doubt(NamedTuple):
         matters = self.off > _NOTHING * self.plain.measured.range
         if self.is_worse and matters:
             delayed, far = self.plain.delayed, self.plain.delayed_off * screen.scale
-            times = "" if delayed.gain == 1.0 else f" times {delayed.gain:.3g},"
+            gain = f"{delayed.gain:.3g}"
+            times = "" if gain == "1" else f" times {gain},"
             what = (
                 "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
                 f" {self.lag * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
