@@ -14,7 +14,7 @@ from pumafuse import FirstOrder, SecondOrder
 from pumafuse.identification.fit import StepFit, fit_steps, flags
 from pumafuse.identification.trials import StepTrials, Trial
 from pumafuse.model.unit_response import unit_response
-from pumafuse.tuning.arms import Limits, Measured, Recording, Rest
+from pumafuse.tuning.arms import Limits, Measured, NoiseModel, Recording
 from pumafuse.tuning.plain import plain_arm
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -155,7 +155,7 @@ def test_the_search_for_arms_finds_the_same_arm(order: int, shape: tuple[float, 
     one = trial(*shape, 1e-5, seed)
     fit, n = fit_step(one, order), len(TIMES)
     run = Recording(
-        given=np.array([-(10**9), 0]),
+        told=np.array([-(10**9), 0]),
         command=np.array([0.0, one.step]),
         start=0.0,
         time=np.rint(one.time * 1e9).astype(np.int64),
@@ -170,7 +170,7 @@ def test_the_search_for_arms_finds_the_same_arm(order: int, shape: tuple[float, 
     limits = Limits({"delay": (0.0, 0.6), "lag": (1e-3, 2.0), "damping": (0.2, 8.0), "gain": (-np.inf, np.inf)}, {})
     start, least = (
         plain.arm._replace(damping=order - 1.0),
-        Rest(np.array([1e-7])),
+        NoiseModel(np.array([1e-7])),
     )  # so little that it never stops early
     found = measured.fitted(start, names, least, limits).arm
     assert found.delay == pytest.approx(fit.shape.delay, abs=2e-6)

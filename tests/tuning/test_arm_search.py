@@ -43,7 +43,7 @@ def table(search: ArmSearch, gain: float) -> tuple[np.ndarray, np.ndarray, np.nd
     """The log-likelihood over dead times and logarithms of lags, and both."""
     delays, lags = np.linspace(0.04, 0.105, 66), np.linspace(math.log(0.02), math.log(0.11), 61)
     arms = [Arm(delay, math.exp(lag), gain=gain) for delay in delays.tolist() for lag in lags.tolist()]
-    log, _ = measured(1).weighed(arms, search.rest)
+    log, _ = measured(1).weighed(arms, search.noise)
     return log.reshape(len(delays), len(lags)), delays, lags
 
 
@@ -76,7 +76,7 @@ def test_the_noise_that_is_likely_is_what_second_differences_show(search: ArmSea
     """Of what the best arm leaves where it is calm; here that is the white noise of the sensor, to a tenth."""
     entries = [one for branch in search.posterior.branches for one in branch.entries]
     arm, one = max(entries, key=lambda entry: entry.log_density).arm, measured(1).recordings[0]
-    path = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+    path = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
     ways = np.ptp(np.lib.stride_tricks.sliding_window_view(path, 3), axis=1)
     calm = ways <= np.quantile(ways, 1.0 / 3.0)
     shown = np.median(np.abs(np.diff(one.value - path, 2))[calm]) / (0.6745 * np.sqrt(6.0))

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 
 from pumafuse.filter.response import response
 from pumafuse.model.arm import Sag
-from pumafuse.tuning.arms import Arm, Limits, Measured, Recording, Rest, rests
+from pumafuse.tuning.arms import Arm, Limits, Measured, NoiseModel, Recording, noise_models
 
 T = 0.02
 OFFSET = 30.0  # times the range of what is measured: where an offset may begin
@@ -30,7 +30,7 @@ def recording(seed: int, count: int = 60, sensors: int = 1) -> Recording:
     return Recording(given, command, 0.3, time, value, rng.integers(0, sensors, count), np.ones(count))
 
 
-def covariance(one: Recording, rest: Rest, offset_sd: float) -> np.ndarray:
+def covariance(one: Recording, rest: NoiseModel, offset_sd: float) -> np.ndarray:
     """Of all that is measured: an offset that walks from its beginning, a disturbance and white noise."""
     t = (one.time - one.time[0]) / 1e9
     apart = np.abs(t[:, None] - t)
@@ -41,10 +41,10 @@ def covariance(one: Recording, rest: Rest, offset_sd: float) -> np.ndarray:
 
 
 RESTS = [
-    Rest(np.array([0.01]), 0.0),
-    Rest(np.array([0.01]), 0.02),
-    Rest(np.array([0.003]), 0.01, 0.03, 0.1, 1.5),
-    Rest(np.array([0.003]), 0.0, 0.03, 0.05, 0.5),
+    NoiseModel(np.array([0.01]), 0.0),
+    NoiseModel(np.array([0.01]), 0.02),
+    NoiseModel(np.array([0.003]), 0.01, 0.03, 0.1, 1.5),
+    NoiseModel(np.array([0.003]), 0.0, 0.03, 0.05, 0.5),
 ]
 ARMS = [
     Arm(0.05, 0.08, gain=0.9),
@@ -61,8 +61,8 @@ def test_what_bends_an_axis_is_part_of_its_response(arm: Arm) -> None:
     axis = replaced(bent.model, sag=Sag(offset=0.01, slope=-0.05))
     assert Arm.of(axis, arm.delay) == pytest.approx(bent, rel=1e-12)
     one = recording(3)
-    expected = response(axis, T, arm.delay, one.given, one.command, one.start, one.time)
-    straight = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+    expected = response(axis, T, arm.delay, one.told, one.command, one.start, one.time)
+    straight = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
     assert np.abs(expected - straight).max() > 0.005
     measured = Measured([one], T, ["a"], axis).of([one._replace(value=expected).of(slice(None, None, 2))])
     np.testing.assert_allclose(measured.responses(bent)[0], expected[::2], rtol=0.0, atol=1e-12)  # cut elsewhere
@@ -71,14 +71,14 @@ def test_what_bends_an_axis_is_part_of_its_response(arm: Arm) -> None:
 
 @pytest.mark.parametrize("rest", RESTS)
 @pytest.mark.parametrize("arm", ARMS)
-def test_the_likelihood_of_an_arm_is_the_joint_gaussians(arm: Arm, rest: Rest) -> None:
+def test_the_likelihood_of_an_arm_is_the_joint_gaussians(arm: Arm, rest: NoiseModel) -> None:
     """Of what the arm leaves, in two recordings that rest at two levels before their first command."""
     other = recording(2, 40)
     parts = [recording(1), other._replace(command=other.command + 0.4, start=other.start + 0.4)]
     measured, expected = Measured(parts, T, ["a"]), 0.0
     reach = max(np.ptp(one.value) for one in parts)
     for one in parts:
-        moved = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+        moved = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
         cov = covariance(one, rest, OFFSET * reach)
         expected += multivariate_normal.logpdf(one.value - moved, cov=cov)
     assert measured.weighed([arm], rest)[0][0] == pytest.approx(expected, rel=1e-7)
@@ -87,10 +87,10 @@ def test_the_likelihood_of_an_arm_is_the_joint_gaussians(arm: Arm, rest: Rest) -
 
 def test_the_best_gain_is_that_of_generalised_least_squares() -> None:
     """And the likelihood is that with this gain, beside a second sensor that is off by any constant."""
-    one, rest, arm = recording(3, 80, sensors=2), Rest(np.array([0.01, 0.02]), 0.02), Arm(0.05, 0.08)
+    one, rest, arm = recording(3, 80, sensors=2), NoiseModel(np.array([0.01, 0.02]), 0.02), Arm(0.05, 0.08)
     measured = Measured([one], T, ["a", "b"])
     log, gain = measured.weighed([arm], rest, Limits({}, {}))
-    r = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+    r = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
     X = np.column_stack([r, one.source == 1])
     inverse = np.linalg.inv(covariance(one, rest, OFFSET * np.ptp(one.value)))
     best = np.linalg.solve(X.T @ inverse @ X, X.T @ inverse @ one.value)
@@ -133,8 +133,8 @@ def test_a_long_recording_is_known_by_where_each_quarter_of_it_moves_most(rows: 
 
 def test_a_fit_is_a_maximum_and_its_information_the_curvature() -> None:
     """A simulated second-order arm: no neighbour is likelier, and the likelihood falls as the information says."""
-    one, rest, true = recording(5, 400), Rest(np.array([1e-3])), Arm(0.05, 0.1, damping=0.8, gain=0.95)
-    moved = response(true.model, T, true.delay, one.given, one.command, one.start, one.time)
+    one, rest, true = recording(5, 400), NoiseModel(np.array([1e-3])), Arm(0.05, 0.1, damping=0.8, gain=0.95)
+    moved = response(true.model, T, true.delay, one.told, one.command, one.start, one.time)
     value = moved + np.random.default_rng(5).normal(0.0, 1e-3, 400)
     measured = Measured([one._replace(value=value)], T, ["a"])
     found = measured.fitted(Arm(0.06, 0.08, damping=1.0), NAMES, rest, FREE)
@@ -155,12 +155,12 @@ def test_a_fit_is_a_maximum_and_its_information_the_curvature() -> None:
 )
 def test_what_an_arm_leaves_is_found(number: int, kind: str) -> None:
     """A walk, a smooth and a rough disturbance with white noise: of the last two the right one is likelier."""
-    true = {"walk": Rest(np.array([2e-3]), 5e-3), "smooth": Rest(np.array([2e-3]), 1e-6, 0.02, 0.3, 1.5)}
-    rest = true.get(kind, Rest(np.array([2e-3]), 1e-6, 0.02, 0.3, 0.5))
+    true = {"walk": NoiseModel(np.array([2e-3]), 5e-3), "smooth": NoiseModel(np.array([2e-3]), 1e-6, 0.02, 0.3, 1.5)}
+    rest = true.get(kind, NoiseModel(np.array([2e-3]), 1e-6, 0.02, 0.3, 0.5))
     one = recording(6, 1500)._replace(time=np.arange(1500) * 20_000_000)
     value = np.random.default_rng(7).multivariate_normal(np.zeros(1500), covariance(one, rest, 1e-3))
     still = one._replace(value=value, command=np.full(100, 0.3))
-    found = list(rests(Measured([still], T, ["a"]), Arm(0.0, 0.1), 0.04, [1e-6]))
+    found = list(noise_models(Measured([still], T, ["a"]), Arm(0.0, 0.1), 0.04, [1e-6]))
     if number:
         assert found[number][1] > found[3 - number][1]
     likely = found[number][0]
@@ -176,16 +176,16 @@ def test_noise_is_believed_to_be_what_second_differences_show_where_the_arm_is_c
     """Within a factor of 1.9: log-posteriors are the likelihood less half the square of that, at a maximum."""
     one, arm = recording(3), Arm(0.05, 0.08)
     measured = Measured([one], T, ["a"])
-    path = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+    path = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
     ways = np.ptp(np.lib.stride_tricks.sliding_window_view(path, 3), axis=1)
     calm = ways <= np.quantile(ways, 1.0 / 3.0)
     shown = np.median(np.abs(np.diff(one.value - path, 2))[calm]) / (0.6745 * np.sqrt(6.0))
 
-    def posterior(rest: Rest) -> float:
+    def posterior(rest: NoiseModel) -> float:
         x = np.log(rest.sd[0] / shown) / np.log(1.9)
         return float(measured.weighed([arm], rest)[0][0]) - 0.5 * x**2 * believed
 
-    for rest, log in rests(measured, arm, 0.04, [1e-6], believed):
+    for rest, log in noise_models(measured, arm, 0.04, [1e-6], believed):
         assert log == pytest.approx(posterior(rest), abs=1e-3)
         beside = [posterior(replace(rest, sd=rest.sd * by)) for by in (0.7, 1.4)]
         assert max(beside) < log + 0.05
@@ -197,7 +197,7 @@ def test_jitter_is_told_where_the_arm_is_calm() -> None:
     time = np.arange(0, 20 * 10**9, 10**7)
     moving = np.sin(time / 2e9) > 0.0
     command = np.cumsum(np.where(moving, 1e-3, 0.0))
-    swing = one._replace(given=time, command=command, start=0.0, time=time, source=np.zeros(len(time), np.int64))
+    swing = one._replace(told=time, command=command, start=0.0, time=time, source=np.zeros(len(time), np.int64))
     arm = Arm(0.0, 1e-3)
     path = response(arm.model, T, arm.delay, time, command, 0.0, time)
     value = path + rng.normal(0.0, np.where(moving, 0.02, 2e-3))

@@ -141,12 +141,12 @@ def test_what_was_not_configured_has_no_value_before() -> None:
     """A recovery that the arm does not have, and a parameter of a plant of the other order."""
     arm = replaced(ARM, axes={**ARM.axes, "radial": replaced(ARM.axes["radial"], gain_recovery=None)})
     config = replaced(CONFIG, arm=arm)
-    assert of("axes.radial.gain_recovery_ms").given(CONFIG) == 0.1
-    assert of("axes.radial.gain_recovery_ms").given(config) is None
+    assert of("axes.radial.gain_recovery_ms").configured(CONFIG) == 0.1
+    assert of("axes.radial.gain_recovery_ms").configured(config) is None
     assert 0.02 < of("axes.radial.gain_recovery_ms").get(config) < 0.5
     second = with_order(CONFIG, "radial", 2)
-    assert of("axes.radial.damping", second).given(CONFIG) is None
-    assert of("axes.radial.damping", second).given(second) == 1.0
+    assert of("axes.radial.damping", second).configured(CONFIG) is None
+    assert of("axes.radial.damping", second).configured(second) == 1.0
 
 
 # ---- fixing ---------------------------------------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def test_the_result_is_likelier_and_reports_by_how_much() -> None:
     assert total(run, found.config) > total(run, found.before) + 200.0
     keys = {one.key: one for one in free_of(Likelihood([run], found.config), found.config, ARM)}
     for key, one in fitted(found).items():
-        known = keys[key].given(found.before)
+        known = keys[key].configured(found.before)
         assert one.before == (None if known is None else pytest.approx(known / keys[key].unit))
         assert one.value == pytest.approx(keys[key].get(found.config) / keys[key].unit)
         low, high = one.ci95

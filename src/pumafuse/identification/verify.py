@@ -26,7 +26,7 @@ from ..logs.run import Run
 from ..model.arm import ArmModel, commanded_speed
 from ..model.plants import PLANTS
 from ..toml import Interval
-from ..tuning.arms import Arm, Coordinates, Limits, Measured, Recording, Rest
+from ..tuning.arms import Arm, Coordinates, Limits, Measured, NoiseModel, Recording
 from ..tuning.plain import COMMANDS, LAGS, ROWS, delays
 from ..units import Kind
 from .estimate import t_quantile
@@ -233,7 +233,7 @@ def _verified(measured: Measured, run: Run, axis: str, arm: ArmModel) -> tuple[A
     best = best_in_class(measured, own)
     lag = model.lag(own.delay, float(speeds(measured).mean()))
     trace = Trace(
-        units.seconds(recording.time, int(recording.given[0])),
+        units.seconds(recording.time, int(recording.told[0])),
         recording.value - recording.value.mean(),
         modelled - modelled.mean(),
     )
@@ -338,12 +338,12 @@ def best_in_class(measured: Measured, own: Arm) -> BestInClass:
     if np.ptp(moving) > 1e-6 * moving.max():
         names.append("slope")
     starts = _on_grid(measured, own)
-    rest = measured.white(starts[0])
-    fits = [measured.fitted(arm, names, rest, _ANY) for arm in (own, *starts)]
+    noise = measured.white(starts[0])
+    fits = [measured.fitted(arm, names, noise, _ANY) for arm in (own, *starts)]
     near = max(fits, key=lambda one: one.log_posterior).arm
-    rest = measured.white(near)  # beside the noise of a poor start the last steps seemed to gain nothing
-    best, speed = measured.fitted(near, names, rest, _ANY).arm, float(moving.mean())
-    lag, half = best.model.lag(best.delay, speed), _half_width(measured, best, names, rest, speed)
+    noise = measured.white(near)  # beside the noise of a poor start the last steps seemed to gain nothing
+    best, speed = measured.fitted(near, names, noise, _ANY).arm, float(moving.mean())
+    lag, half = best.model.lag(best.delay, speed), _half_width(measured, best, names, noise, speed)
     return BestInClass(
         fit=model_fit(measured, best),
         lag=lag,
@@ -361,11 +361,11 @@ def _on_grid(measured: Measured, own: Arm) -> list[Arm]:
     return part.likeliest(arms, part.white(own), _ANY, _STARTS)
 
 
-def _half_width(measured: Measured, arm: Arm, names: Coordinates, rest: Rest, speed: float) -> float:
+def _half_width(measured: Measured, arm: Arm, names: Coordinates, noise: NoiseModel, speed: float) -> float:
     """Half the 95 % interval of the lag at a ``speed`` [m/s or rad/s].
 
     What a model leaves over of a run is correlated, and each measurement alone would count far too much: a block of the
     run counts as one observation (Bester, Conley & Hansen, J. Econometrics 165, 2011).
     """
-    _, variance = measured.lag_variances(arm, names, rest, _ANY, _BLOCKS, lambda one: one.model.lag(one.delay, speed))
+    _, variance = measured.lag_variances(arm, names, noise, _ANY, _BLOCKS, lambda one: one.model.lag(one.delay, speed))
     return t_quantile(_BLOCKS - 1) * (variance * _BLOCKS / (_BLOCKS - 1)) ** 0.5

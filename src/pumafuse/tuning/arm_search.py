@@ -15,7 +15,19 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from .arms import BENDS, SAG, Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
+from .arms import (
+    BENDS,
+    SAG,
+    Arm,
+    Coordinates,
+    Fit,
+    Limits,
+    Measured,
+    NoiseModel,
+    covariance,
+    longest_delay,
+    noise_models,
+)
 from .bends import Bent, bent_arm
 from .parameters import QUICKEST, RECOVERY, RECOVERY_PRIOR
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
@@ -66,7 +78,7 @@ _SLOPE = 1e-5  # of a coordinate, by which quantities are varied
 class Freedom(NamedTuple):
     """What of an arm is to be found; the rest stays as given."""
 
-    given: Arm  # the arm as it is known
+    arm: Arm  # as it is configured
     # the coordinates that may vary
     free: Collection[str] = ("delay", "lag", "damping", "recovery", "gain", *BENDS, "sag")
     orders: Sequence[int] = (1, 2)  # the orders of the plant to try
@@ -75,38 +87,38 @@ class Freedom(NamedTuple):
     @property
     def models(self) -> list[Model]:
         """The models to try, the simplest first."""
-        return sorted((Model(*one) for one in product(self.orders, self.gains)), key=lambda model: model.size)
+        return sorted((Model(*pair) for pair in product(self.orders, self.gains)), key=lambda model: model.size)
 
     @property
     def bends(self) -> list[str]:
         """What of play and a fastest speed the arm has."""
-        return [kind for kind in BENDS if getattr(self.given, kind)]
+        return [kind for kind in BENDS if getattr(self.arm, kind)]
 
     def names(self, model: Model) -> list[str]:
         """The coordinates of a model that are free, the dead time first."""
-        found = ["delay", "lag"] if model.order == 1 else ["delay", "lag", "damping"]
-        found += {"given": [], "static": ["gain"], "recovering": ["gain", "recovery"]}[model.gain]
-        found += self.bends
-        return [name for name in found if name in self.free]
+        names = ["delay", "lag"] if model.order == 1 else ["delay", "lag", "damping"]
+        names += {"given": [], "static": ["gain"], "recovering": ["gain", "recovery"]}[model.gain]
+        names += self.bends
+        return [name for name in names if name in self.free]
 
     def bent(self, bent: Bent | None) -> Freedom:
         """With the play, fastest speed and sag that were found; without any, those that are given stay."""
         if bent is None:
             return self
-        found = {name: getattr(bent.arm, name) for name in (*BENDS, *SAG)}
-        return self._replace(given=self.given._replace(**found))
+        bends = {name: getattr(bent.arm, name) for name in (*BENDS, *SAG)}
+        return self._replace(arm=self.arm._replace(**bends))
 
     def shaped(self, arm: Arm, gain: GainKind) -> Arm:
-        """An arm with the kind of gain; one as it is given keeps what is known of it."""
+        """An arm with the kind of gain; one as it is given keeps what is configured of it."""
         if gain == "given":
-            return arm._replace(gain=self.given.gain, recovery=self.given.recovery, slope=self.given.slope)
-        return arm._replace(recovery=0.0, slope=0.0) if gain == "static" else arm._replace(slope=self.given.slope)
+            return arm._replace(gain=self.arm.gain, recovery=self.arm.recovery, slope=self.arm.slope)
+        return arm._replace(recovery=0.0, slope=0.0) if gain == "static" else arm._replace(slope=self.arm.slope)
 
 
 class ArmSearch:
     """The arms of an axis: maxima of each model, and the walk from one along the dead time."""
 
-    rests: Sequence[Rest]  # what the best arm leaves, without a disturbance, with a smooth one and with a rough one
+    noise_models: Sequence[NoiseModel]  # of what the best arm leaves: without a disturbance, a smooth, a rough one
 
     def __init__(
         self,
@@ -118,7 +130,8 @@ class ArmSearch:
         """``least``: noise of each sensor [m]; ``believed``: to be what second differences show."""
         self._measured, self.sensors = measured.liveliest(_ENOUGH), measured.sensors
         self._longest = longest_delay(measured.period)
-        self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
+        self.plain = plain_arm(measured)
+        self.noise = NoiseModel(np.ones(len(measured.sensors)))  # at first: least squares
         self.bent = self._bent(freedom)  # their arm with what it has of play, a fastest speed and a sag
         self.freedom = freedom.bent(self.bent)
         self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
@@ -130,19 +143,19 @@ class ArmSearch:
         self.limits = self.limits._replace(bounds={**self.limits.bounds, "gain": gains})
         peaks, branches = self._peaks(least, believed), list[Branch]()
         for evidence, model, peak in peaks:
-            walked = (one for one in branches if one.model == model)
+            walked = (branch for branch in branches if branch.model == model)
             if evidence > peaks[0][0] - _FORLORN and not any(
-                one.delays[0] <= peak.arm.delay <= one.delays[-1] for one in walked
+                branch.delays[0] <= peak.arm.delay <= branch.delays[-1] for branch in walked
             ):
-                highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
+                highest = max((float(branch.log_density.max()) for branch in branches), default=-np.inf)
                 branches.append(self._walk(model, peak, highest - _FORLORN))
         self.posterior = AxisPosterior(branches)  # of all models that count, along their dead times
 
     @property
     def likely_noise(self) -> dict[str, float]:
         """The white noise that each sensor is believed to have [m]."""
-        found = self._measured.jitter(self._best(self._fits).arm)
-        return dict(zip(self.sensors, found.tolist(), strict=True))
+        jitter = self._measured.jitter(self._best(self._fits).arm)
+        return dict(zip(self.sensors, jitter.tolist(), strict=True))
 
     @property
     def spread(self) -> float:
@@ -151,102 +164,102 @@ class ArmSearch:
 
     def arm(self, model: Model, delay: float | None = None) -> Arm:
         """The most likely arm of a model; the one with this dead time [s]."""
-        entries = [one for branch in self.posterior.branches if branch.model == model for one in branch.entries]
+        entries = [entry for branch in self.posterior.branches if branch.model == model for entry in branch.entries]
         if delay is None:
-            return max(entries, key=lambda one: one.log_density).arm
-        near = min(entries, key=lambda one: abs(one.delay - delay)).arm._replace(delay=delay)
+            return max(entries, key=lambda entry: entry.log_density).arm
+        near = min(entries, key=lambda entry: abs(entry.delay - delay)).arm._replace(delay=delay)
         names = [name for name in self.freedom.names(model) if name != "delay"]
-        return self._measured.fitted(near, names, self.rest, self.limits).arm
+        return self._measured.fitted(near, names, self.noise, self.limits).arm
 
     def lag_scatter(self, model: Model, arm: Arm) -> float:
         """How much more the lag scatters over pieces of the runs than the information says, 1 or more (White, 1982)."""
         names = self.freedom.names(model)
-        variances = self._measured.lag_variances(arm, names, self.rest, self.limits, _PIECES, lambda one: one.total)
+        variances = self._measured.lag_variances(arm, names, self.noise, self.limits, _PIECES, lambda arm: arm.total)
         return max(1.0, math.sqrt(variances[1] / variances[0])) if variances[0] > 0.0 else 1.0
 
     def _bent(self, freedom: Freedom) -> Bent | None:
         if self.plain is None or not {"delay", "lag"} <= set(freedom.free):
             return None
-        return bent_arm(self.plain, freedom.given, [*freedom.free])
+        return bent_arm(self.plain, freedom.arm, [*freedom.free])
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
     def _by_least_squares(self) -> dict[Model, Fit]:
         """Each model, from the grid: noise that is fitted to a poor arm explains what a better one would."""
         whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
-        self.rest = self._measured.white(self._on_grid(1)[0])
-        found = self._fitted(self._on_grid(_STARTS))
-        self.rest = self._measured.white(self._best(found).arm)
-        found = self._fitted([self._best(found).arm], found)
+        self.noise = self._measured.white(self._on_grid(1)[0])
+        fits = self._fitted(self._on_grid(_STARTS))
+        self.noise = self._measured.white(self._best(fits).arm)
+        fits = self._fitted([self._best(fits).arm], fits)
         self._measured = whole
-        return found
+        return fits
 
-    def _likely(self, found: Mapping[Model, Fit]) -> dict[Model, Fit]:
+    def _likely(self, fits: Mapping[Model, Fit]) -> dict[Model, Fit]:
         """Those models that a better noise could still bring near the best."""
-        evidence = {model: self._evidence(model, fit) for model, fit in found.items()}
+        evidence = {model: self._evidence(model, fit) for model, fit in fits.items()}
         least = max(evidence.values()) - _NEARLY
-        return {model: fit for model, fit in found.items() if evidence[model] > least}
+        return {model: fit for model, fit in fits.items() if evidence[model] > least}
 
     def _peaks(self, least: Sequence[float], believed: bool) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
         for _ in range(_GATED):
-            self.rest = self._likely_rest(self._best(self._fits).arm, least, believed)
-            self._measured = self._measured.gated(self._best(self._fits).arm, self.rest, _GATE)
+            self.noise = self._likely_noise(self._best(self._fits).arm, least, believed)
+            self._measured = self._measured.gated(self._best(self._fits).arm, self.noise, _GATE)
         self._fits = self._likely(self._fitted([self._best(self._fits).arm, *self._on_grid(1)], self._fits))
-        self.rest = self._likely_rest(self._best(self._fits).arm, least, believed)
+        self.noise = self._likely_noise(self._best(self._fits).arm, least, believed)
         self._fits = self._likely(self._fitted([self._best(self._fits).arm], self._fits))
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
-        highest = max(one[0] for one in every)
+        highest = max(peak[0] for peak in every)
         for evidence, model, fit in list(every) if "delay" in self.freedom.free else ():
             for ticks in (-1.0, 1.0) if evidence > highest - _FORLORN else ():
                 beside = self._fit(model, self._delayed(fit.arm, fit.arm.delay + ticks * self._measured.period))
-                known = [one.arm.delay for _, other, one in every if other == model]
-                if min(abs(beside.arm.delay - one) for one in known) > _SAME:
+                delays = [peak.arm.delay for _, other, peak in every if other == model]
+                if min(abs(beside.arm.delay - delay) for delay in delays) > _SAME:
                     every.append((self._evidence(model, beside), model, beside))
-        return sorted(every, key=lambda one: -one[0])
+        return sorted(every, key=lambda peak: -peak[0])
 
     def _on_grid(self, count: int) -> list[Arm]:
         """The arms of highest likelihood on a grid of first-order plants, no two of them neighbours."""
-        given, free = self.freedom.given, self.freedom
-        late = delays(self._measured) if "delay" in free.free else np.array([given.delay])
-        lags = LAGS if "lag" in free.free else np.array([given.lag])
-        damping = 0.0 if 1 in free.orders else given.damping
-        arms = [given._replace(delay=d, lag=lag, damping=damping) for d, lag in product(late.tolist(), lags.tolist())]
+        start, free = self.freedom.arm, self.freedom
+        late = delays(self._measured) if "delay" in free.free else np.array([start.delay])
+        lags = LAGS if "lag" in free.free else np.array([start.lag])
+        damping = 0.0 if 1 in free.orders else start.damping
+        arms = [start._replace(delay=d, lag=lag, damping=damping) for d, lag in product(late.tolist(), lags.tolist())]
         varied = "gain" in free.free
         if varied:
             arms = [free.shaped(arm, "static") for arm in arms]
-        log, gain = self._measured.weighed(arms, self.rest, self.limits if varied else None)
+        log, gain = self._measured.weighed(arms, self.noise, self.limits if varied else None)
         table = log.reshape(len(late), len(lags))
         around = np.pad(table, 1, constant_values=-np.inf)
         highest = np.max([np.roll(around, shift, (0, 1)) for shift in product((-1, 0, 1), repeat=2)], axis=0)[
             1:-1, 1:-1
         ]
-        summits = [int(one) for one in np.flatnonzero(table >= highest) if log[one] > log.max() - _NEAR]
-        summits.sort(key=lambda one: -log[one])
-        return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
+        summits = [int(cell) for cell in np.flatnonzero(table >= highest) if log[cell] > log.max() - _NEAR]
+        summits.sort(key=lambda cell: -log[cell])
+        return [arms[cell]._replace(gain=float(gain[cell])) for cell in summits[:count]]
 
-    def _likely_rest(self, arm: Arm, least: Sequence[float], believed: bool) -> Rest:
+    def _likely_noise(self, arm: Arm, least: Sequence[float], believed: bool) -> NoiseModel:
         """The most likely of what an arm leaves, after the penalty for its numbers."""
-        found = list(rests(self._measured, arm, QUICKEST * self._measured.period, least, believed))
-        self.rests = [rest for rest, _ in found]
+        likely = list(noise_models(self._measured, arm, QUICKEST * self._measured.period, least, believed))
+        self.noise_models = [model for model, _ in likely]
         dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
         prices = [WANDERS, dearer + SMOOTHER, dearer]
-        return max(zip(found, prices, strict=True), key=lambda one: one[0][1] - one[1])[0][0]
+        return max(zip(likely, prices, strict=True), key=lambda priced: priced[0][1] - priced[1])[0][0]
 
-    def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None) -> dict[Model, Fit]:
+    def _fitted(self, starts: Sequence[Arm], earlier: Mapping[Model, Fit] | None = None) -> dict[Model, Fit]:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
-        found = dict[Model, Fit]()
-        for model in known or self.freedom.models:
-            arms = starts if not found else [self._best(found).arm]
-            tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, 1 if known else 2)]
-            if known:
-                tries.append(self._fit(model, known[model].arm))
-            found[model] = max(tries, key=lambda one: one.log_posterior)
-        best = max(found, key=lambda model: found[model].log_posterior)
+        fits = dict[Model, Fit]()
+        for model in earlier or self.freedom.models:
+            arms = starts if not fits else [self._best(fits).arm]
+            tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, 1 if earlier else 2)]
+            if earlier:
+                tries.append(self._fit(model, earlier[model].arm))
+            fits[model] = max(tries, key=lambda fit: fit.log_posterior)
+        best = max(fits, key=lambda model: fits[model].log_posterior)
         for ticks in _TICKS if "delay" in self.freedom.free else ():
-            there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)
-            found[best] = max(found[best], self._fit(best, there), key=lambda one: one.log_posterior)
-        return found
+            shifted = self._delayed(fits[best].arm, fits[best].arm.delay + ticks * self._measured.period)
+            fits[best] = max(fits[best], self._fit(best, shifted), key=lambda fit: fit.log_posterior)
+        return fits
 
     def _likeliest(self, model: Model, arms: Iterable[Arm], count: int) -> list[Arm]:
         """The likeliest arms of a model that are as late as others."""
@@ -254,7 +267,7 @@ class ArmSearch:
         if len(tried) <= count:
             return tried
         varied = "gain" in self.freedom.names(model)
-        return self._measured.likeliest(tried, self.rest, self.limits if varied else None, count)
+        return self._measured.likeliest(tried, self.noise, self.limits if varied else None, count)
 
     def _shapes(self, model: Model, arm: Arm) -> Iterator[Arm]:
         """Arms of a model that are as late as another one."""
@@ -266,15 +279,15 @@ class ArmSearch:
         else:
             changes = product(_ERRORS, _RECOVERING)
             gains = [arm._replace(gain=1.0 + error, recovery=recovery) for error, recovery in changes]
-        for one in gains:
-            one = self._as_late(one, arm.total)
+        for shape in gains:
+            shape = self._as_late(shape, arm.total)
             if model.order == order:
-                yield one
+                yield shape
             elif model.order == 1:
-                yield one._replace(damping=0.0)
+                yield shape._replace(damping=0.0)
             else:
                 for earlier, damping in product(_EARLIER, _DAMPED) if len(gains) == 1 else ((0.3, 1.0),):
-                    yield self._delayed(one, one.delay - earlier * one.delay)._replace(damping=damping)
+                    yield self._delayed(shape, shape.delay - earlier * shape.delay)._replace(damping=damping)
 
     def _as_late(self, arm: Arm, total: float) -> Arm:
         """An arm whose plant makes up for what its gain changed of the lag."""
@@ -293,10 +306,10 @@ class ArmSearch:
 
     def _fit(self, model: Model, start: Arm) -> Fit:
         names = self.freedom.names(model)
-        return self._measured.fitted(start, names, self.rest, self.limits)
+        return self._measured.fitted(start, names, self.noise, self.limits)
 
-    def _best(self, found: Mapping[Model, Fit]) -> Fit:
-        return max(found.values(), key=lambda one: one.log_posterior)
+    def _best(self, fits: Mapping[Model, Fit]) -> Fit:
+        return max(fits.values(), key=lambda fit: fit.log_posterior)
 
     def _evidence(self, model: Model, fit: Fit) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly."""
@@ -308,16 +321,16 @@ class ArmSearch:
     def _laplace(self, fit: Fit, names: Coordinates, inside: BoolArray) -> float:
         """The log-density with the free numbers integrated out, each with its prior's constant."""
         log = fit.log_posterior
-        free = [name for name, one in zip(names, inside, strict=True) if one]
+        free = [name for name, is_free in zip(names, inside, strict=True) if is_free]
         some = np.flatnonzero(inside)
         information = fit.information[np.ix_(some, some)]
-        for place, name in enumerate(free):
+        for row, name in enumerate(free):
             if name in PRIORS:
                 log -= math.log(PRIORS[name][1] * math.sqrt(2.0 * math.pi))
             else:  # uniform: where the likelihood is flat, it ends at its bounds all the same
                 width = self._longest if name == "delay" else _LOG_RANGE
                 log -= math.log(width)
-                information[place, place] += 12.0 / width**2
+                information[row, row] += 12.0 / width**2
         if not np.isfinite(information).all():  # an arm that runs off
             return -math.inf
         if free:
@@ -351,8 +364,8 @@ class ArmSearch:
             if not -abs(step) < delay <= self._longest:
                 return
             at = np.array([before.coordinate(name) for name in names])
-            there = before.moved(names, np.clip(at + move, low, high).tolist())._replace(delay=max(delay, 0.0))
-            entry = self._at(there, names)
+            start = before.moved(names, np.clip(at + move, low, high).tolist())._replace(delay=max(delay, 0.0))
+            entry = self._at(start, names)
             yield entry
             least = max(least, entry.log_density - _FORLORN)
             if entry.log_density < least or delay <= 0.0:
@@ -366,17 +379,17 @@ class ArmSearch:
 
     def _at(self, arm: Arm, names: Coordinates) -> Entry:
         """The entry of the best arm with the same dead time."""
-        return self._entry(self._measured.fitted(arm, names, self.rest, self.limits), names)
+        return self._entry(self._measured.fitted(arm, names, self.noise, self.limits), names)
 
     def _entry(self, fit: Fit, names: Coordinates) -> Entry:
         inside = self.limits.inside(fit.arm, names)
-        free = [name for name, one in zip(names, inside, strict=True) if one]
+        free = [name for name, is_free in zip(names, inside, strict=True) if is_free]
         cov = covariance(fit.information[np.ix_(inside, inside)])
         means = _quantities(fit.arm)
         moved = [_quantities(fit.arm.moved([name], [fit.arm.coordinate(name) + _SLOPE])) for name in free]
         sds: dict[Quantity, float] = {}
         for quantity, mean in means.items():
-            slope = np.array([(one[quantity] - mean) / _SLOPE for one in moved])
+            slope = np.array([(beside[quantity] - mean) / _SLOPE for beside in moved])
             sds[quantity] = math.sqrt(max(float(slope @ cov @ slope), 0.0)) if free else 0.0
         return Entry(fit.arm.delay, fit.arm, self._laplace(fit, names, inside), means, sds)
 
@@ -398,26 +411,28 @@ def chosen_arms(
 
     That of ``delayed`` axes is free; with ``one_delay`` they share one whatever the measurements say.
     """
-    known = {axis: one.posterior for axis, one in searched.items() if axis in delayed}
-    shares = list(known) if one_delay else sharing(known)
-    delay, found = shared_delay([known[axis] for axis in shares]) if shares else None, dict[str, Chosen]()
-    worth = {} if one_delay else own_worth(known, shares)
+    posteriors = {axis: search.posterior for axis, search in searched.items() if axis in delayed}
+    shares = list(posteriors) if one_delay else sharing(posteriors)
+    delay, chosen = shared_delay([posteriors[axis] for axis in shares]) if shares else None, dict[str, Chosen]()
+    worth = {} if one_delay else own_worth(posteriors, shares)
     for axis, search in searched.items():
-        mine, posterior = axis in shares, search.posterior
-        others = [known[one] for one in shares if mine and one != axis]
+        is_shared, posterior = axis in shares, search.posterior
+        others = [posteriors[other] for other in shares if is_shared and other != axis]
         model = chosen_model(posterior.mixture(others))
-        likely = posterior.mixture(others, 1.0 / (1.0 + math.exp(worth[axis])) if mine and worth else 1.0)
-        found[axis] = Chosen(search.arm(model, delay if mine else None), model, likely, mine, worth.get(axis))
-    return found, delay
+        likely = posterior.mixture(others, 1.0 / (1.0 + math.exp(worth[axis])) if is_shared and worth else 1.0)
+        chosen[axis] = Chosen(
+            search.arm(model, delay if is_shared else None), model, likely, is_shared, worth.get(axis)
+        )
+    return chosen, delay
 
 
 def _quantities(arm: Arm) -> dict[Quantity, float]:
     """What is said of an arm; of what can only be positive the logarithm."""
-    found: dict[Quantity, float] = {"lag": arm.total, "delay": arm.delay, "gain": arm.gain}
+    quantities: dict[Quantity, float] = {"lag": arm.total, "delay": arm.delay, "gain": arm.gain}
     if arm.damping:
-        found |= {"natural_frequency": math.log(2.0 * arm.damping / arm.lag), "damping": math.log(arm.damping)}
+        quantities |= {"natural_frequency": math.log(2.0 * arm.damping / arm.lag), "damping": math.log(arm.damping)}
     else:
-        found["time_constant"] = math.log(arm.lag)
+        quantities["time_constant"] = math.log(arm.lag)
     if arm.recovery:
-        found["gain_recovery"] = math.log(arm.recovery)
-    return found | {bend: math.log(size) for bend in BENDS if (size := getattr(arm, bend))}
+        quantities["gain_recovery"] = math.log(arm.recovery)
+    return quantities | {bend: math.log(size) for bend in BENDS if (size := getattr(arm, bend))}

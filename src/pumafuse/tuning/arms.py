@@ -65,7 +65,7 @@ BEYOND = (-0.98, 1.0)  # bounds of the slope of another: no load moves a tool mo
 class Recording(NamedTuple):
     """What was commanded on an axis, and what was measured of it, in one piece."""
 
-    given: TimeArray  # when each command was given, int64 ns, (k,)
+    told: TimeArray  # when each command was given, int64 ns, (k,)
     command: FloatArray  # u [m], (k,)
     start: float  # the level [m] at which the axis rests before its first command
     time: TimeArray  # when each measurement is valid, int64 ns, ascending, (m,)
@@ -80,7 +80,7 @@ class Recording(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Rest:
+class NoiseModel:
     """What an arm leaves of the measurements."""
 
     sd: FloatArray  # white noise of each sensor [m], (s,)
@@ -132,11 +132,11 @@ class Arm(NamedTuple):
             sag=self.sag_beside(Sag()) if self.beyond or self.below else None,
         )
 
-    def sag_beside(self, given: Sag) -> Sag:
-        """Its knees, with the rest of a sag that is given."""
+    def sag_beside(self, sag: Sag) -> Sag:
+        """Its knees, beside those of ``sag`` that it does not have."""
         if self.beyond:
-            given = replace(given, knee=self.knee, slope_beyond=self.beyond)
-        return replace(given, knee_below=self.knee_below, slope_below=self.below) if self.below else given
+            sag = replace(sag, knee=self.knee, slope_beyond=self.beyond)
+        return replace(sag, knee_below=self.knee_below, slope_below=self.below) if self.below else sag
 
     @classmethod
     def of(cls, axis: AxisModel, delay: float) -> Arm:
@@ -144,7 +144,7 @@ class Arm(NamedTuple):
         damping = axis.plant.damping if isinstance(axis.plant, SecondOrder) else 0.0
         gain, bends = axis.gain, (axis.play or 0.0, axis.max_speed or 0.0)
         sag = axis.sag or Sag()
-        bends += tuple(one or 0.0 for one in (sag.knee, sag.slope_beyond, sag.knee_below, sag.slope_below))
+        bends += tuple(number or 0.0 for number in (sag.knee, sag.slope_beyond, sag.knee_below, sag.slope_below))
         return cls(delay, axis.plant.lag, damping, axis.gain_recovery or 0.0, gain.intercept, gain.slope, *bends)
 
     def coordinate(self, name: str) -> float:
@@ -155,7 +155,7 @@ class Arm(NamedTuple):
     def moved(self, names: Coordinates, coordinates: Sequence[float]) -> Arm:
         """With other coordinates."""
         values = zip(names, coordinates, strict=True)
-        return self._replace(**{name: math.exp(one) if name in LOGARITHMIC else one for name, one in values})
+        return self._replace(**{name: math.exp(value) if name in LOGARITHMIC else value for name, value in values})
 
 
 class Limits(NamedTuple):
@@ -193,15 +193,17 @@ class Fit(NamedTuple):
 
 
 class Measured:
-    """All recordings of an axis, as a function of the arm and the rest."""
+    """All recordings of an axis, as a function of the arm and of the noise that it leaves."""
 
     def __init__(
-        self, recordings: Sequence[Recording], period: float, sensors: Sequence[str], known: AxisModel | None = None
+        self, recordings: Sequence[Recording], period: float, sensors: Sequence[str], model: AxisModel | None = None
     ) -> None:
-        """By these ``sensors``, of an axis of update period ``period`` [s], which sags as the ``known`` model does."""
-        self.recordings, self.period, self.sensors, self._known = recordings, period, sensors, known
-        self.count = int(sum(one.weight.sum() for one in recordings))
-        self.range = max((float(np.ptp(one.value)) for one in recordings if len(one.value)), default=0.0)
+        """By these ``sensors``, of an axis of update period ``period`` [s], which sags as the ``model`` does."""
+        self.recordings, self.period, self.sensors, self._known = recordings, period, sensors, model
+        self.count = int(sum(recording.weight.sum() for recording in recordings))
+        self.range = max(
+            (float(np.ptp(recording.value)) for recording in recordings if len(recording.value)), default=0.0
+        )
         self._offset = _FAR * max(self.range, 1e-6)
 
     def of(self, recordings: Sequence[Recording]) -> Measured:
@@ -212,8 +214,8 @@ class Measured:
     def moving(self) -> BoolArray:
         """Which of the measurements that count are of an axis in motion: a tenth of its fastest or more, (n,)."""
         parts = list[BoolArray]()
-        for one in self.recordings:
-            value = one.value[one.weight > 0.0]
+        for recording in self.recordings:
+            value = recording.value[recording.weight > 0.0]
             way = np.abs(np.gradient(value)) if len(value) > 1 else np.zeros(len(value))
             parts.append(way >= _SLOW * np.quantile(way, _FASTEST) if way.any() else way == 0.0)
         return np.concatenate(parts)
@@ -221,66 +223,78 @@ class Measured:
     def left(self, arm: Arm) -> FloatArray:
         """What an arm leaves of the measurements that count, of each recording about its mean [m]."""
         parts = [
-            one[part.weight > 0.0]
-            for one, part in zip(self.residuals(arm), self.recordings, strict=True)
+            left[part.weight > 0.0]
+            for left, part in zip(self.residuals(arm), self.recordings, strict=True)
             if part.weight.any()
         ]
-        return np.concatenate([one - one.mean() for one in parts] or [np.zeros(0)])
+        return np.concatenate([left - left.mean() for left in parts] or [np.zeros(0)])
 
     @property
     def power(self) -> float:
         """The sum of squares of all that is measured [m²], of each recording about its mean."""
-        return sum(float(np.var(one.value) * len(one.value)) for one in self.recordings if len(one.value))
+        return sum(
+            float(np.var(recording.value) * len(recording.value))
+            for recording in self.recordings
+            if len(recording.value)
+        )
 
     def without_far_from(self, arm: Arm, times: float) -> Measured:
         """Without measurements so many times as far off an arm as half of them are: those in motion, and those at rest.
 
         What is nearer than a small part of the motion does no harm.
         """
-        left = np.abs(np.concatenate([one - np.median(one) if len(one) else one for one in self.residuals(arm)]))
-        moving = self.of([one._replace(weight=np.ones(len(one.time))) for one in self.recordings]).moving
+        left = np.abs(
+            np.concatenate(
+                [residual - np.median(residual) if len(residual) else residual for residual in self.residuals(arm)]
+            )
+        )
+        moving = self.of(
+            [recording._replace(weight=np.ones(len(recording.time))) for recording in self.recordings]
+        ).moving
         limit = np.full(len(left), _HARMLESS * self.range)
         for some in (moving, ~moving):
             limit[some] = np.maximum(limit[some], times * np.median(left[some]) if some.any() else 0.0)
-        near = np.split(left <= limit, np.cumsum([len(one.time) for one in self.recordings])[:-1])
+        near = np.split(left <= limit, np.cumsum([len(recording.time) for recording in self.recordings])[:-1])
         return self.of(
             [
-                one._replace(weight=np.where(kept, one.weight, 0.0))
-                for one, kept in zip(self.recordings, near, strict=True)
+                recording._replace(weight=np.where(kept, recording.weight, 0.0))
+                for recording, kept in zip(self.recordings, near, strict=True)
             ]
         )
 
-    def white(self, arm: Arm) -> Rest:
+    def white(self, arm: Arm) -> NoiseModel:
         """All that an arm leaves as noise of the sensors: for least squares."""
         left = np.sort(np.abs(self.left(arm)))
         left = left[: math.ceil(_SHARE * len(left))]
         sd = max(float(np.sqrt(np.mean(left**2))), _SMALLEST) if len(left) else 1.0
-        return Rest(np.full(len(self.sensors), sd))
+        return NoiseModel(np.full(len(self.sensors), sd))
 
     def jitter(self, arm: Arm) -> FloatArray:
         """White noise of each sensor [m], (s,), by second differences of what an arm leaves where it is calm."""
-        found = np.full(len(self.sensors), float(self.white(arm).sd[0]))
+        sds = np.full(len(self.sensors), float(self.white(arm).sd[0]))
         moved = self.responses(arm)
-        for number in range(len(found)):
-            mine = [(one.source == number) & (one.weight > 0.0) for one in self.recordings]
-            paths = [path[rows] for path, rows in zip(moved, mine, strict=True) if rows.sum() > 2]
-            seen = [one.value[rows] for one, rows in zip(self.recordings, mine, strict=True) if rows.sum() > 2]
+        for number in range(len(sds)):
+            chosen = [(recording.source == number) & (recording.weight > 0.0) for recording in self.recordings]
+            paths = [path[rows] for path, rows in zip(moved, chosen, strict=True) if rows.sum() > 2]
+            seen = [
+                recording.value[rows] for recording, rows in zip(self.recordings, chosen, strict=True) if rows.sum() > 2
+            ]
             if paths:
                 bends = np.concatenate([np.abs(np.diff(z - r, 2)) for z, r in zip(seen, paths, strict=True)])
                 ways = np.concatenate([np.ptp([r[:-2], r[1:-1], r[2:]], axis=0) for r in paths])
                 calm = ways <= np.quantile(ways, _CALM)
-                found[number] = max(float(np.median(bends[calm])) / _BEND, _SMALLEST)
-        return found
+                sds[number] = max(float(np.median(bends[calm])) / _BEND, _SMALLEST)
+        return sds
 
-    def gated(self, arm: Arm, rest: Rest, gate: float) -> Measured:
+    def gated(self, arm: Arm, noise: NoiseModel, gate: float) -> Measured:
         """Without measurements whose innovation beside an arm is beyond so many standard deviations.
 
         More than a few of them in a row are no outliers: it is the arm that moves otherwise.
         """
         left, parts = self.residuals(arm), list[Recording]()
-        for one, mine in zip(self.recordings, left, strict=True):
-            white, _ = self._white(one, rest, mine[None])
-            parts.append(one._replace(weight=np.where(lonely(np.abs(white[0]) > gate), 0.0, one.weight)))
+        for recording, left_here in zip(self.recordings, left, strict=True):
+            white, _ = self._white(recording, noise, left_here[None])
+            parts.append(recording._replace(weight=np.where(lonely(np.abs(white[0]) > gate), 0.0, recording.weight)))
         return self.of(parts)
 
     def liveliest(self, most: int) -> Measured:
@@ -289,39 +303,41 @@ class Measured:
         Shorter recordings, and those of few commands, are whole.
         """
         parts = list[Recording]()
-        for one in self.recordings:
-            commands, long = len(one.given), max(len(one.given), len(one.time))
+        for recording in self.recordings:
+            commands, long = len(recording.told), max(len(recording.told), len(recording.time))
             if long <= most or commands < _FEW_COMMANDS:
-                parts.append(one)
+                parts.append(recording)
                 continue
             edges = np.linspace(0, commands, _QUARTERS + 1).astype(int).tolist()
             longest = max(commands * most // long, _FEW_COMMANDS) // _QUARTERS
-            parts += [_liveliest(one, longest, *ends) for ends in pairwise(edges)]
+            parts += [_liveliest(recording, longest, *ends) for ends in pairwise(edges)]
         return self.of(parts)
 
     def excerpt(self, commands: int, rows: int) -> Measured:
         """The part of each recording with the most motion, and some of its measurements, evenly."""
-        parts = [_liveliest(one, commands, 0, len(one.given)) for one in self.recordings]
-        return self.of([one.of(slice(None, None, len(one.time) // rows + 1)) for one in parts])
+        parts = [_liveliest(recording, commands, 0, len(recording.told)) for recording in self.recordings]
+        return self.of([part.of(slice(None, None, len(part.time) // rows + 1)) for part in parts])
 
     def responses(self, arm: Arm) -> list[FloatArray]:
         """The response of each recording [m], relative to its start."""
-        return [one[0] for one in self._responses([arm])]
+        return [moved[0] for moved in self._responses([arm])]
 
     def residuals(self, arm: Arm) -> list[FloatArray]:
         """What an arm leaves of each recording [m]."""
-        return [one.value - moved for one, moved in zip(self.recordings, self.responses(arm), strict=True)]
+        return [recording.value - moved for recording, moved in zip(self.recordings, self.responses(arm), strict=True)]
 
-    def whitened(self, rest: Rest, columns: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+    def whitened(self, noise: NoiseModel, columns: Sequence[FloatArray]) -> tuple[FloatArray, float]:
         """Columns (c, m) of each recording, one recording after the other, whitened; and the sum of log S."""
-        found, log_determinant = list[FloatArray](), 0.0
-        for one, some in zip(self.recordings, columns, strict=True):
-            white, log = self._white(one, rest, some)
-            found.append(white)
+        white_parts, log_determinant = list[FloatArray](), 0.0
+        for recording, some in zip(self.recordings, columns, strict=True):
+            white, log = self._white(recording, noise, some)
+            white_parts.append(white)
             log_determinant += log
-        return np.concatenate(found, axis=1), log_determinant
+        return np.concatenate(white_parts, axis=1), log_determinant
 
-    def weighed(self, arms: Sequence[Arm], rest: Rest, limits: Limits | None = None) -> tuple[FloatArray, FloatArray]:
+    def weighed(
+        self, arms: Sequence[Arm], noise: NoiseModel, limits: Limits | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """The log-likelihood of each arm with its best gain, and that gain; for ``limits`` of None the gain is given.
 
         Returns:
@@ -329,30 +345,31 @@ class Measured:
         """
         records = self._records(arms)
         c = len(self.sensors)  # the measurements, and for each sensor but the first whether it is that
-        products, own, log_determinant = np.zeros((len(arms), 2, 2 + c)), np.zeros((c, c)), 0.0
-        for one in self.recordings:
-            white, log = self._white(one, rest, self._columns(one))
-            own, log_determinant = own + white @ white.T, log_determinant + log
-            found, noise, variance = np.empty_like(products), self._noise(rest), self._variance(one, rest)
-            records["start"] = one.start
+        products, columns_alone, log_determinant = np.zeros((len(arms), 2, 2 + c)), np.zeros((c, c)), 0.0
+        for recording in self.recordings:
+            white, log = self._white(recording, noise, self._columns(recording))
+            columns_alone, log_determinant = columns_alone + white @ white.T, log_determinant + log
+            products_here, record = np.empty_like(products), self._noise_record(noise)
+            variance = self._variance(recording, noise)
+            records["start"] = recording.start
             library.pf_weigh(
-                at(noise), len(one.time), at(one.time), at(variance), c, at(white), len(one.given),
-                at(one.given), at(one.command), len(arms), at(records), at(found),
+                at(record), len(recording.time), at(recording.time), at(variance), c, at(white), len(recording.told),
+                at(recording.told), at(recording.command), len(arms), at(records), at(products_here),
             )  # fmt: skip
-            products += found
+            products += products_here
         plain, more = products[:, 0], products[:, 1]
         left = np.zeros((len(arms), 1 + c, 1 + c))  # products of what the plain response leaves, gain, and biases
-        left[:, 0, 0] = own[0, 0] - 2.0 * plain[:, 2] + plain[:, 0]
+        left[:, 0, 0] = columns_alone[0, 0] - 2.0 * plain[:, 2] + plain[:, 0]
         left[:, 0, 1] = left[:, 1, 0] = more[:, 2] - plain[:, 1]
         left[:, 1, 1] = more[:, 1]
-        left[:, 2:, 2:] = own[1:, 1:]
-        left[:, 0, 2:] = left[:, 2:, 0] = own[0, 1:] - plain[:, 3:]
+        left[:, 2:, 2:] = columns_alone[1:, 1:]
+        left[:, 0, 2:] = left[:, 2:, 0] = columns_alone[0, 1:] - plain[:, 3:]
         left[:, 1, 2:] = left[:, 2:, 1] = more[:, 3:]
         free = [*range(1, 1 + c)]
         if limits is None:
-            given = np.array([arm.gain for arm in arms]) - 1.0
-            left[:, 0, 0] += given * (given * left[:, 1, 1] - 2.0 * left[:, 0, 1])
-            left[:, 0, 2:] -= given[:, None] * left[:, 1, 2:]
+            beyond_one = np.array([arm.gain for arm in arms]) - 1.0
+            left[:, 0, 0] += beyond_one * (beyond_one * left[:, 1, 1] - 2.0 * left[:, 0, 1])
+            left[:, 0, 2:] -= beyond_one[:, None] * left[:, 1, 2:]
             left[:, 2:, 0] = left[:, 0, 2:]
             free = free[1:]
         else:
@@ -367,12 +384,12 @@ class Measured:
         log = -0.5 * (np.maximum(squares, 0.0) + log_determinant + self.count * _LOG_2PI)
         return np.asarray(log, dtype=np.float64), np.asarray(gain, dtype=np.float64)
 
-    def fitted(self, start: Arm, names: Coordinates, rest: Rest, limits: Limits) -> Fit:
+    def fitted(self, start: Arm, names: Coordinates, noise: NoiseModel, limits: Limits) -> Fit:
         """The arm of the highest posterior near another one, by Gauss and Newton."""
         low, high = limits.range(names)
         reach = np.array([_REACH[name] for name in names])
         arm = start.moved(names, np.clip([start.coordinate(name) for name in names], low, high).tolist())
-        best = self._linear(arm, names, rest, limits)
+        best = self._linear(arm, names, noise, limits)
         for _ in range(_STEPS if names else 0):
             here = np.array([best.arm.coordinate(name) for name in names])
             for damping in _DAMPINGS:
@@ -380,7 +397,7 @@ class Measured:
                 step = bounded_step(best.score, best.information, *ends, np.full(len(names), damping))
                 if float(best.score @ step) - 0.5 * float(step @ best.information @ step) < _CLOSE:
                     return Fit(best.arm, best.log_posterior, best.information)
-                trial = self._linear(best.arm.moved(names, (here + step).tolist()), names, rest, limits)
+                trial = self._linear(best.arm.moved(names, (here + step).tolist()), names, noise, limits)
                 if trial.log_posterior > best.log_posterior:
                     best = trial
                     break
@@ -389,7 +406,7 @@ class Measured:
         return Fit(best.arm, best.log_posterior, best.information)
 
     def lag_variances(
-        self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits, pieces: int, lag: Callable[[Arm], float]
+        self, arm: Arm, names: Coordinates, noise: NoiseModel, limits: Limits, pieces: int, lag: Callable[[Arm], float]
     ) -> tuple[float, float]:
         """The variance of a lag [s²] by the information, and by the scatter of the score over pieces of the recordings.
 
@@ -397,37 +414,37 @@ class Measured:
         """
         free = [name for name, inside in zip(names, limits.inside(arm, names), strict=True) if inside]
         beside = [arm.moved([name], [arm.coordinate(name) + _NUDGE]) for name in free]
-        slope = np.array([(lag(one) - lag(arm)) / _NUDGE for one in beside])
-        left, slopes, _ = self._sloped(arm, free, rest)
+        slope = np.array([(lag(arm_beside) - lag(arm)) / _NUDGE for arm_beside in beside])
+        left, slopes, _ = self._sloped(arm, free, noise)
         scores = np.add.reduceat(slopes * left, np.unique(np.arange(pieces) * len(left) // pieces), axis=1)
-        weight = covariance(self._linear(arm, free, rest, limits).information) @ slope
+        weight = covariance(self._linear(arm, free, noise, limits).information) @ slope
         return float(slope @ weight), float(np.sum((weight @ scores) ** 2))
 
-    def likeliest(self, arms: Sequence[Arm], rest: Rest, limits: Limits | None, count: int) -> list[Arm]:
+    def likeliest(self, arms: Sequence[Arm], noise: NoiseModel, limits: Limits | None, count: int) -> list[Arm]:
         """The likeliest of some arms, the best first, each with its best gain; for ``limits`` of None with its own."""
-        log, gain = self.weighed(arms, rest, limits)
-        return [arms[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:count].tolist()]
+        log, gain = self.weighed(arms, noise, limits)
+        return [arms[number]._replace(gain=float(gain[number])) for number in np.argsort(-log)[:count].tolist()]
 
-    def _linear(self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits) -> _Linear:
+    def _linear(self, arm: Arm, names: Coordinates, noise: NoiseModel, limits: Limits) -> _Linear:
         """Posterior, score and information at an arm."""
-        left, slopes, log_determinant = self._sloped(arm, names, rest)
+        left, slopes, log_determinant = self._sloped(arm, names, noise)
         information, score = slopes @ slopes.T, slopes @ left
-        for place, name in enumerate(names):
+        for row, name in enumerate(names):
             if name in limits.priors:
                 mean, sd = limits.priors[name]
-                information[place, place] += 1.0 / sd**2
-                score[place] -= (arm.coordinate(name) - mean) / sd**2
+                information[row, row] += 1.0 / sd**2
+                score[row] -= (arm.coordinate(name) - mean) / sd**2
         log = -0.5 * (float(left @ left) + log_determinant + self.count * _LOG_2PI)
         return _Linear(arm, log + limits.log_prior(arm, names), score, information)
 
-    def _sloped(self, arm: Arm, names: Coordinates, rest: Rest) -> tuple[FloatArray, FloatArray, float]:
+    def _sloped(self, arm: Arm, names: Coordinates, noise: NoiseModel) -> tuple[FloatArray, FloatArray, float]:
         """What an arm leaves and how it changes with each coordinate, whitened, without biases; the sum of log S."""
         moved = self._derivatives(arm, names)
         columns = [
-            np.vstack([one.value - rows[0], rows[1:], self._columns(one)[1:]])
-            for one, rows in zip(self.recordings, moved, strict=True)
+            np.vstack([recording.value - rows[0], rows[1:], self._columns(recording)[1:]])
+            for recording, rows in zip(self.recordings, moved, strict=True)
         ]
-        white, log_determinant = self.whitened(rest, columns)
+        white, log_determinant = self.whitened(noise, columns)
         left, slopes, others = np.split(white, [1, 1 + len(names)])
         if len(others):
             basis = np.linalg.qr(others.T)[0]
@@ -440,10 +457,10 @@ class Measured:
         if self._is_linear(arm):
             steps = [1.0 if name in ("gain", "slope") else step for name, step in zip(names, steps, strict=True)]
         beside = [arm.moved([name], [arm.coordinate(name) + step]) for name, step in zip(names, steps, strict=True)]
-        found = self._responses([arm, *beside])
-        for moved in found:
+        responses = self._responses([arm, *beside])
+        for moved in responses:
             moved[1:] = (moved[1:] - moved[0]) / np.array(steps)[:, None]
-        return found
+        return responses
 
     def _is_linear(self, arm: Arm) -> bool:
         return not any((arm.play, arm.max_speed, arm.beyond, arm.below)) and not self.sags
@@ -453,52 +470,56 @@ class Measured:
         """Whether the axis is known to sag."""
         return self._known is not None and self._known.sag is not None
 
-    def _columns(self, one: Recording) -> FloatArray:
+    def _columns(self, recording: Recording) -> FloatArray:
         """The measurements, and for each sensor but the first which are its, (s, m)."""
         return np.array(
-            [one.value, *((one.source == other).astype(np.float64) for other in range(1, len(self.sensors)))]
+            [
+                recording.value,
+                *((recording.source == other).astype(np.float64) for other in range(1, len(self.sensors))),
+            ]
         )
 
     def _responses(self, arms: Sequence[Arm]) -> list[FloatArray]:
         """The responses of arms, for each recording (n, m)."""
-        records, found = self._records(arms), list[FloatArray]()
-        for one in self.recordings:
-            records["start"] = one.start
-            moved = np.empty((len(arms), len(one.time)))
-            commands = len(one.given), at(one.given), at(one.command)
-            library.pf_response(len(arms), at(records), *commands, len(one.time), at(one.time), at(moved))
-            found.append(moved)
-        return found
+        records, responses = self._records(arms), list[FloatArray]()
+        for recording in self.recordings:
+            records["start"] = recording.start
+            moved = np.empty((len(arms), len(recording.time)))
+            commands = len(recording.told), at(recording.told), at(recording.command)
+            library.pf_response(len(arms), at(records), *commands, len(recording.time), at(recording.time), at(moved))
+            responses.append(moved)
+        return responses
 
     def _records(self, arms: Sequence[Arm]) -> Record:
         """Arms as the core takes them, (n,)."""
-        found, columns = np.zeros(len(arms), AXIS), np.array(arms).T
+        records, columns = np.zeros(len(arms), AXIS), np.array(arms).T
         delay, lag, damping, recovery, gain, slope, play, max_speed, *sag = columns
         if self._known is not None:
-            found[:] = record_of(self._known, self.period, 0.0, 0.0)
-        found["period"], found["delay"] = self.period, delay
-        found["time_constant"] = np.where(damping > 0.0, 0.0, lag)
-        found["natural_frequency"], found["damping"] = 2.0 * damping / lag, damping
-        found["slope"], found["intercept"], found["recovery"] = slope, gain, recovery
-        found["play"], found["max_speed"] = play, max_speed
+            records[:] = record_of(self._known, self.period, 0.0, 0.0)
+        records["period"], records["delay"] = self.period, delay
+        records["time_constant"] = np.where(damping > 0.0, 0.0, lag)
+        records["natural_frequency"], records["damping"] = 2.0 * damping / lag, damping
+        records["slope"], records["intercept"], records["recovery"] = slope, gain, recovery
+        records["play"], records["max_speed"] = play, max_speed
         for name, knee, other in (("beyond", *sag[:2]), ("below", *sag[2:])):
             where, bent = f"sag_knee{'_below' * (name == 'below')}", other != 0.0
-            found[where][bent], found[f"sag_slope_{name}"][bent] = knee[bent], other[bent]
-        return found
+            records[where][bent], records[f"sag_slope_{name}"][bent] = knee[bent], other[bent]
+        return records
 
-    def _variance(self, one: Recording, rest: Rest) -> FloatArray:
-        return np.where(one.weight > 0.0, np.square(rest.sd)[one.source], np.inf)
+    def _variance(self, recording: Recording, noise: NoiseModel) -> FloatArray:
+        return np.where(recording.weight > 0.0, np.square(noise.sd)[recording.source], np.inf)
 
-    def _noise(self, rest: Rest) -> Record:
-        found = np.zeros(1, _NOISE)
-        found[0] = rest.walk, self._offset, rest.disturbance_sd, rest.disturbance_time, rest.smoothness
-        return found
+    def _noise_record(self, noise: NoiseModel) -> Record:
+        record = np.zeros(1, _NOISE)
+        record[0] = noise.walk, self._offset, noise.disturbance_sd, noise.disturbance_time, noise.smoothness
+        return record
 
-    def _white(self, one: Recording, rest: Rest, columns: FloatArray) -> tuple[FloatArray, float]:
-        noise, variance, white, log = self._noise(rest), self._variance(one, rest), np.empty_like(columns), np.empty(1)
-        library.pf_whiten(
-            at(noise), len(one.time), at(one.time), at(variance), len(columns), at(columns), at(white), at(log)
-        )
+    def _white(self, recording: Recording, noise: NoiseModel, columns: FloatArray) -> tuple[FloatArray, float]:
+        record, variance, white, log = (
+            self._noise_record(noise), self._variance(recording, noise), np.empty_like(columns), np.empty(1)
+        )  # fmt: skip
+        rows = len(recording.time), at(recording.time), at(variance)
+        library.pf_whiten(at(record), *rows, len(columns), at(columns), at(white), at(log))
         return white, float(log[0])
 
 
@@ -509,20 +530,20 @@ def lonely(far: BoolArray) -> BoolArray:
     return far & (in_a_row <= _FEW)
 
 
-def _liveliest(one: Recording, most: int, begin: int, end: int) -> Recording:
+def _liveliest(recording: Recording, most: int, begin: int, end: int) -> Recording:
     """What was measured while so many commands moved most, of those between two; with commands that still act then."""
-    if len(one.given) <= most:
-        return one
+    if len(recording.told) <= most:
+        return recording
     most = min(most, end - begin)
     firsts = np.append(np.arange(begin, end - most, max(most // 2, 1)), end - most)
-    way = np.append(0.0, np.cumsum(np.abs(np.diff(one.command))))
-    first = int(max(firsts, key=lambda place: way[place + most - 1] - way[place]))
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(recording.command))))
+    first = int(max(firsts, key=lambda row: way[row + most - 1] - way[row]))
     last = first + most - 1
-    part = one.of((one.time >= one.given[first]) & (one.time <= one.given[last]))
-    act = int(np.searchsorted(one.given, int(one.given[first]) - round(_SETTLED * 1e9)))
-    start = float(one.command[act]) if act else one.start
-    given, command = one.given[act : last + 1], one.command[act : last + 1]
-    return part._replace(given=given, command=command, start=start, value=part.value + one.start - start)
+    part = recording.of((recording.time >= recording.told[first]) & (recording.time <= recording.told[last]))
+    act = int(np.searchsorted(recording.told, int(recording.told[first]) - round(_SETTLED * 1e9)))
+    start = float(recording.command[act]) if act else recording.start
+    times, command = recording.told[act : last + 1], recording.command[act : last + 1]
+    return part._replace(told=times, command=command, start=start, value=part.value + recording.start - start)
 
 
 def covariance(information: FloatArray, scale: float | Sequence[float] = 1.0) -> FloatArray:
@@ -541,22 +562,22 @@ class _Linear(NamedTuple):
     information: FloatArray
 
 
-# ---- the rest -------------------------------------------------------------------------------------------------------
+# ---- the noise ------------------------------------------------------------------------------------------------------
 
 
-def rests(
+def noise_models(
     measured: Measured, arm: Arm, quickest: float, least: Sequence[float], believed: bool = False
-) -> Iterator[tuple[Rest, float]]:
-    """The most likely rest that an arm leaves, without a disturbance and with one of each kind, and its log-posterior.
+) -> Iterator[tuple[NoiseModel, float]]:
+    """The most likely noise that an arm leaves, without a disturbance and with one of each kind, and its log-posterior.
 
     A disturbance is not quicker than ``quickest`` [s], the noise of each sensor is at ``least`` that [m], and it may be
     ``believed`` to be what second differences show.
     """
     from scipy.optimize import minimize  # takes 0.2 s to import
 
-    left = [one[None] for one in measured.residuals(arm)]
-    spread = max(float(np.std(np.concatenate([one[0] for one in left]))), 1e-7)
-    sensors = [(max(one, _SDS[0]), _SDS[1]) for one in least]
+    left = [residual[None] for residual in measured.residuals(arm)]
+    spread = max(float(np.std(np.concatenate([row[0] for row in left]))), 1e-7)
+    sensors = [(max(sd, _SDS[0]), _SDS[1]) for sd in least]
     white = np.clip(measured.jitter(arm), *np.transpose(sensors))
     s, means = len(white), np.log(np.maximum(white, least))
     for smoothness in (0.0, 1.5, 0.5):
@@ -564,15 +585,15 @@ def rests(
         if smoothness:
             begin, bounds = [0.01 * spread, 0.7 * spread, _TIME], [*bounds, _SDS, (quickest, _TIMES[1])]
 
-        def rest_of(x: FloatArray, smoothness: float = smoothness) -> Rest:
+        def model_of(x: FloatArray, smoothness: float = smoothness) -> NoiseModel:
             sd, (walk, *disturbance) = np.exp(x[:s]), np.exp(x[s:]).tolist()
-            return Rest(sd, walk, disturbance[0], disturbance[1], smoothness) if disturbance else Rest(sd, walk)
+            return NoiseModel(sd, walk, *disturbance, smoothness=smoothness) if disturbance else NoiseModel(sd, walk)
 
-        def cost(x: FloatArray, rest_of: Callable[[FloatArray], Rest] = rest_of) -> float:
-            white, log_determinant = measured.whitened(rest_of(x), left)
-            found = 0.5 * (float(np.vdot(white, white)) + log_determinant + measured.count * _LOG_2PI)
-            return found + 0.5 * float(np.sum(((x[:s] - means) / BELIEF) ** 2)) * believed
+        def cost(x: FloatArray, model_of: Callable[[FloatArray], NoiseModel] = model_of) -> float:
+            white, log_determinant = measured.whitened(model_of(x), left)
+            loss = 0.5 * (float(np.vdot(white, white)) + log_determinant + measured.count * _LOG_2PI)
+            return loss + 0.5 * float(np.sum(((x[:s] - means) / BELIEF) ** 2)) * believed
 
         at, options = np.log([*white, *begin]), {"ftol": 1e-3, "eps": 1e-4}
-        found = minimize(cost, at, method="SLSQP", bounds=np.log(bounds), options=options)
-        yield rest_of(found.x), -found.fun
+        minimum = minimize(cost, at, method="SLSQP", bounds=np.log(bounds), options=options)
+        yield model_of(minimum.x), -minimum.fun

@@ -45,24 +45,24 @@ class Bent(NamedTuple):
 
     def sentences(self, screen: Screen) -> list[str]:
         """What it has, and what that is worth, in the units of its axis."""
-        play, fastest = (one * screen.scale for one in (self.arm.play, self.arm.max_speed))
-        found = [f"play: about {play:.3g} {screen.unit}"] if play else []
-        found += [f"fastest speed: about {fastest:.4g} {screen.unit}/s"] if fastest else []
+        play, fastest = (size * screen.scale for size in (self.arm.play, self.arm.max_speed))
+        sentences = [f"play: about {play:.3g} {screen.unit}"] if play else []
+        sentences += [f"fastest speed: about {fastest:.4g} {screen.unit}/s"] if fastest else []
         sides = ("above", self.arm.knee, self.arm.beyond), ("below", self.arm.knee_below, self.arm.below)
         for where, knee, slope in sides:
             if slope:
                 times = f"{1.0 + slope:.3g} times as far as elsewhere"
-                found.append(f"sag: {where} about {knee * screen.scale:.3g} {screen.unit} it moves {times}")
+                sentences.append(f"sag: {where} about {knee * screen.scale:.3g} {screen.unit} it moves {times}")
         off, linear = self.off * screen.scale, self.linear_off * screen.scale
-        return [*found, f"with it {off:.3g} {screen.unit} off where it was not fitted, without it {linear:.3g}"]
+        return [*sentences, f"with it {off:.3g} {screen.unit} off where it was not fitted, without it {linear:.3g}"]
 
 
-def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
+def bent_arm(plain: PlainArm, arm: Arm, free: Collection[str]) -> Bent | None:
     """The least-squares arm with what pays of play, a fastest speed and a sag; None for a linear axis.
 
-    What is known of it and not ``free`` stays as ``given``; dead time and lag are free.
+    What is known of it and not ``free`` stays as ``arm``; dead time and lag are free.
     """
-    search = _Search(plain, given, free)
+    search = _Search(plain, arm, free)
     if min(half.count for half in search.halves) < _FEWEST:
         return None
     chosen: list[str] = []
@@ -81,7 +81,7 @@ def bent_arm(plain: PlainArm, given: Arm, free: Collection[str]) -> Bent | None:
             squares.append(tried[best])
     if not chosen:
         return None
-    linear, bent = (float(np.sqrt(one.mean())) for one in (squares[0], squares[-1]))
+    linear, bent = (float(np.sqrt(mean_squares.mean())) for mean_squares in (squares[0], squares[-1]))
     return Bent(search.whole(chosen), bent, linear)
 
 
@@ -93,21 +93,21 @@ def _pays(kind: str, left: FloatArray, before: FloatArray) -> bool:
 
 def _beside(chosen: Sequence[str], kind: str) -> list[str]:
     """One bend more; of sags there is one."""
-    return [*(one for one in chosen if one not in _SAGS or kind not in _SAGS), kind]
+    return [*(bend for bend in chosen if bend not in _SAGS or kind not in _SAGS), kind]
 
 
 class _Search:
     """Arms of least squares with and without bends, of all of the motion and of its halves."""
 
-    def __init__(self, plain: PlainArm, given: Arm, free: Collection[str]) -> None:
+    def __init__(self, plain: PlainArm, arm: Arm, free: Collection[str]) -> None:
         self.measured, self._names = _looked_at(plain), [name for name in _ANY if name in free]
-        told = np.concatenate([one.command for one in self.measured.recordings])
+        told = np.concatenate([recording.command for recording in self.measured.recordings])
         self._low, self._high = float(told.min()), float(told.max())
         self._middle = 0.5 * (self._low + self._high)
         sag = {name: (self._low, self._high) if name.startswith("knee") else BEYOND for name in SAG}
         self._limits = Limits({**_ANY, **BENDS, **sag}, {})
-        self._rest = self.measured.white(plain.arm)
-        self._start = given._replace(delay=plain.arm.delay, lag=plain.arm.lag, play=0.0, max_speed=0.0)
+        self._noise = self.measured.white(plain.arm)
+        self._start = arm._replace(delay=plain.arm.delay, lag=plain.arm.lag, play=0.0, max_speed=0.0)
         if "gain" in free:
             self._start = self._start._replace(gain=plain.arm.gain, recovery=0.0, slope=0.0)
         self._wholes: dict[tuple[str, ...], Arm] = {}
@@ -115,7 +115,7 @@ class _Search:
         self._free = free
         self.halves = _halves(self.measured)
         first, parts = self.halves[0].recordings, self.measured.recordings
-        counts = [one.weight[part.weight > 0.0] > 0.0 for one, part in zip(first, parts, strict=True)]
+        counts = [half.weight[part.weight > 0.0] > 0.0 for half, part in zip(first, parts, strict=True)]
         self._rows = np.concatenate(counts)  # of the first half, among those that count
 
     def seems(self, kind: str, chosen: Sequence[str]) -> bool:
@@ -139,12 +139,12 @@ class _Search:
     def _size(self, kind: str, arm: Arm) -> dict[str, float]:
         """The likeliest play or fastest speed on a rough grid; none where all that may be is too small."""
         sd, fastest = float(np.std(self.measured.left(arm))), _fastest(self.measured, arm)
-        sizes = [sd * one for one in _WIDTHS] if kind == "play" else [fastest * one for one in _SPEEDS]
+        sizes = [sd * width for width in _WIDTHS] if kind == "play" else [fastest * share for share in _SPEEDS]
         if min(sizes) <= BENDS[kind][0]:
             return {}
         shares = product((arm.delay * _SOONER).tolist(), (arm.lag * _SOONER[1:]).tolist(), sizes)
         arms = [arm._replace(delay=delay, lag=lag, **{kind: size}) for delay, lag, size in shares]
-        log, _ = self.measured.weighed(arms, self._rest, self._limits)
+        log, _ = self.measured.weighed(arms, self._noise, self._limits)
         return {kind: getattr(arms[int(np.argmax(log))], kind)}
 
     def _knees(self, arm: Arm, count: int) -> dict[str, float]:
@@ -162,8 +162,8 @@ class _Search:
         middle = 1 if count == 2 or abs(math.log(gains[1])) < abs(math.log(gains[0])) else 0
         gain, start = gains[middle] if "gain" in self._names else arm.gain, self.measured.recordings[0].start
         made = {"gain": gain} if "gain" in self._names else {}
-        for place, knee in enumerate(knees):
-            at, slope, piece = (*SAG[2:], place) if place < middle else (*SAG[:2], place + 1)
+        for number, knee in enumerate(knees):
+            at, slope, piece = (*SAG[2:], number) if number < middle else (*SAG[:2], number + 1)
             made[at] = start + (knee - start) * gain / arm.gain
             made[slope] = min(max(gains[piece] / gains[middle] - 1.0, BEYOND[0]), BEYOND[1])
         return made
@@ -181,20 +181,20 @@ class _Search:
         """The arm of least squares with these bends of all of the motion, of first or second order."""
         if (key := tuple(kinds)) not in self._wholes:
             start = self._start._replace(**{name: size for kind in kinds for name, size in self._starts[kind].items()})
-            found = [self._fitted(self.measured, start._replace(damping=0.0), kinds)]
-            first = found[0].arm
+            fits = [self._fitted(self.measured, start._replace(damping=0.0), kinds)]
+            first = fits[0].arm
             for earlier in _EARLIER if "damping" in self._names else ():  # dead time and plant make up for each other
                 by = earlier * first.delay
                 second = first._replace(delay=first.delay - by, lag=first.lag + by, damping=1.0)
-                found.append(self._fitted(self.measured, second, kinds))
-            self._wholes[key] = max(found, key=lambda one: one.log_posterior).arm
+                fits.append(self._fitted(self.measured, second, kinds))
+            self._wholes[key] = max(fits, key=lambda fit: fit.log_posterior).arm
         return self._wholes[key]
 
     def off(self, kinds: Sequence[str]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
         first, second = self.halves
         pairs = (first, second), (second, first)
-        return np.array([_square(there, self._fitted(here, self.whole(kinds), kinds).arm) for here, there in pairs])
+        return np.array([_square(that, self._fitted(here, self.whole(kinds), kinds).arm) for here, that in pairs])
 
     def _fitted(self, measured: Measured, near: Arm, kinds: Sequence[str]) -> Fit:
         """The arm of least squares with these bends near one of the same order."""
@@ -203,43 +203,45 @@ class _Search:
         if "stops" in kinds:  # between them is the middle of what is commanded
             sides = {"knee": (self._middle, self._high), "knee_below": (self._low, self._middle)}
             limits = limits._replace(bounds={**limits.bounds, **sides})
-        return measured.fitted(near, [*names, *bends], self._rest, limits)
+        return measured.fitted(near, [*names, *bends], self._noise, limits)
 
 
 def _best_knees(level: FloatArray, left: FloatArray, count: int, middle: float) -> list[float]:
     """The knees of the line over levels that explains most of what is left, two on both sides of a level; or none."""
     places: list[float] = np.quantile(level, _KNEES).tolist()
     pairs = combinations(range(len(places)), count)
-    every = np.array([one for one in pairs if count == 1 or places[one[0]] <= middle < places[one[1]]], dtype=np.intp)
+    every = np.array(
+        [pair for pair in pairs if count == 1 or places[pair[0]] <= middle < places[pair[1]]], dtype=np.intp
+    )
     if not len(every):
         return []
     straight = np.linalg.qr(np.column_stack([np.ones(len(level)), level]))[0]
     bent = np.column_stack([np.maximum(level - knee, 0.0) for knee in places])
-    rest, bent = left - straight @ (straight.T @ left), bent - straight @ (straight.T @ bent)
-    own, with_rest = bent.T @ bent, (bent.T @ rest)[every]
-    own += 1e-12 * np.diag(own).max() * np.eye(len(places))
+    residual, bent = left - straight @ (straight.T @ left), bent - straight @ (straight.T @ bent)
+    products, with_residual = bent.T @ bent, (bent.T @ residual)[every]
+    products += 1e-12 * np.diag(products).max() * np.eye(len(places))
     shares = np.asarray(
-        np.linalg.solve(own[every[:, :, None], every[:, None, :]], with_rest[:, :, None]), dtype=np.float64
+        np.linalg.solve(products[every[:, :, None], every[:, None, :]], with_residual[:, :, None]), dtype=np.float64
     )
-    explained = np.einsum("ij,ij->i", shares[:, :, 0], with_rest)
-    return [places[one] for one in every[int(np.argmax(explained))].tolist()]
+    explained = np.einsum("ij,ij->i", shares[:, :, 0], with_residual)
+    return [places[number] for number in every[int(np.argmax(explained))].tolist()]
 
 
 def _looked_at(plain: PlainArm) -> Measured:
     """What least squares look at, with what is far from a linear arm for many rows: it may be where a load holds it."""
     parts = list[Recording]()
-    for one, near in zip(plain.whole.recordings, plain.measured.recordings, strict=True):
-        far = (one.weight > 0.0) & (near.weight == 0.0)
-        parts.append(one._replace(weight=np.where(lonely(far), 0.0, one.weight)))
-    found = plain.whole.of(parts)
-    return found if found.count > _MANY * plain.measured.count else plain.measured
+    for recording, near in zip(plain.whole.recordings, plain.measured.recordings, strict=True):
+        far = (recording.weight > 0.0) & (near.weight == 0.0)
+        parts.append(recording._replace(weight=np.where(lonely(far), 0.0, recording.weight)))
+    counted = plain.whole.of(parts)
+    return counted if counted.count > _MANY * plain.measured.count else plain.measured
 
 
 def _fastest(measured: Measured, arm: Arm) -> float:
     """The speed that an arm hardly ever exceeds between two measurements [m/s]."""
     parts = [
-        np.abs(np.diff(moved)) / np.maximum(np.diff(one.time), 1) * 1e9
-        for moved, one in zip(measured.responses(arm), measured.recordings, strict=True)
+        np.abs(np.diff(moved)) / np.maximum(np.diff(recording.time), 1) * 1e9
+        for moved, recording in zip(measured.responses(arm), measured.recordings, strict=True)
     ]
     return float(np.quantile(np.concatenate(parts), _FASTEST))
 
@@ -247,7 +249,7 @@ def _fastest(measured: Measured, arm: Arm) -> float:
 def _levels(measured: Measured, arm: Arm) -> FloatArray:
     """Where an arm without a sag is, as logged, at the measurements that count [m]."""
     parts = zip(measured.recordings, measured.responses(arm), strict=True)
-    return np.concatenate([(one.start + moved)[one.weight > 0.0] for one, moved in parts])
+    return np.concatenate([(recording.start + moved)[recording.weight > 0.0] for recording, moved in parts])
 
 
 def _square(measured: Measured, arm: Arm) -> float:
@@ -258,10 +260,10 @@ def _square(measured: Measured, arm: Arm) -> float:
 def _halves(measured: Measured) -> tuple[Measured, Measured]:
     """The measurements of every second part of the time, and the others."""
 
-    def half(one: Recording, which: int) -> Recording:
-        since = one.time - one.time[:1]
+    def half(recording: Recording, which: int) -> Recording:
+        since = recording.time - recording.time[:1]
         part = since * _PARTS // (since[-1:] + 1)
-        return one._replace(weight=np.where(part % 2 == which, one.weight, 0.0))
+        return recording._replace(weight=np.where(part % 2 == which, recording.weight, 0.0))
 
-    first, second = (measured.of([half(one, which) for one in measured.recordings]) for which in (0, 1))
+    first, second = (measured.of([half(recording, which) for recording in measured.recordings]) for which in (0, 1))
     return first, second

@@ -75,12 +75,12 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
             raise TuneError(f"{axis}: only {count} measurements; a fit needs at least {FEWEST}")
     if not likelihood.count.any():
         raise TuneError("no measurement of a configured sensor lies within the runs: nothing to fit to")
-    found: list[str] = []
+    axes: list[str] = []
     for axis, names in likelihood.sensors.items():
         noise = min(likelihood.scatter.get((name, axis), 0.0) for name in names)
         if likelihood.travel[axis] > _EXCITED * noise:
-            found.append(axis)
-    if not found:
+            axes.append(axis)
+    if not axes:
         if refused := [fault.sentence for fault in likelihood.faults(config) if fault.refused]:
             raise TuneError(refused[0])  # in another unit the noise seems large
         widest = max(likelihood.travel, key=likelihood.travel.__getitem__)
@@ -97,9 +97,9 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
                 " stamped by one clock?"
             )
     for fault in likelihood.faults(config):
-        if fault.lost and not set(fault.axes).isdisjoint(found):
+        if fault.lost and not set(fault.axes).isdisjoint(axes):
             raise LostError(fault)
-    return found
+    return axes
 
 
 def least_count(likelihood: Likelihood) -> int:
@@ -111,10 +111,10 @@ def for_few(likelihood: Likelihood, free: Sequence[Parameter]) -> list[Parameter
     """The parameters that as many measurements as there are can tell."""
     few = {axis for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True) if count < FEW}
     return [
-        one
-        for one in free
-        if one.axis not in few
-        or not (one.path[-1] in _OF_MANY or (one.fit == "plant" and one.path[-1] != "time_constant"))
+        parameter
+        for parameter in free
+        if parameter.axis not in few
+        or not (parameter.path[-1] in _OF_MANY or (parameter.fit == "plant" and parameter.path[-1] != "time_constant"))
     ]
 
 
@@ -122,7 +122,7 @@ def few_measurements(likelihood: Likelihood, free: Sequence[Parameter]) -> list[
     """A sentence for each axis with too few measurements for as many numbers, or for some kinds of numbers."""
     many, few = list[str](), list[str]()
     for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True):
-        if count < _ENOUGH * (numbers := sum(one.axis == axis for one in free)):
+        if count < _ENOUGH * (numbers := sum(parameter.axis == axis for parameter in free)):
             many.append(
                 f"{axis}: {count} measurements for {numbers} numbers to fit: with fewer than {_ENOUGH} for each, noise"
                 " and motion are hard to tell apart and error bars need not hold; fit less, or record for longer"
@@ -140,12 +140,12 @@ def few_measurements(likelihood: Likelihood, free: Sequence[Parameter]) -> list[
 
 def covariance(information: FloatArray, free: Sequence[Parameter]) -> FloatArray:
     """The covariance of the coordinates, (k, k), from the information (k, k); without information it is enormous."""
-    return arms.covariance(information, [one.scale for one in free])
+    return arms.covariance(information, [parameter.scale for parameter in free])
 
 
 def within_bounds(free: Sequence[Parameter], config: FusionConfig) -> list[Parameter]:
     """The parameters that are at neither bound."""
-    return [one for one in free if one.at_bound(config) is None]
+    return [parameter for parameter in free if parameter.at_bound(config) is None]
 
 
 def correlations(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[Correlation]:
@@ -167,20 +167,22 @@ def not_identifiable(likelihood: Likelihood, best: Point, free: Sequence[Paramet
     a tenth of the gain. The one to fix is a latency first, that of the sensor with the least noise.
     """
     inside = within_bounds(free, best.config)
-    arm = [number for number, one in enumerate(inside) if one.fit in _FIXED_FIRST]
+    arm = [number for number, parameter in enumerate(inside) if parameter.fit in _FIXED_FIRST]
     if not arm:
         return None
-    found = likelihood.derivatives(best.config, inside, best.outcomes)
-    cov = covariance(found.information, inside)[np.ix_(arm, arm)]
+    derivatives = likelihood.derivatives(best.config, inside, best.outcomes)
+    cov = covariance(derivatives.information, inside)[np.ix_(arm, arm)]
     scale = np.array([inside[number].scale for number in arm])
     values, vectors = np.linalg.eigh(cov / np.outer(scale, scale))
     if values[-1] < 1.0:
         return None
     weight = np.abs(vectors[:, -1])
-    order = [int(place) for place in np.argsort(-weight) if weight[place] > _MEMBER * weight.max()]
-    members = [inside[arm[place]] for place in order]
-    fixed = min(members, key=lambda one: (_FIXED_FIRST.index(one.fit), _noise_of(one, best.config), one.key))
-    return NotIdentifiable(tuple(one.key for one in members), fixed.key)
+    order = [int(number) for number in np.argsort(-weight) if weight[number] > _MEMBER * weight.max()]
+    members = [inside[arm[number]] for number in order]
+    fixed = min(
+        members, key=lambda member: (_FIXED_FIRST.index(member.fit), _noise_of(member, best.config), member.key)
+    )
+    return NotIdentifiable(tuple(member.key for member in members), fixed.key)
 
 
 def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[Parameter]:
@@ -190,9 +192,13 @@ def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[P
     """
     inside = within_bounds(free, best.config)
     cov = covariance(derivatives(likelihood, best, inside).information, inside)
-    wide = {one.key for one, variance in zip(inside, np.diag(cov), strict=True) if variance > 1.0}
-    noises = [one for one in free if one.is_noise or "bias_drift_sd" in one.path]
-    return [one for one in noises if one.prior is None and (one.key in wide or one.at_bound(best.config) == "lower")]
+    wide = {parameter.key for parameter, variance in zip(inside, np.diag(cov), strict=True) if variance > 1.0}
+    noises = [parameter for parameter in free if parameter.is_noise or "bias_drift_sd" in parameter.path]
+    return [
+        noise
+        for noise in noises
+        if noise.prior is None and (noise.key in wide or noise.at_bound(best.config) == "lower")
+    ]
 
 
 def shared_times(
@@ -203,34 +209,45 @@ def shared_times(
     One of each group of sensors and moving ``axes`` that are connected by measurements, that of the most accurate,
     unless a delay or a latency among them is known; and that of each sensor which measures no axis that moves.
     """
-    delays = {one.axis: one for one in free if one.fit == "delay"}
-    latencies = {one.sensor: one for one in free if one.fit == "latency"}
+    delays = {parameter.axis: parameter for parameter in free if parameter.fit == "delay"}
+    latencies = {parameter.sensor: parameter for parameter in free if parameter.fit == "latency"}
     groups: list[tuple[set[str], set[str]]] = []  # axes and sensors that are connected
     for axis in axes:
         joined = [group for group in groups if group[1] & {*sensors[axis]}]
         groups = [group for group in groups if group not in joined]
-        groups.append(({axis}.union(*(one for one, _ in joined)), {*sensors[axis]}.union(*(one for _, one in joined))))
+        groups.append(
+            (
+                {axis}.union(*(axes_there for axes_there, _ in joined)),
+                {*sensors[axis]}.union(*(names_there for _, names_there in joined)),
+            )
+        )
     moved = set[str]().union(*(names for _, names in groups))
-    found = [NotIdentifiable((one.key,), one.key) for name, one in latencies.items() if name not in moved]
+    unidentifiable = [
+        NotIdentifiable((latency.key,), latency.key) for name, latency in latencies.items() if name not in moved
+    ]
     for group, names in groups:
         if group <= delays.keys() and names <= latencies.keys():
-            mine = [latencies[name] for name in sorted(names)]
-            fixed = min(mine, key=lambda one: _noise_of(one, config))
-            members = [*mine, *(delays[axis] for axis in sorted(group))]
-            found.append(NotIdentifiable(tuple(one.key for one in members), fixed.key))
-    return found
+            latencies_here = [latencies[name] for name in sorted(names)]
+            fixed = min(latencies_here, key=lambda latency: _noise_of(latency, config))
+            members = [*latencies_here, *(delays[axis] for axis in sorted(group))]
+            unidentifiable.append(NotIdentifiable(tuple(member.key for member in members), fixed.key))
+    return unidentifiable
 
 
 def lone_drifts(
-    sensors: Mapping[str, Sequence[str]], free: Sequence[Parameter], known: FusionConfig
+    sensors: Mapping[str, Sequence[str]], free: Sequence[Parameter], config: FusionConfig
 ) -> list[NotIdentifiable]:
     """The drifts of sensors that measure alone: what they add is as if the arm did it. One that is known stays free."""
     lone = {names[0] for names in sensors.values() if len(names) == 1}
     lone -= {name for names in sensors.values() if len(names) > 1 for name in names}
-    drifts = [one for one in free if one.fit == "bias" and one.path[-1] != "bias_time" and one.sensor in lone]
-    return [NotIdentifiable((one.key,), one.key) for one in drifts if not one.given(known)]
+    drifts = [
+        parameter
+        for parameter in free
+        if parameter.fit == "bias" and parameter.path[-1] != "bias_time" and parameter.sensor in lone
+    ]
+    return [NotIdentifiable((drift.key,), drift.key) for drift in drifts if not drift.configured(config)]
 
 
-def _noise_of(one: Parameter, config: FusionConfig) -> float:
+def _noise_of(parameter: Parameter, config: FusionConfig) -> float:
     """The least noise of the sensor of a parameter [m or rad]; 0 where it has none."""
-    return 0.0 if one.sensor is None else smallest_sd(config, one.sensor)
+    return 0.0 if parameter.sensor is None else smallest_sd(config, parameter.sensor)

@@ -106,61 +106,65 @@ def confidence_intervals(
     best = maximise(likelihood, result, free, outcomes=best.outcomes)
     views = _views(likelihood, best, free)
 
-    def of(one: Parameter) -> ConfidenceInterval:
-        low, high = (_end(views[one.axis], best, one, sign, drawn) for sign in (-1.0, 1.0))
-        peak = one.value(one.at(best.config))
-        value, at = one.clipped(rounded(one.get(result))), one.at_bound(result)
-        log = one.log and not (one.vanishes and low.value <= max(one.bounds[0], _NEXT_TO_NONE * high.value))
+    def of(parameter: Parameter) -> ConfidenceInterval:
+        low, high = (_end(views[parameter.axis], best, parameter, sign, drawn) for sign in (-1.0, 1.0))
+        peak = parameter.value(parameter.at(best.config))
+        value, at = parameter.clipped(rounded(parameter.get(result))), parameter.at_bound(result)
+        log = parameter.log and not (
+            parameter.vanishes and low.value <= max(parameter.bounds[0], _NEXT_TO_NONE * high.value)
+        )
         values, drop = np.array(sorted([*low.curve, (peak, 0.0), *high.curve])).T
         return ConfidenceInterval(
             ci95=(
-                low.value if low.value < value else one.clipped(value - (peak - low.value)),
-                high.value if high.value > value else one.clipped(value + (high.value - peak)),
+                low.value if low.value < value else parameter.clipped(value - (peak - low.value)),
+                high.value if high.value > value else parameter.clipped(value + (high.value - peak)),
             ),
             profiled=low.profiled or high.profiled,
-            at=one.at_bound(best.config),
+            at=parameter.at_bound(best.config),
             open=(low.open or at == "lower", high.open or at == "upper"),
-            profile=Profile(one.key, one.axis, log, values / one.unit, drop),
+            profile=Profile(parameter.key, parameter.axis, log, values / parameter.unit, drop),
         )
 
     asked = free if asked is None else asked
-    return dict(zip([one.key for one in asked], in_threads(of, asked), strict=True))
+    return dict(zip([parameter.key for parameter in asked], in_threads(of, asked), strict=True))
 
 
 def _views(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> Mapping[str | None, _View]:
     """The view of each axis, and under None, where a parameter is shared by all axes, the view of everything."""
     inside = within_bounds(free, best.config)
-    shared = [one for one in inside if one.axis is None]
-    own = {axis: [one for one in inside if one.axis == axis] for axis in likelihood.sensors}
-    parts = {axis: (likelihood.of_axis(axis), likelihood.outcomes_of(axis, best.outcomes)) for axis in own}
+    shared = [parameter for parameter in inside if parameter.axis is None]
+    by_axis = {axis: [parameter for parameter in inside if parameter.axis == axis] for axis in likelihood.sensors}
+    parts = {axis: (likelihood.of_axis(axis), likelihood.outcomes_of(axis, best.outcomes)) for axis in by_axis}
     informed = {
-        axis: _of_shared(part.derivatives(best.config, [*own[axis], *shared], outcomes).information, len(own[axis]))
+        axis: _of_shared(
+            part.derivatives(best.config, [*by_axis[axis], *shared], outcomes).information, len(by_axis[axis])
+        )
         for axis, (part, outcomes) in (parts.items() if shared else ())
     }
     views: dict[str | None, _View] = {}
     for axis, (part, outcomes) in parts.items():
         elsewhere = sum((informed[other] for other in informed if other != axis), np.zeros(len(shared)))
         priors = [
-            replace(one, prior=(one.at(best.config), 1.0 / np.sqrt(max(float(information), 1e-12))))
-            for one, information in zip(shared, elsewhere, strict=True)
+            replace(parameter, prior=(parameter.at(best.config), 1.0 / np.sqrt(max(float(information), 1e-12))))
+            for parameter, information in zip(shared, elsewhere, strict=True)
         ]
-        views[axis] = _view(part, outcomes, best, [*own[axis], *priors])
-    if any(one.axis is None for one in free):
+        views[axis] = _view(part, outcomes, best, [*by_axis[axis], *priors])
+    if any(parameter.axis is None for parameter in free):
         views[None] = _view(likelihood, best.outcomes, best, inside)
     return views
 
 
-def _of_shared(information: FloatArray, own: int) -> FloatArray:
+def _of_shared(information: FloatArray, count: int) -> FloatArray:
     """The information of an axis on each shared parameter, its own being free: the Schur complement's diagonal."""
-    inner = np.linalg.pinv(information[:own, :own], hermitian=True)
-    across = information[:own, own:]
-    return np.diag(information[own:, own:] - across.T @ inner @ across)
+    inner = np.linalg.pinv(information[:count, :count], hermitian=True)
+    across = information[:count, count:]
+    return np.diag(information[count:, count:] - across.T @ inner @ across)
 
 
 def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> _View:
-    there = point(likelihood, best.config, free, outcomes)
-    cov = covariance(derivatives(likelihood, there, free).information, free)
-    return _View(likelihood, outcomes, free, cov, there.log_posterior)
+    peak = point(likelihood, best.config, free, outcomes)
+    cov = covariance(derivatives(likelihood, peak, free).information, free)
+    return _View(likelihood, outcomes, free, cov, peak.log_posterior)
 
 
 class _End(NamedTuple):
@@ -172,13 +176,13 @@ class _End(NamedTuple):
     curve: list[tuple[float, float]]
 
 
-def _end(view: _View, best: Point, one: Parameter, sign: float, drawn: bool) -> _End:
+def _end(view: _View, best: Point, parameter: Parameter, sign: float, drawn: bool) -> _End:
     """The lower (−1) or upper (+1) end of an interval."""
-    if one.at_bound(best.config) == ("lower" if sign < 0.0 else "upper"):
-        return _End(one.get(best.config), True, True, [])
-    side = _Side(view, best, one, sign)
+    if parameter.at_bound(best.config) == ("lower" if sign < 0.0 else "upper"):
+        return _End(parameter.get(best.config), True, True, [])
+    side = _Side(view, best, parameter, sign)
     end, profiled = side.end()
-    value = one.clipped(side.value(end))
+    value = parameter.clipped(side.value(end))
     is_open = profiled and end >= side.limit and side.root(end) < Z95
     return _End(value, profiled, is_open, side.curve(end, profiled) if drawn else [])
 
@@ -200,22 +204,22 @@ class _Side:
         limit: The distance to the parameter's bound.
     """
 
-    def __init__(self, view: _View, best: Point, one: Parameter, sign: float) -> None:
-        self._view, self._best, self._one, self._bound = view, best, one, one.at_bound(best.config)
-        self._others = [other for other in view.free if other.key != one.key]
-        self._every = [*view.free, *([] if self._bound is None else [one])]
+    def __init__(self, view: _View, best: Point, parameter: Parameter, sign: float) -> None:
+        self._view, self._best, self._one, self._bound = view, best, parameter, parameter.at_bound(best.config)
+        self._others = [other for other in view.free if other.key != parameter.key]
+        self._every = [*view.free, *([] if self._bound is None else [parameter])]
         slope, sd = np.zeros(len(self._others)), 1.0
-        for place, other in enumerate(view.free):
-            if other.key == one.key:  # by regression, Cov(·, a) / Var a
-                slope = np.delete(view.covariance[:, place] / view.covariance[place, place], place)
-                sd = float(np.sqrt(view.covariance[place, place]))
-        self._unit, self._start = sign * sd, one.at(best.config)
+        for number, other in enumerate(view.free):
+            if other.key == parameter.key:  # by regression, Cov(·, a) / Var a
+                slope = np.delete(view.covariance[:, number] / view.covariance[number, number], number)
+                sd = float(np.sqrt(view.covariance[number, number]))
+        self._unit, self._start = sign * sd, parameter.at(best.config)
         self._slope = self._unit * slope
-        self._vanishing = self._bound is not None and one.vanishes
+        self._vanishing = self._bound is not None and parameter.vanishes
         self._range = np.array([other.range for other in self._others]).reshape(-1, 2).T
         self._known = {0.0: _Known(0.0, coordinates(best.config, self._others))}  # by distance
-        self._top = view.top + (0.0 if self._bound is None else one.log_prior(best.config))
-        self.limit = self._distance(one.bounds[0 if sign < 0.0 else 1])
+        self._top = view.top + (0.0 if self._bound is None else parameter.log_prior(best.config))
+        self.limit = self._distance(parameter.bounds[0 if sign < 0.0 else 1])
 
     def value(self, distance: float) -> float:
         """The parameter at a distance [SI]."""
@@ -230,7 +234,9 @@ class _Side:
         end = min(Z95, self.limit)
         if self._bound is not None:
             places = [0.5**n * self.limit for n in range(_HALVINGS + 1)]
-            end = places[bisect_left(places, True, hi=_HALVINGS, key=lambda place: _root(self._drop(place)) < Z95)]
+            end = places[
+                bisect_left(places, True, hi=_HALVINGS, key=lambda distance: _root(self._drop(distance)) < Z95)
+            ]
         elif self.limit > Z95:
             drop = self._drop(Z95)
             if abs(drop / (0.5 * Z95**2) - 1.0) < _SKEWED:
@@ -249,23 +255,30 @@ class _Side:
 
     def root(self, distance: float) -> float:
         """The standard deviations that the drop of the profile at a distance stands for."""
-        distance = next((one for one in self._known if math.isclose(one, distance, rel_tol=_SAME)), distance)
+        distance = next(
+            (
+                distance_before
+                for distance_before in self._known
+                if math.isclose(distance_before, distance, rel_tol=_SAME)
+            ),
+            distance,
+        )
         if distance not in self._known:
-            inner = max(one for one in self._known if one < distance)
-            found = self._maximum(distance, self._expected(distance))
-            if _root(found.drop) > _FALLEN * Z95:  # another maximum, perhaps: the one inside goes on
+            inner = max(distance_before for distance_before in self._known if distance_before < distance)
+            maximum = self._maximum(distance, self._expected(distance))
+            if _root(maximum.drop) > _FALLEN * Z95:  # another maximum, perhaps: the one inside goes on
                 beside = self._maximum(distance, self._known[inner].others)
-                found = min(found, beside, key=lambda one: one.drop)
-            self._known[distance] = found
+                maximum = min(maximum, beside, key=lambda point: point.drop)
+            self._known[distance] = maximum
         return _root(self._known[distance].drop)
 
     def _may_be_none(self, distance: float) -> bool:
         """Whether a noise that has not dropped at a distance may be 0: on the way there its profile hardly changes."""
         if not self._one.vanishes or self._unit > 0.0:
             return False
-        found = self._maximum(self.limit, self._known[distance].others)
-        if may_be := _root(found.drop) < Z95:
-            self._known[self.limit] = found
+        maximum = self._maximum(self.limit, self._known[distance].others)
+        if may_be := _root(maximum.drop) < Z95:
+            self._known[self.limit] = maximum
         return may_be
 
     def curve(self, end: float, profiled: bool) -> list[tuple[float, float]]:
@@ -275,13 +288,13 @@ class _Side:
             places = [share * end for share in _SHARES]
         else:
             places = [self._distance(middle + share * (value - middle)) for share in _SHARES]
-        places = [place for place in places if place <= self.limit]
+        places = [distance for distance in places if distance <= self.limit]
         if profiled:
-            for place in places:
-                self.root(place)
-            drops = {place: one.drop for place, one in self._known.items() if 0.0 < place <= max(places)}
+            for distance in places:
+                self.root(distance)
+            drops = {distance: point.drop for distance, point in self._known.items() if 0.0 < distance <= max(places)}
         else:
-            drops = {place: self._drop(place) for place in places}
+            drops = {distance: self._drop(distance) for distance in places}
         return [(self._one.clipped(self.value(at)), -drop) for at, drop in drops.items()]
 
     def _distance(self, value: float) -> float:
@@ -299,7 +312,10 @@ class _Side:
 
     def _expected(self, distance: float) -> FloatArray:
         """The other coordinates at a distance by those that are known: between two, or onwards from the last."""
-        inner, outer = ([one for one in sorted(self._known) if (one > distance) == beyond] for beyond in (False, True))
+        inner, outer = (
+            [distance_before for distance_before in sorted(self._known) if (distance_before > distance) == beyond]
+            for beyond in (False, True)
+        )
         last, at = inner[-1], self._known[inner[-1]].others
         if outer:
             return at + (distance - last) / (outer[0] - last) * (self._known[outer[0]].others - at)
@@ -307,13 +323,13 @@ class _Side:
         return at + (distance - last) * slope
 
     def _along(self, distance: float, others: FloatArray) -> FusionConfig:
-        there = self._one.put(self._best.config, self._one.clipped(self.value(distance)))
-        return moved(there, self._others, np.clip(others, *self._range))
+        config = self._one.put(self._best.config, self._one.clipped(self.value(distance)))
+        return moved(config, self._others, np.clip(others, *self._range))
 
     def _drop(self, distance: float) -> float:
         """What the likelihood drops by with the others where they are expected."""
-        there = self._along(distance, self._known[0.0].others + distance * self._slope)
-        return self._top - point(self._view.likelihood, there, self._every, self._view.outcomes).log_posterior
+        config = self._along(distance, self._known[0.0].others + distance * self._slope)
+        return self._top - point(self._view.likelihood, config, self._every, self._view.outcomes).log_posterior
 
     def _maximum(self, distance: float, others: FloatArray) -> _Known:
         """The maximum next to these other coordinates."""
@@ -350,13 +366,17 @@ def lag_intervals(likelihood: Likelihood, best: Point, free: Sequence[Parameter]
     slopes = lag_slopes(free, best.config)
     if not slopes:
         return {}
-    bounds = [one.at_bound(best.config) for one in free]
-    inside = [n for n, (one, bound) in enumerate(zip(free, bounds, strict=True)) if bound is None or one.fit == "delay"]
+    bounds = [parameter.at_bound(best.config) for parameter in free]
+    inside = [
+        n
+        for n, (parameter, bound) in enumerate(zip(free, bounds, strict=True))
+        if bound is None or parameter.fit == "delay"
+    ]
     some = [free[n] for n in inside]
     _, information, scatter = derivatives(likelihood, best, some)
     cov = covariance(information, some)
     real = cov @ scatter @ cov
-    found: dict[str, Distances] = {}
+    distances: dict[str, Distances] = {}
     for axis, slope in slopes.items():
         inner = slope[inside]
         half = Z95 * float(np.sqrt(max(inner @ cov @ inner, inner @ real @ inner)))
@@ -366,17 +386,17 @@ def lag_intervals(likelihood: Likelihood, best: Point, free: Sequence[Parameter]
             all(bound == ("lower" if rises == upwards else "upper") for bound, rises in moving)
             for upwards in (True, False)
         )
-        found[axis] = (np.inf if down else half, np.inf if up else half)
-    return found
+        distances[axis] = (np.inf if down else half, np.inf if up else half)
+    return distances
 
 
 def lag_slopes(free: Sequence[Parameter], config: FusionConfig) -> dict[str, FloatArray]:
     """The derivatives of each axis's lag by the coordinates (k,), where any is not 0."""
 
-    def slope(one: Parameter, axis: str) -> float:
-        at = one.at(config)
-        up, down = (one.move(config, at + step).arm.lag_of(axis) for step in (_LAG_STEP, -_LAG_STEP))
+    def slope(parameter: Parameter, axis: str) -> float:
+        at = parameter.at(config)
+        up, down = (parameter.move(config, at + step).arm.lag_of(axis) for step in (_LAG_STEP, -_LAG_STEP))
         return (up - down) / (2.0 * _LAG_STEP)
 
-    found = {axis: np.array([slope(one, axis) for one in free]) for axis in config.arm.axes}
-    return {axis: slopes for axis, slopes in found.items() if slopes.any()}
+    by_axis = {axis: np.array([slope(parameter, axis) for parameter in free]) for axis in config.arm.axes}
+    return {axis: slopes for axis, slopes in by_axis.items() if slopes.any()}

@@ -38,8 +38,8 @@ from .parameters import (
     parameters,
     rounded,
     with_arm,
+    with_noise,
     with_own_delays,
-    with_rest,
     with_shared_delay,
 )
 from .plain import LONGEST, Doubt, doubts, with_plain_arm
@@ -208,29 +208,29 @@ class Latency:
     runs: Sequence[Run]
 
     def __repr__(self) -> str:
-        lags = ", ".join(f"{axis} {one.lag * MS:.4g} ms" for axis, one in self.details.axes.items())
+        lags = ", ".join(f"{axis} {lag.lag * MS:.4g} ms" for axis, lag in self.details.axes.items())
         return f"Latency({', '.join(self.details.runs)} by {self.details.sensor}: {lags})"
 
     @property
     def arm(self) -> ArmModel:
         """The arm with its intervals and where it is from, for ``arm.toml``."""
         arm: ArmModel = self.config.arm
-        for axis, one in self.details.axes.items():
+        for axis, lag in self.details.axes.items():
             for name in ("time_constant", "natural_frequency", "damping"):
                 if hasattr(arm.axes[axis].plant, name):
-                    arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(one, f"{name}_ci95"))
-            arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), one.gain_ci95)
+                    arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(lag, f"{name}_ci95"))
+            arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), lag.gain_ci95)
             for name in ("gain_recovery", *BENDS, "lag"):
-                arm = changed(arm, ("axes", axis, f"{name}_ci95"), getattr(one, f"{name}_ci95"))
-            own = arm.axes[axis].delay is not None
-            arm = changed(arm, ("axes", axis, "delay_ci95") if own else ("delay_ci95",), one.delay_ci95)
+                arm = changed(arm, ("axes", axis, f"{name}_ci95"), getattr(lag, f"{name}_ci95"))
+            has_own_delay = arm.axes[axis].delay is not None
+            arm = changed(arm, ("axes", axis, "delay_ci95") if has_own_delay else ("delay_ci95",), lag.delay_ci95)
         provenance = {"identified_on": self.details.runs, "sensor": self.details.sensor}
         return msgspec.structs.replace(arm, provenance=provenance)
 
     def to_json(self) -> str:
         """All of it as JSON, in the units of the names."""
         tree = toml.reported(self.details)
-        tree["axes"] = {axis: toml.reported(one, one.kind) for axis, one in self.details.axes.items()}
+        tree["axes"] = {axis: toml.reported(lag, lag.kind) for axis, lag in self.details.axes.items()}
         return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode() + "\n"
 
 
@@ -256,41 +256,48 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
         raise TuneError("no run to look at")
     measured = [{REFERENCE: run.reference, **run.sensors} if run.reference else run.sensors for run in every]
     every = [replace(run, sensors=sources, reference=None) for run, sources in zip(every, measured, strict=True)]
-    aside = {name: one.words for run in every for name, one in own_frames(run).items()}
-    every = [replace(run, sensors={k: v for k, v in run.sensors.items() if k not in aside}) for run in every]
-    turned = [f"sensor '{name}' {words}: `pumafuse register` finds it; it is not used" for name, words in aside.items()]
+    elsewhere = {name: own_frame.words for run in every for name, own_frame in own_frames(run).items()}
+    every = [replace(run, sensors={k: v for k, v in run.sensors.items() if k not in elsewhere}) for run in every]
+    turned = [
+        f"sensor '{name}' {words}: `pumafuse register` finds it; it is not used" for name, words in elsewhere.items()
+    ]
     if turned and not any(run.sensors for run in every):
         raise TuneError("; ".join(turned))
     surveys = [Survey(Path(run.name), run, relations(run)) for run in sorted(every, key=_motion, reverse=True)]
-    guesses = [guess(one) for one in surveys]
+    guesses = [guess(survey) for survey in surveys]
     config = first_guess(guesses)
     trusted = _trusted(config, every, sensor)
-    sooner = {axis: by for one in surveys for axis, by in early(one, trusted).items()}
-    if sooner and not {axis for one in surveys for name, axis in one.relations if name == trusted} - set(sooner):
+    sooner = {axis: by for survey in surveys for axis, by in early(survey, trusted).items()}
+    if sooner and not {axis for survey in surveys for name, axis in survey.relations if name == trusted} - set(sooner):
         raise TuneError(f"{every[0].name}: {too_early(trusted, max(sooner.values()))}")
     likelihood = Likelihood(every, _with_right_stamps(config, trusted), [trusted])
     moving = [axis for axis in excited_axes(likelihood, likelihood.config) if axis not in sooner]
-    found = dict(zip(moving, in_threads(lambda axis: _search(likelihood, axis), moving), strict=True))
-    lost = [axis for axis, search in found.items() if search.plain is None]
-    config, lags = _arm(likelihood.config, {axis: found[axis] for axis in moving if axis not in lost}, trusted)
-    if endless := [axis for axis, one in lags.items() if one.lag > LONGEST]:
+    searches = dict(zip(moving, in_threads(lambda axis: _search(likelihood, axis), moving), strict=True))
+    lost = [axis for axis, search in searches.items() if search.plain is None]
+    config, lags = _arm(likelihood.config, {axis: searches[axis] for axis in moving if axis not in lost}, trusted)
+    if endless := [axis for axis, lag in lags.items() if lag.lag > LONGEST]:
         lost += endless
-        config, lags = _arm(likelihood.config, {axis: found[axis] for axis in moving if axis not in lost}, trusted)
-    for axis, one in doubts({axis: found[axis].plain for axis in lags}, config).items():
-        lags[axis] = _doubted(lags[axis], one, one.sentence(config, axis))
-        if one.refutes:
-            config = with_plain_arm(config, axis, one.plain.arm)
-    known = {name: one.pair for _, each in guesses for name, one in each.items() if one.pair and len(every) == 1}
-    best, sensors, said = _sensors(every, config, trusted, known)
+        config, lags = _arm(likelihood.config, {axis: searches[axis] for axis in moving if axis not in lost}, trusted)
+    for axis, doubt in doubts({axis: searches[axis].plain for axis in lags}, config).items():
+        lags[axis] = _doubted(lags[axis], doubt, doubt.sentence(config, axis))
+        if doubt.refutes:
+            config = with_plain_arm(config, axis, doubt.plain.arm)
+    pairs = {
+        name: sensor_guess.pair
+        for _, each in guesses
+        for name, sensor_guess in each.items()
+        if sensor_guess.pair and len(every) == 1
+    }
+    best, sensors, said = _sensors(every, config, trusted, pairs)
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
     notes = [*turned, *likelihood.notes, *said]
     notes += [f"{axis}: does not move, or {trusted} does not measure it" for axis in still]
-    notes += [f"{axis}: {one.step}" for axis in lags if (one := found[axis].plain) and one.step]
+    notes += [f"{axis}: {doubt.step}" for axis in lags if (doubt := searches[axis].plain) and doubt.step]
     notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
     notes += [f"{axis}: {too_early(trusted, by)}" for axis, by in sooner.items()]
-    notes += [_SAMPLED.format(one.run.name, step * MS) for one in surveys if (step := interpolation(one))]
-    notes += [_AHEAD_OF.format(one.run.name, -lag * MS) for one in surveys if (lag := soonest(one)) < -SOONER]
+    notes += [_SAMPLED.format(survey.run.name, step * MS) for survey in surveys if (step := interpolation(survey))]
+    notes += [_AHEAD_OF.format(survey.run.name, -lag * MS) for survey in surveys if (lag := soonest(survey)) < -SOONER]
     summary = LatencySummary(
         pumafuse=version("pumafuse"),
         runs=[run.name for run in every],
@@ -317,45 +324,47 @@ def first_guess(guesses: Sequence[tuple[ArmGuess, Mapping[str, SensorGuess]]]) -
         RunError: There are fewer than two commands.
     """
     arms, axes, sensors = list[ArmGuess](), dict[str, AxisGuess](), dict[str, SensorGuess]()
-    for arm, found in guesses:
+    for arm, sensor_guesses in guesses:
         arms.append(arm)
         axes = {**arm.axes, **axes}
-        for name, one in found.items():
+        for name, sensor_guess in sensor_guesses.items():
             before = sensors.get(name)
             sensors[name] = (
-                one if before is None else replace(before, sd={**one.sd, **before.sd}, bias={**one.bias, **before.bias})
+                sensor_guess
+                if before is None
+                else replace(before, sd={**sensor_guess.sd, **before.sd}, bias={**sensor_guess.bias, **before.bias})
             )
     model = ArmModel(
         name="identified from motion",
         update_period=float(f"{arms[0].period:.4g}"),
         delay=rounded(arms[0].delay),
         axes={
-            name: AxisModel(kind=one.kind, plant=FirstOrder(time_constant=one.time_constant))
-            for name, one in axes.items()
+            name: AxisModel(kind=axis.kind, plant=FirstOrder(time_constant=axis.time_constant))
+            for name, axis in axes.items()
         },
     )
     return FusionConfig(
         arm=model,
-        start=Start(offset_sd={name: one.offset_sd for name, one in axes.items()}),
-        process={name: Process(input_noise=one.input_noise, drift=one.drift) for name, one in axes.items()},
-        sensors={name: _sensor(one) for name, one in sensors.items()},
+        start=Start(offset_sd={name: axis.offset_sd for name, axis in axes.items()}),
+        process={name: Process(input_noise=axis.input_noise, drift=axis.drift) for name, axis in axes.items()},
+        sensors={name: _sensor(sensor) for name, sensor in sensors.items()},
     )
 
 
 def _motion(run: Run) -> float:
     """How much a run moves: the lengths of its commanded paths, each in units of its range."""
-    found = 0.0
+    motion = 0.0
     for value in run.command.values.values():
-        known = value[np.isfinite(value)]
-        if len(known) > 1 and np.ptp(known) > 0.0:
-            found += float(np.abs(np.diff(known)).sum() / np.ptp(known))
-    return found
+        values = value[np.isfinite(value)]
+        if len(values) > 1 and np.ptp(values) > 0.0:
+            motion += float(np.abs(np.diff(values)).sum() / np.ptp(values))
+    return motion
 
 
-def _sensor(found: SensorGuess) -> Sensor:
-    bias: float | dict[str, float] = {axis: found.bias.get(axis, 0.0) for axis in found.sd} if found.bias else 0.0
-    gate = _GATE if found.gate else 0.0  # without outliers only a poor model is rejected, and that pays
-    return Sensor(sd=dict(found.sd), latency=found.latency, scale=found.scale, bias_sd=bias, gate=gate)
+def _sensor(guess: SensorGuess) -> Sensor:
+    bias: float | dict[str, float] = {axis: guess.bias.get(axis, 0.0) for axis in guess.sd} if guess.bias else 0.0
+    gate = _GATE if guess.gate else 0.0  # without outliers only a poor model is rejected, and that pays
+    return Sensor(sd=dict(guess.sd), latency=guess.latency, scale=guess.scale, bias_sd=bias, gate=gate)
 
 
 def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> str:
@@ -384,7 +393,7 @@ def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> st
             )
             for axis in config.arm.axes
         }
-        shares = [one / max(travel[axis], 1e-12) for axis, one in sd.items()] if isinstance(sd, dict) else [sd]
+        shares = [sd_here / max(travel[axis], 1e-12) for axis, sd_here in sd.items()] if isinstance(sd, dict) else [sd]
         return -len(shares), float(np.median(shares))
 
     return min(config.sensors, key=rank)
@@ -393,8 +402,8 @@ def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> st
 def _with_right_stamps(config: FusionConfig, trusted: str) -> FusionConfig:
     """The configuration with the trusted sensor's stamps right, and the others' latencies as much shorter."""
     late = config.sensors[trusted].latency
-    for name, one in config.sensors.items():
-        config = changed(config, ("sensors", name, "latency"), one.latency - late)
+    for name, sensor in config.sensors.items():
+        config = changed(config, ("sensors", name, "latency"), sensor.latency - late)
     return config
 
 
@@ -411,39 +420,41 @@ def _search(likelihood: Likelihood, axis: str) -> ArmSearch:
     return ArmSearch(measured, freedom, least)
 
 
-def _arm(config: FusionConfig, found: Mapping[str, ArmSearch], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:
+def _arm(
+    config: FusionConfig, searches: Mapping[str, ArmSearch], trusted: str
+) -> tuple[FusionConfig, dict[str, AxisLag]]:
     """The arm of all axes with what it leaves, and the lag of each with its intervals."""
-    (chosen, delay), lags = chosen_arms(found, found), dict[str, AxisLag]()
-    for axis, one in chosen.items():
-        arm = Arm(*(rounded(number) for number in one.arm))
-        config = with_rest(with_arm(config, axis, arm), axis, found[axis].rest, [trusted])
-        lags[axis] = _axis_lag(found[axis], one._replace(arm=arm), trusted, config.arm.axes[axis].kind)
-    shares = [axis for axis, one in chosen.items() if one.shares]
+    (chosen, delay), lags = chosen_arms(searches, searches), dict[str, AxisLag]()
+    for axis, choice in chosen.items():
+        arm = Arm(*(rounded(number) for number in choice.arm))
+        config = with_noise(with_arm(config, axis, arm), axis, searches[axis].noise, [trusted])
+        lags[axis] = _axis_lag(searches[axis], choice._replace(arm=arm), trusted, config.arm.axes[axis].kind)
+    shares = [axis for axis, choice in chosen.items() if choice.shares]
     return with_shared_delay(config, shares, rounded(delay)) if delay is not None else config, lags
 
 
-def _notes(one: AxisLag, gains: tuple[float, float]) -> list[str]:
+def _notes(lag: AxisLag, gains: tuple[float, float]) -> list[str]:
     """What the motion was too poor for, and what to record instead; beside the least and the largest gain."""
-    found: list[str] = []
-    width = one.lag_ci95[1] - one.lag_ci95[0]
-    if width > max(_WIDE * abs(one.lag), _WIDE_LAG):
-        found.append(
+    notes: list[str] = []
+    width = lag.lag_ci95[1] - lag.lag_ci95[0]
+    if width > max(_WIDE * abs(lag.lag), _WIDE_LAG):
+        notes.append(
             "the motion is too poor for the lag: it is known to"
             f" ± {0.5 * width * MS:.0f} ms; record faster or longer motion"
         )
-    elif one.delay_ci95[1] - one.delay_ci95[0] > max(_WIDE * one.lag, 2.0 * width):
-        found.append(
+    elif lag.delay_ci95[1] - lag.delay_ci95[0] > max(_WIDE * lag.lag, 2.0 * width):
+        notes.append(
             "the lag is known, its parts are not: dead time and plant make up for each other in motion this slow;"
             " record steps, or reversals within the lag, to tell them apart"
         )
-    if one.gain_ci95 is not None and one.gain_ci95[1] - one.gain_ci95[0] > _WIDE_GAIN:
-        found.append("the motion is too poor for the gain; record motion over more of the range")
-    if one.gain in gains:
-        found.append(
-            f"the gain lies at the end of what is believed, {one.gain:g}: the axis moves otherwise than these models"
+    if lag.gain_ci95 is not None and lag.gain_ci95[1] - lag.gain_ci95[0] > _WIDE_GAIN:
+        notes.append("the motion is too poor for the gain; record motion over more of the range")
+    if lag.gain in gains:
+        notes.append(
+            f"the gain lies at the end of what is believed, {lag.gain:g}: the axis moves otherwise than these models"
             " do, and its lag and gain mean little"
         )
-    return found
+    return notes
 
 
 def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> AxisLag:
@@ -453,10 +464,10 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         """Of the models like the chosen one; of a logarithm in the number itself."""
         log = quantity not in ("lag", "delay", "gain")
 
-        def alike(one: Model) -> bool:
+        def alike(other: Model) -> bool:
             if quantity in ("gain", "gain_recovery"):
-                return one.gain == model.gain
-            return quantity in ("lag", "delay", *BENDS) or one.order == model.order
+                return other.gain == model.gain
+            return quantity in ("lag", "delay", *BENDS) or other.order == model.order
 
         middle = math.log(value) if log else value
         low, high = mixture.quantiles(quantity, alike)
@@ -478,7 +489,7 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         values |= {bend: getattr(arm, bend), f"{bend}_ci95": interval(bend, getattr(arm, bend))}
     if arm.recovery:
         values |= {"gain_recovery": arm.recovery, "gain_recovery_ci95": interval("gain_recovery", arm.recovery)}
-    found = AxisLag(
+    lag = AxisLag(
         sensor=trusted,
         lag=arm.total,
         lag_ci95=interval("lag", arm.total, search.lag_scatter(model, arm)),
@@ -492,7 +503,7 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         **values,
     )
     notes = ["; ".join(search.bent.sentences(SCREEN[kind]))] if search.bent is not None else []
-    return msgspec.structs.replace(found, notes=[*notes, *_notes(found, search.limits.bounds["gain"])])
+    return msgspec.structs.replace(lag, notes=[*notes, *_notes(lag, search.limits.bounds["gain"])])
 
 
 def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
@@ -521,40 +532,40 @@ def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
 
 
 def _sensors(
-    runs: Sequence[Run], config: FusionConfig, trusted: str, known: Mapping[str, Pair]
+    runs: Sequence[Run], config: FusionConfig, trusted: str, pairs: Mapping[str, Pair]
 ) -> tuple[FusionConfig, dict[str, SensorLag], list[str]]:
     """The configuration with noise, latency and scale of the other sensors; these with intervals; what is to be said.
 
-    No arm is needed for it. ``known``: what was found for the first guess, beside some sensor.
+    No arm is needed for it. ``pairs``: what was found for the first guess, beside some sensor.
     """
-    found, notes = dict[str, SensorLag](), list[str]()
+    lags, notes = dict[str, SensorLag](), list[str]()
     for name, sensor in config.sensors.items():
         if name == trusted:
             continue
-        beside = known.get(name)
-        one = beside.alignment if beside and beside.other == trusted else aligned(runs, trusted, name)
-        if one is None:
+        beside = pairs.get(name)
+        alignment = beside.alignment if beside and beside.other == trusted else aligned(runs, trusted, name)
+        if alignment is None:
             notes.append(_APART.format(name, trusted))
             continue
-        found[name] = SensorLag(
-            latency=one.latency,
-            latency_ci95=one.latency_ci95,
-            latency_sd=one.latency_sd,
-            scale=one.scale,
-            scale_ci95=one.scale_ci95,
-            steps=[LatencyStep(time=step.time, before=step.before, after=step.after) for step in one.steps],
+        lags[name] = SensorLag(
+            latency=alignment.latency,
+            latency_ci95=alignment.latency_ci95,
+            latency_sd=alignment.latency_sd,
+            scale=alignment.scale,
+            scale_ci95=alignment.scale_ci95,
+            steps=[LatencyStep(time=step.time, before=step.before, after=step.after) for step in alignment.steps],
         )
-        notes += one.doubts(name, trusted)
+        notes += alignment.doubts(name, trusted)
         sd = sensor.sd if isinstance(sensor.sd, dict) else {}
         better = msgspec.structs.replace(
             sensor,
-            sd={**sd, **{axis: max(rounded(value), SD_BOUNDS[0]) for axis, value in one.sd.items()}},
-            latency=rounded(one.latency),
-            latency_sd=rounded(one.latency_sd),
-            scale=rounded(one.scale) * config.sensors[trusted].scale,
+            sd={**sd, **{axis: max(rounded(value), SD_BOUNDS[0]) for axis, value in alignment.sd.items()}},
+            latency=rounded(alignment.latency),
+            latency_sd=rounded(alignment.latency_sd),
+            scale=rounded(alignment.scale) * config.sensors[trusted].scale,
         )
         config = changed(config, ("sensors", name), better)
-    return config, found, notes
+    return config, lags, notes
 
 
 # ---- the lag over the run -------------------------------------------------------------------------------------------
@@ -565,7 +576,9 @@ def _free_arm(likelihood: Likelihood, config: FusionConfig, axis: str) -> list[P
     config = with_own_delays(config, [axis])
     every = parameters(config, config, {axis: likelihood.sensors[axis]}, ["delay", "plant", "gain"])
     fixed = config.arm.axes[axis].gain.intercept == 1.0
-    return [one for one in every if one.axis == axis and not (fixed and one.path[-1] == "intercept")]
+    return [
+        parameter for parameter in every if parameter.axis == axis and not (fixed and parameter.path[-1] == "intercept")
+    ]
 
 
 class _Course(NamedTuple):
@@ -597,19 +610,19 @@ def _with_courses(
     """The lags with their courses over the longest run, and drift and wandering of a clock that all axes share."""
     courses: dict[str, _Course] = {}
     for axis in lags:
-        found = likelihood.shifts(axis, with_own_delays(config, [axis]), _PARTS, _free_arm(likelihood, config, axis))
-        if found is not None and np.trace(found[2]) > 0.0:
-            courses[axis] = _Course(*found)
-    known = dict(lags)
+        shifts = likelihood.shifts(axis, with_own_delays(config, [axis]), _PARTS, _free_arm(likelihood, config, axis))
+        if shifts is not None and np.trace(shifts[2]) > 0.0:
+            courses[axis] = _Course(*shifts)
+    with_courses = dict(lags)
     for axis, course in courses.items():
         trend, sd = _trend(course), np.sqrt(course.variance)
         parts = zip(course.time.tolist(), course.shift.tolist(), sd.tolist(), strict=True)
-        known[axis] = msgspec.structs.replace(
-            known[axis],
+        with_courses[axis] = msgspec.structs.replace(
+            with_courses[axis],
             **trend._asdict(),
-            course=[PartLag(time=time, shift=shift, sd=one) for time, shift, one in parts],
+            course=[PartLag(time=time, shift=shift, sd=sd_here) for time, shift, sd_here in parts],
         )
-    return known, _clock(list(courses.values()))
+    return with_courses, _clock(list(courses.values()))
 
 
 def _trend(course: _Course) -> _Trend:
@@ -620,12 +633,12 @@ def _trend(course: _Course) -> _Trend:
     x = (course.time - course.time.mean()) / span
     power = float(x @ G @ x)
     drift = float(x @ G @ course.shift) / power
-    rest = course.shift - drift * x
-    free = len(rest) - 2
-    chi2 = float(rest @ G @ rest)
+    left = course.shift - drift * x
+    free = len(left) - 2
+    chi2 = float(left @ G @ left)
     variance = course.variance
     weight = 1.0 / np.maximum(variance, 1e-18)
-    wander = math.sqrt(max(float(weight @ (rest**2 - variance) / weight.sum()), 0.0))
+    wander = math.sqrt(max(float(weight @ (left**2 - variance) / weight.sum()), 0.0))
     sd = math.sqrt(max(1.0, chi2 / free) / power)
     wanders = wander > _SMALLEST and float(chdtrc(free, chi2)) < _WANDERS
     return _Trend(drift, sd, abs(drift) > max(_DRIFTS * sd, _SMALLEST), wander if wanders else 0.0)
@@ -635,10 +648,10 @@ def _clock(courses: Sequence[_Course]) -> tuple[float | None, float | None]:
     """By how much all axes drift and wander together; None where they do not, or each for itself."""
     if len(courses) < 2:
         return None, None
-    information: FloatArray = np.sum([one.information for one in courses], axis=0)
-    moved: FloatArray = np.sum([one.information @ one.shift for one in courses], axis=0)
+    information: FloatArray = np.sum([course.information for course in courses], axis=0)
+    moved: FloatArray = np.sum([course.information @ course.shift for course in courses], axis=0)
     shift = np.asarray(np.linalg.pinv(information, 1e-6, hermitian=True) @ moved, dtype=np.float64)
-    every = sum(float(one.shift @ one.information @ one.shift) for one in courses)
+    every = sum(float(course.shift @ course.information @ course.shift) for course in courses)
     if float(shift @ information @ shift) < 0.5 * every:
         return None, None
     trend = _trend(_Course(courses[0].time, shift, information))

@@ -55,7 +55,7 @@ def in_threads(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
 
     cores = min(len(items), cpu_count()) if len(items) > 1 else 1
     if cores == 1:
-        return [work(one) for one in items]
+        return [work(item) for item in items]
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(work, items))
 
@@ -73,7 +73,7 @@ class Point:
     @property
     def outcomes(self) -> list[CodeArray]:
         """The outcome of each measurement on each axis, for each segment, (m, A)."""
-        return [one.outcome for one in self.results]
+        return [result.outcome for result in self.results]
 
     @property
     def log_likelihood(self) -> float:
@@ -144,16 +144,16 @@ class Likelihood:
         built = list[Segment]()
         self.notes, counted = list[str](), dict[str, list[Segment]]()
         for name, part in named:
-            asked = [one for one in chosen if one in part.sensors]
+            asked = [name for name in chosen if name in part.sensors]
             clocks = clock_faults(part, config.arm.update_period, asked)
             built.append(build(part, config, chosen))
-            turns = [one.sentence for one in within_a_turn(built[-1], config)]
+            turns = [fault.sentence for fault in within_a_turn(built[-1], config)]
             notes = (*clocks, *built[-1].notes, *turns, *starts_in_motion(built[-1], config))
             self.notes += [f"run '{name}': {note}" for note in notes]
             counted.setdefault(name, []).append(built[-1])
-        self.commands = {name: added(one.command_counts for one in parts) for name, parts in counted.items()}
+        self.commands = {name: added(part.command_counts for part in parts) for name, parts in counted.items()}
         self.rows = {
-            name: {sensor: added(one.counts[sensor] for one in parts) for sensor in parts[0].counts}
+            name: {sensor: added(part.counts[sensor] for part in parts) for sensor in parts[0].counts}
             for name, parts in counted.items()
         }
         self.config = config
@@ -176,7 +176,7 @@ class Likelihood:
 
     def measured(self, axis: str, config: FusionConfig, sensors: Sequence[str] | None = None) -> Measured:
         """What was commanded on an axis and measured of it, by all sensors or some, in their order."""
-        names, found = list(self.sensors[axis] if sensors is None else sensors), list[Recording]()
+        names, recordings = list(self.sensors[axis] if sensors is None else sensors), list[Recording]()
         for segment in (part.segment for part in self._of(axis)):
             start, parts = segment.start[axis], list[tuple[TimeArray, FloatArray, IntArray]]()
             for name, rows in segment.rows_by_sensor().items():
@@ -187,17 +187,17 @@ class Likelihood:
             if parts:
                 time, value, source = (np.concatenate(column) for column in zip(*parts, strict=True))
                 every = Recording(*segment.given(axis), start, time, value, source, np.ones(len(time)))
-                found.append(every.of(np.argsort(time, kind="stable")))
-        return Measured(found, config.arm.update_period, names, config.arm.axes[axis])
+                recordings.append(every.of(np.argsort(time, kind="stable")))
+        return Measured(recordings, config.arm.update_period, names, config.arm.axes[axis])
 
     def of_axis(self, axis: str) -> Likelihood:
         """The likelihood of the measurements of one axis; ``axes`` stay as they are."""
-        found, mine = copy(self), self._of(axis)
-        found._segments = [part.segment for part in mine]
-        found._parts = [
-            replace(part, whole=number, rows=np.arange(len(part.rows)), column=0) for number, part in enumerate(mine)
+        likelihood, parts = copy(self), self._of(axis)
+        likelihood._segments = [part.segment for part in parts]
+        likelihood._parts = [
+            replace(part, whole=number, rows=np.arange(len(part.rows)), column=0) for number, part in enumerate(parts)
         ]
-        return found
+        return likelihood
 
     def outcomes_of(self, axis: str, outcomes: Sequence[CodeArray]) -> list[CodeArray]:
         """Those outcomes that are of one axis's measurements, for each segment of :meth:`of_axis`."""
@@ -209,16 +209,16 @@ class Likelihood:
     @cached_property
     def _values(self) -> dict[tuple[str, str], list[FloatArray]]:
         """What a sensor measured of an axis, by the names of both, of each segment."""
-        found: dict[tuple[str, str], list[FloatArray]] = {}
+        by_sensor: dict[tuple[str, str], list[FloatArray]] = {}
         for part in self._parts:
             for name, rows in part.segment.rows_by_sensor().items():
-                found.setdefault((name, self.axes[part.axis]), []).append(rows.value[:, 0])
-        return found
+                by_sensor.setdefault((name, self.axes[part.axis]), []).append(rows.value[:, 0])
+        return by_sensor
 
     @cached_property
     def scatter(self) -> dict[tuple[str, str], float]:
         """Rough noise of each sensor on each axis [m or rad], by the names of both."""
-        sds = {key: [scatter(one) for one in values if len(one) > 3] for key, values in self._values.items()}
+        sds = {key: [scatter(value) for value in values if len(value) > 3] for key, values in self._values.items()}
         return {key: float(np.median(each)) for key, each in sds.items() if each and min(each) > 0.0}
 
     @cached_property
@@ -241,22 +241,22 @@ class Likelihood:
     @cached_property
     def travel(self) -> dict[str, float]:
         """The range of the commands of each axis, of the run where it is greatest [m]."""
-        found = dict.fromkeys(self.axes, 0.0)
+        travel = dict.fromkeys(self.axes, 0.0)
         for segment in self._segments:
             for axis in segment.axes:
                 reached = float(np.ptp(np.append(segment.given(axis)[1], segment.start[axis])))
-                found[axis] = max(found[axis], reached)
-        return found
+                travel[axis] = max(travel[axis], reached)
+        return travel
 
     def apart(self, config: FusionConfig) -> dict[tuple[str, str], list[FloatArray]]:
         """How far the measurements of each sensor on an axis are from the noiseless arm [m], of each segment (m,)."""
-        certain, found = _certain(config), dict[tuple[str, str], list[FloatArray]]()
+        certain, apart = _certain(config), dict[tuple[str, str], list[FloatArray]]()
         for part in self._parts:
             left = innovations(part.segment, certain).innovation[:, 0]
             for number, name in enumerate(part.segment.sensors):
-                if (mine := part.segment.measurement_rows.source == number).any():
-                    found.setdefault((name, self.axes[part.axis]), []).append(left[mine])
-        return found
+                if (its_rows := part.segment.measurement_rows.source == number).any():
+                    apart.setdefault((name, self.axes[part.axis]), []).append(left[its_rows])
+        return apart
 
     def shifts(
         self, axis: str, config: FusionConfig, count: int, free: Sequence[Parameter] = ()
@@ -270,12 +270,12 @@ class Likelihood:
         middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,), (n,) and
         (n, n); None where there are too few measurements.
         """
-        part = max(self._of(axis), key=lambda one: len(one.rows), default=None)
+        part = max(self._of(axis), key=lambda part: len(part.rows), default=None)
         if part is None or len(part.rows) < 3 * count:
             return None
         segment, rows = part.segment, part.segment.measurement_rows
-        found = innovations(segment, config)
-        weight = ((found.outcome != int(Outcome.REJECTED)) / found.innovation_sd)[:, 0]
+        filtered = innovations(segment, config)
+        weight = ((filtered.outcome != int(Outcome.REJECTED)) / filtered.innovation_sd)[:, 0]
         delay, certain = config.arm.delay_of(axis), _certain(config)
 
         def predicted(shift: float) -> FloatArray:
@@ -284,37 +284,42 @@ class Likelihood:
 
         def changes(part: Segment, at: FusionConfig) -> FloatArray:
             """What becomes of the innovations, over their deviations, the outcomes being the same."""
-            return weight * (innovations(part, at, found.outcome).innovation - found.innovation)[:, 0]
+            return weight * (innovations(part, at, filtered.outcome).innovation - filtered.innovation)[:, 0]
 
         rate = (predicted(_SHIFT) - predicted(-_SHIFT)) / (_SHIFT + min(_SHIFT, delay))
         since = (rows.time - segment.origin) / 1e9
         edges = np.linspace(float(since.min()), float(since.max()), count + 1)
-        place = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, count - 1)
-        later = [rows.value + (rate * (place == number))[:, None] for number in range(count)]
+        part_of_row = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, count - 1)
+        later = [rows.value + (rate * (part_of_row == number))[:, None] for number in range(count)]
         moved = np.array(
-            [changes(replace(segment, measurement_rows=rows._replace(value=one)), config) for one in later]
+            [changes(replace(segment, measurement_rows=rows._replace(value=value)), config) for value in later]
         )
         if free:
-            steps = [one.move(config, one.at(config) + (_LOG_STEP if one.log else _STEP)) for one in free]
+            steps = [
+                parameter.move(config, parameter.at(config) + (_LOG_STEP if parameter.log else _STEP))
+                for parameter in free
+            ]
             fitted, _ = np.linalg.qr(np.array([moved.sum(axis=0), *(changes(segment, step) for step in steps)]).T)
             moved -= (moved @ fitted) @ fitted.T
         information = moved @ moved.T
         inverse = np.asarray(np.linalg.pinv(information, _SINGULAR, hermitian=True), dtype=np.float64)
-        shift = np.asarray(inverse @ moved @ (weight * found.innovation[:, 0]), dtype=np.float64)
+        shift = np.asarray(inverse @ moved @ (weight * filtered.innovation[:, 0]), dtype=np.float64)
         return 0.5 * (edges[:-1] + edges[1:]), shift, information
 
     def misfit(self, config: FusionConfig) -> dict[str, float]:
         """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis."""
-        found: dict[str, list[float]] = {axis: [] for axis in self.axes}
+        by_axis: dict[str, list[float]] = {axis: [] for axis in self.axes}
         for (name, axis), parts in self.apart(config).items():
-            apart = SD_OF_MEDIAN * float(np.median(np.abs(np.concatenate([one - np.median(one) for one in parts]))))
-            found[axis].append(max(apart / abs(config.sensors[name].scale), _SMALLEST))
-        return {axis: min(apart, default=_SMALLEST) for axis, apart in found.items()}
+            apart = SD_OF_MEDIAN * float(
+                np.median(np.abs(np.concatenate([apart_here - np.median(apart_here) for apart_here in parts])))
+            )
+            by_axis[axis].append(max(apart / abs(config.sensors[name].scale), _SMALLEST))
+        return {axis: min(apart, default=_SMALLEST) for axis, apart in by_axis.items()}
 
     def innovation(self, config: FusionConfig) -> float:
         """Root mean square of all innovations [m or rad], whatever their sd, but for the largest fiftieth: outliers."""
-        every = [innovations(one, config).innovation for one in self._segments]
-        squares = np.sort(np.concatenate([one[np.isfinite(one)] ** 2 for one in every]))
+        every = [innovations(segment, config).innovation for segment in self._segments]
+        squares = np.sort(np.concatenate([innovation[np.isfinite(innovation)] ** 2 for innovation in every]))
         return float(np.sqrt(squares[: math.ceil(_COUNTED * len(squares))].mean())) if len(squares) else 0.0
 
     def faults(self, config: FusionConfig) -> list[Fault]:
@@ -324,19 +329,19 @@ class Likelihood:
     def rejecting(self, results: Sequence[Results]) -> list[str]:
         """The axes of which measurements are rejected."""
         rejected = int(Outcome.REJECTED)
-        mine = {
+        numbers = {
             part.axis for part in self._parts if (results[part.whole].outcome[part.rows, part.column] == rejected).any()
         }
-        return [axis for number, axis in enumerate(self.axes) if number in mine]
+        return [axis for number, axis in enumerate(self.axes) if number in numbers]
 
     def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> Point:
         """The log-likelihood of the measurements, without priors; for ``outcomes`` of None the gates decide on them."""
         axes, results, densities = np.zeros(len(self.axes)), list[Results](), list[FloatArray]()
         for number, segment in enumerate(self._segments):
-            found = innovations(segment, config, None if outcomes is None else outcomes[number])
+            filtered = innovations(segment, config, None if outcomes is None else outcomes[number])
             gates = np.array([config.sensors[name].gate for name in segment.sensors])[segment.measurement_rows.source]
-            densities.append(log_density(found.innovation, found.innovation_sd, found.outcome, gates[:, None]))
-            results.append(found)
+            densities.append(log_density(filtered.innovation, filtered.innovation_sd, filtered.outcome, gates[:, None]))
+            results.append(filtered)
         for part in self._parts:
             axes[part.axis] += float(densities[part.whole][part.rows, part.column].sum())
         return Point(config, axes, np.zeros(len(axes)), results)
@@ -349,32 +354,34 @@ class Likelihood:
         def of(part: _Part) -> tuple[list[int], FloatArray, FloatArray]:
             """Which parameters a part depends on, the scores of its pieces (p, pieces), and its information (p, p)."""
             outcome = outcomes[part.whole][part.rows, part.column]
-            mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
+            numbers = [
+                number for number, parameter in enumerate(parameters) if parameter.axis in (None, self.axes[part.axis])
+            ]
             beside = list[tuple[FusionConfig, FusionConfig, float]]()
-            for one in (parameters[number] for number in mine):
-                at, step = one.at(config), _LOG_STEP if one.log else _STEP
-                beside.append((one.move(config, at - step), one.move(config, at + step), 2.0 * step))
-            found, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
-            fused, sd = outcome != int(Outcome.REJECTED), found.innovation_sd[:, 0]
-            r, d_nu, d_s = found.innovation[:, 0] / sd, d_nu[:, :, 0] * (fused / sd), d_s[:, :, 0] / sd**2
+            for parameter in (parameters[number] for number in numbers):
+                at, step = parameter.at(config), _LOG_STEP if parameter.log else _STEP
+                beside.append((parameter.move(config, at - step), parameter.move(config, at + step), 2.0 * step))
+            filtered, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
+            fused, sd = outcome != int(Outcome.REJECTED), filtered.innovation_sd[:, 0]
+            r, d_nu, d_s = filtered.innovation[:, 0] / sd, d_nu[:, :, 0] * (fused / sd), d_s[:, :, 0] / sd**2
             excess = np.where(fused, r * r - 1.0, -1.0)
             begins = np.unique(np.arange(_PIECES) * len(r) // _PIECES)
             score = np.add.reduceat(0.5 * d_s * excess - d_nu * r, begins, axis=1)
-            return mine, score, d_nu @ d_nu.T + 0.5 * d_s @ d_s.T
+            return numbers, score, d_nu @ d_nu.T + 0.5 * d_s @ d_s.T
 
         k = len(parameters)
         information, scores = np.zeros((k, k)), np.zeros((len(self._segments), k, _PIECES))
-        for part, (mine, score, known) in zip(self._parts, in_threads(of, self._parts), strict=True):
-            scores[part.whole, mine, : score.shape[1]] += score
-            information[np.ix_(mine, mine)] += known
+        for part, (numbers, score, information_here) in zip(self._parts, in_threads(of, self._parts), strict=True):
+            scores[part.whole, numbers, : score.shape[1]] += score
+            information[np.ix_(numbers, numbers)] += information_here
         return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
 
 
 def _certain(config: FusionConfig) -> FusionConfig:
     """The configuration of an arm without any noise: no measurement moves its estimate."""
     sensors = {
-        name: msgspec.structs.replace(one, bias_sd=0.0, bias_drift_sd=0.0, gate=0.0)
-        for name, one in config.sensors.items()
+        name: msgspec.structs.replace(sensor, bias_sd=0.0, bias_drift_sd=0.0, gate=0.0)
+        for name, sensor in config.sensors.items()
     }
     process = dict.fromkeys(config.process, Process(input_noise=0.0, drift=0.0))
     return msgspec.structs.replace(config, start=Start(offset_sd=0.0), process=process, sensors=sensors)
@@ -388,6 +395,6 @@ def _decided(segment: Segment, until: float | None, latest: float | None) -> Seg
         chosen &= rows.time <= segment.origin + round(until * 1e9)
     if latest is not None:
         chosen &= rows.stamp - round(latest * 1e9) >= segment.origin
-    known = np.where((rows.known == Outcome.FUSED) & chosen[:, None], rows.known, ABSENT).astype(np.uint8)
-    kept = np.flatnonzero((known != ABSENT).any(axis=1))
-    return replace(segment, measurement_rows=rows._replace(known=known).rows(kept))
+    decisions = np.where((rows.known == Outcome.FUSED) & chosen[:, None], rows.known, ABSENT).astype(np.uint8)
+    kept = np.flatnonzero((decisions != ABSENT).any(axis=1))
+    return replace(segment, measurement_rows=rows._replace(known=decisions).rows(kept))

@@ -49,20 +49,20 @@ def point(
 ) -> Point:
     """Evaluate a configuration; with ``outcomes`` these are repeated and its gates are not applied."""
     prior = np.zeros(len(likelihood.axes))
-    for one in free:
-        prior[0 if one.axis is None else likelihood.axes.index(one.axis)] += one.log_prior(config)
+    for parameter in free:
+        prior[0 if parameter.axis is None else likelihood.axes.index(parameter.axis)] += parameter.log_prior(config)
     return replace(likelihood.evaluate(config, outcomes), priors=prior)
 
 
 def derivatives(likelihood: Likelihood, at: Point, free: Sequence[Parameter]) -> Derivatives:
     """Score and information of the log-posterior at a point."""
-    found = likelihood.derivatives(at.config, free, at.outcomes)
-    score, information = found.score.copy(), found.information.copy()
-    for number, one in enumerate(free):
-        more, known = one.prior_score(at.config)
+    derivatives_here = likelihood.derivatives(at.config, free, at.outcomes)
+    score, information = derivatives_here.score.copy(), derivatives_here.information.copy()
+    for number, parameter in enumerate(free):
+        more, information_here = parameter.prior_score(at.config)
         score[number] += more
-        information[number, number] += known
-    return Derivatives(score, information, found.scatter)
+        information[number, number] += information_here
+    return Derivatives(score, information, derivatives_here.scatter)
 
 
 def maximise(
@@ -105,19 +105,19 @@ class _Ascent:
         tolerance: float,
     ) -> None:
         self._likelihood, self._free, self._outcomes, self._tolerance = likelihood, free, outcomes, tolerance
-        self._low, self._high = np.array([one.range for one in free]).reshape(-1, 2).T
-        self._reach = _REACH * np.array([one.scale for one in free])
-        self._axis = [-1 if one.axis is None else likelihood.axes.index(one.axis) for one in free]
+        self._low, self._high = np.array([parameter.range for parameter in free]).reshape(-1, 2).T
+        self._reach = _REACH * np.array([parameter.scale for parameter in free])
+        self._axis = [-1 if parameter.axis is None else likelihood.axes.index(parameter.axis) for parameter in free]
         self._damping = np.full(len(free), _FIRST_DAMPING)
 
     def better(self, best: Point) -> tuple[Point, FloatArray, float]:
         """A better point, the step to it and what it was expected to gain; ``best`` itself if there is none."""
         at, failed = coordinates(best.config, self._free), False
-        found = derivatives(self._likelihood, best, self._free)
+        slopes = derivatives(self._likelihood, best, self._free)
         low, high = np.maximum(self._low - at, -self._reach), np.minimum(self._high - at, self._reach)
         while True:
-            step = bounded_step(found.score, found.information, low, high, self._damping)
-            expected = float(found.score @ step) - 0.5 * float(step @ found.information @ step)
+            step = bounded_step(slopes.score, slopes.information, low, high, self._damping)
+            expected = float(slopes.score @ step) - 0.5 * float(step @ slopes.information @ step)
             if not expected > 0.0 or self._damping.min() > _LAST_DAMPING:
                 return best, step, expected
             trial = self._point(best, at + step)
@@ -150,19 +150,19 @@ def maximise_by_axis(
     likelihood: Likelihood, start: FusionConfig, free: Sequence[Parameter], notify: Notify, tolerance: float
 ) -> Point:
     """Find the nearest maximum of each axis, several at a time; of all together where a parameter is shared."""
-    if any(one.axis is None for one in free):
+    if any(parameter.axis is None for parameter in free):
         return maximise(likelihood, start, free, notify, tolerance=tolerance)
 
     def of(axis: str) -> FusionConfig:
-        mine = [one for one in free if one.axis == axis]
-        return maximise(likelihood.of_axis(axis), start, mine, tolerance=tolerance).config
+        own_parameters = [parameter for parameter in free if parameter.axis == axis]
+        return maximise(likelihood.of_axis(axis), start, own_parameters, tolerance=tolerance).config
 
     best, axes = start, list(likelihood.sensors)
     for axis, config in zip(axes, in_threads(of, axes), strict=True):
         best = with_axis_of(best, config, axis)
-    found = point(likelihood, best, free)
-    notify(found)
-    return found
+    peak = point(likelihood, best, free)
+    notify(peak)
+    return peak
 
 
 def maximise_with_gates(
@@ -181,9 +181,9 @@ def maximise_with_gates(
     for _ in range(_GATE_ROUNDS):
         peak = maximise(likelihood, best.config, free, outcomes=best.outcomes)
         at = coordinates(best.config, free)
-        there = coordinates(peak.config, free)
+        target = coordinates(peak.config, free)
         for share in _SHARES:
-            trial = point(likelihood, moved(best.config, free, at + share * (there - at)), free)
+            trial = point(likelihood, moved(best.config, free, at + share * (target - at)), free)
             if trial.log_posterior > best.log_posterior + _TOLERANCE:
                 break
         else:
@@ -195,12 +195,14 @@ def maximise_with_gates(
 
 def past_bumps(likelihood: Likelihood, best: Point, free: Sequence[Parameter], notify: Notify = ignore) -> Point:
     """Pass the small bumps that the likelihood has along a time, where measurements pass commands and each other."""
-    for one in free:
-        if one.fit not in ("delay", "latency"):
+    for parameter in free:
+        if parameter.fit not in ("delay", "latency"):
             continue
-        at = one.at(best.config)
-        near = [point(likelihood, one.move(best.config, one.coordinate(at + shift)), free) for shift in _BUMPS]
-        beside = max(near, key=lambda found: found.log_posterior)
+        at = parameter.at(best.config)
+        near = [
+            point(likelihood, parameter.move(best.config, parameter.coordinate(at + shift)), free) for shift in _BUMPS
+        ]
+        beside = max(near, key=lambda peak: peak.log_posterior)
         if beside.log_posterior > best.log_posterior + _TOLERANCE:
             best = maximise(likelihood, beside.config, free, notify)
     return best

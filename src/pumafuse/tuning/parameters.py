@@ -18,7 +18,7 @@ from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor
 from ..model.arm import Sag
 from ..model.plants import SecondOrder
 from ..units import ending, of_kind, si
-from .arms import BELIEF, BENDS, BEYOND, Arm, Rest, longest_delay
+from .arms import BELIEF, BENDS, BEYOND, Arm, NoiseModel, longest_delay
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale", "bias"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -53,13 +53,13 @@ def _changed(node: Any, path: Path, value: object, root: Any) -> Any:
         return value
     if isinstance(node, int | float):
         node = dict.fromkeys(root.arm.axes, node)
-    name, rest = path[0], path[1:]
+    name, tail = path[0], path[1:]
     if isinstance(node, dict):
         table = cast("dict[str, Any]", node)
-        return {**table, name: _changed(table.get(name), rest, value, root)}
+        return {**table, name: _changed(table.get(name), tail, value, root)}
     other = copy(node)  # unchecked: a search moves a configuration thousands of times, within bounds
-    msgspec.structs.force_setattr(other, name, _changed(getattr(node, name), rest, value, root))
-    if not rest and hasattr(node, f"{name}_ci95"):
+    msgspec.structs.force_setattr(other, name, _changed(getattr(node, name), tail, value, root))
+    if not tail and hasattr(node, f"{name}_ci95"):
         msgspec.structs.force_setattr(other, f"{name}_ci95", None)
     return other
 
@@ -99,7 +99,7 @@ class Parameter:
         """The bounds as coordinates."""
         return self.coordinate(self.bounds[0]), self.coordinate(self.bounds[1])
 
-    def given(self, config: FusionConfig) -> float | None:
+    def configured(self, config: FusionConfig) -> float | None:
         """The number as configured [SI]; None where it is not: no recovery, or a plant of the other order."""
         if self.fit == "delay" and self.axis is not None:
             return config.arm.delay_of(self.axis)
@@ -112,7 +112,7 @@ class Parameter:
 
     def get(self, config: FusionConfig) -> float:
         """The number in a configuration [SI]; the prior's mean where it is not configured."""
-        value = self.given(config)
+        value = self.configured(config)
         return self.value(cast("tuple[float, float]", self.prior)[0]) if value is None else value
 
     def put(self, config: FusionConfig, value: float) -> FusionConfig:
@@ -159,23 +159,23 @@ class Parameter:
         mean, sd = cast("tuple[float, float]", self.prior)
         return (self.at(config) - mean) / sd
 
-    def of(self, known: FusionConfig, axis: str | None, sensor: str | None) -> Parameter:
-        """This line of the table for an axis and a sensor; bounds about the number in ``known`` if not log."""
-        kind = known.arm.kinds[0] if axis is None else known.arm.axes[axis].kind
+    def of(self, config: FusionConfig, axis: str | None, sensor: str | None) -> Parameter:
+        """This line of the table for an axis and a sensor; bounds about the number in ``config`` if not log."""
+        kind = config.arm.kinds[0] if axis is None else config.arm.axes[axis].kind
         key = ".".join(of_kind(part, kind) for part in self.key.split(".")).format(axis=axis, sensor=sensor)
         path = tuple(part.format(axis=axis, sensor=sensor) for part in self.path)
-        one = replace(self, key=key, path=path, axis=axis, sensor=sensor)
-        if one.path[-1] == "disturbance_time":  # what is faster is no motion of an arm but noise of its sensors
-            return replace(one, bounds=(quickest(known), one.bounds[1]))
+        line = replace(self, key=key, path=path, axis=axis, sensor=sensor)
+        if line.path[-1] == "disturbance_time":  # what is faster is no motion of an arm but noise of its sensors
+            return replace(line, bounds=(quickest(config), line.bounds[1]))
         if self.log or "sag" in path:
-            return one
-        middle, (low, high) = one.get(known), self.bounds
+            return line
+        middle, (low, high) = line.get(config), self.bounds
         if self.fit == "delay":
-            return replace(one, bounds=(0.0, max(longest_delay(known.arm.update_period), middle)))
+            return replace(line, bounds=(0.0, max(longest_delay(config.arm.update_period), middle)))
         if self.fit == "scale":  # shares of it: a scale of 0 is none
-            low, high, one = low * abs(middle), high * abs(middle), replace(one, scale=self.scale * abs(middle))
+            low, high, line = low * abs(middle), high * abs(middle), replace(line, scale=self.scale * abs(middle))
         return replace(
-            one, bounds=(middle + low, middle + high), prior=self.prior and (middle + self.prior[0], self.prior[1])
+            line, bounds=(middle + low, middle + high), prior=self.prior and (middle + self.prior[0], self.prior[1])
         )
 
 
@@ -216,7 +216,7 @@ _TABLE = (
 
 def parameters(
     config: FusionConfig,
-    known: FusionConfig,
+    reference: FusionConfig,
     sensors: Mapping[str, Sequence[str]],
     fit: Sequence[Fit],
     fixed: Iterable[str] = (),
@@ -227,7 +227,7 @@ def parameters(
 
     Args:
         config: Its plants are of the orders to fit.
-        known: The configuration as given: priors and bounds are around its gains and latencies.
+        reference: The configuration as given: priors and bounds are around its gains and latencies.
         sensors: For each axis the sensors that measure it.
         fit: Which kinds.
         fixed: Parts of names: a parameter whose name has all the parts of one, in their order, is left out.
@@ -235,48 +235,56 @@ def parameters(
         believed: The noise that a sensor on an axis is believed to have, within a factor of some 2 [m or rad].
     """
     free = list[Parameter]()
-    for one in _every(known, sensors, fit):
-        if is_fixed(one.key, fixed) or not _belongs(one, config, sensors):
+    for parameter in _every(reference, sensors, fit):
+        if is_fixed(parameter.key, fixed) or not _belongs(parameter, config, sensors):
             continue
-        if one.is_noise:
-            of = str(one.sensor), str(one.axis)
-            one = replace(one, bounds=(max(resolution.get(of, 0.0), one.bounds[0]), one.bounds[1]))
-            one = replace(one, prior=(one.coordinate(believed[of]), BELIEF)) if of in believed else one
-        free.append(one)
+        if parameter.is_noise:
+            of = str(parameter.sensor), str(parameter.axis)
+            parameter = replace(
+                parameter, bounds=(max(resolution.get(of, 0.0), parameter.bounds[0]), parameter.bounds[1])
+            )
+            parameter = (
+                replace(parameter, prior=(parameter.coordinate(believed[of]), BELIEF)) if of in believed else parameter
+            )
+        free.append(parameter)
     return free
 
 
-def _every(known: FusionConfig, sensors: Mapping[str, Sequence[str]], fit: Sequence[Fit]) -> list[Parameter]:
+def _every(reference: FusionConfig, sensors: Mapping[str, Sequence[str]], fit: Sequence[Fit]) -> list[Parameter]:
     """The lines of the table for each axis and its sensors, then those that belong to no axis."""
     used = {name for names in sensors.values() for name in names}
     return [
-        line.of(known, axis, name)
-        for axis, names in (*sensors.items(), (None, [name for name in known.sensors if name in used]))
+        line.of(reference, axis, name)
+        for axis, names in (*sensors.items(), (None, [name for name in reference.sensors if name in used]))
         for line in _TABLE
         if line.fit in fit and ("{axis}" in line.key) == (axis is not None)
         for name in (names if "{sensor}" in line.key else [None])
     ]
 
 
-def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
+def _belongs(parameter: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
     """Whether a configuration has it: a plant's order, play, an own delay, a recovery, a disturbance, a drift.
 
     An axis that rings, and has no plant noise yet, gets none. Friction and loads hold a tool off, and noise that
     shakes such a plant brings it back within half a period: then the estimate of a slower motion is pulled off.
     """
-    if one.axis is not None and one.path[-1].startswith("disturbance"):
-        return config.process[one.axis].disturbance_sd > 0.0
-    if one.axis is not None and one.path[-1] in _PLANT_NOISE and rings(config, one.axis):
-        return one.at_bound(config) != "lower"
-    if one.fit == "bias" and one.sensor is not None:
-        drift = config.sensors[one.sensor].bias_drift_sd
+    if parameter.axis is not None and parameter.path[-1].startswith("disturbance"):
+        return config.process[parameter.axis].disturbance_sd > 0.0
+    if parameter.axis is not None and parameter.path[-1] in _PLANT_NOISE and rings(config, parameter.axis):
+        return parameter.at_bound(config) != "lower"
+    if parameter.fit == "bias" and parameter.sensor is not None:
+        drift = config.sensors[parameter.sensor].bias_drift_sd
         if isinstance(drift, dict):  # one for each axis
-            return drift.get(one.axis, 0.0) > 0.0 if one.axis is not None else one.path[-1] == "bias_time"
-        return one.axis is None and drift > 0.0
-    if one.fit == "delay":
+            return (
+                drift.get(parameter.axis, 0.0) > 0.0
+                if parameter.axis is not None
+                else parameter.path[-1] == "bias_time"
+            )
+        return parameter.axis is None and drift > 0.0
+    if parameter.fit == "delay":
         shares = [axis for axis in axes if config.arm.axes[axis].delay is None]
-        return bool(shares) if one.axis is None else one.axis not in shares
-    return one.given(config) is not None and (one.path[-1] != "play" or one.get(config) > 0.0)
+        return bool(shares) if parameter.axis is None else parameter.axis not in shares
+    return parameter.configured(config) is not None and (parameter.path[-1] != "play" or parameter.get(config) > 0.0)
 
 
 def kinds_of(fit: Iterable[str]) -> list[Fit]:
@@ -304,7 +312,7 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
         axis: [name for name, sensor in config.sensors.items() if sensor.sd_of(axis) is not None]
         for axis in config.arm.axes
     }
-    keys = {one.key for one in _every(config, measured, FITS)}
+    keys = {parameter.key for parameter in _every(config, measured, FITS)}
     keys |= {f"sensors.{name}.{of_kind('bias_sd_mm', kind)}" for name in config.sensors for kind in config.arm.kinds}
     for name in fixed:
         if not any(is_fixed(key, [name]) for key in keys):
@@ -348,13 +356,13 @@ def smallest_sd(config: FusionConfig, name: str) -> float:
 
 def coordinates(config: FusionConfig, free: Sequence[Parameter]) -> FloatArray:
     """The coordinate of each parameter in a configuration, (k,)."""
-    return np.array([one.at(config) for one in free])
+    return np.array([parameter.at(config) for parameter in free])
 
 
 def moved(config: FusionConfig, free: Sequence[Parameter], coordinates: Iterable[float]) -> FusionConfig:
     """The configuration with every parameter at its coordinate."""
-    for one, coordinate in zip(free, coordinates, strict=True):
-        config = one.move(config, float(coordinate))
+    for parameter, coordinate in zip(free, coordinates, strict=True):
+        config = parameter.move(config, float(coordinate))
     return config
 
 
@@ -410,24 +418,24 @@ def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     return changed(config, ("arm", "axes", axis, "delay"), arm.delay)
 
 
-def with_rest(config: FusionConfig, axis: str, rest: Rest, sensors: Sequence[str]) -> FusionConfig:
+def with_noise(config: FusionConfig, axis: str, noise: NoiseModel, sensors: Sequence[str]) -> FusionConfig:
     """The configuration with what an arm leaves of an axis as its noise and that of these sensors."""
     process = Process(
         input_noise=0.0,
-        drift=rounded(rest.walk),
-        disturbance_sd=rounded(rest.disturbance_sd),
-        disturbance_time=rounded(rest.disturbance_time),
-        disturbance_kind="matern" if rest.smoothness > 1.0 else "ou",
+        drift=rounded(noise.walk),
+        disturbance_sd=rounded(noise.disturbance_sd),
+        disturbance_time=rounded(noise.disturbance_time),
+        disturbance_kind="matern" if noise.smoothness > 1.0 else "ou",
     )
-    for name, sd in zip(sensors, rest.sd.tolist(), strict=True):
+    for name, sd in zip(sensors, noise.sd.tolist(), strict=True):
         config = changed(config, ("sensors", name, "sd", axis), rounded(sd))
     return changed(config, ("process", axis), process)
 
 
-def with_gates(config: FusionConfig, given: FusionConfig, wider: float | None = None) -> FusionConfig:
+def with_gates(config: FusionConfig, gated: FusionConfig, wider: float | None = None) -> FusionConfig:
     """The configuration with the gates of another; with ``wider`` so many times as wide, each component for itself."""
     sensors: dict[str, Sensor] = {}
     for name, sensor in config.sensors.items():
-        gate, rows = given.sensors[name].gate, given.sensors[name].gate_rows if wider is None else False
+        gate, rows = gated.sensors[name].gate, gated.sensors[name].gate_rows if wider is None else False
         sensors[name] = _replace(sensor, gate=(wider or 1.0) * gate, gate_rows=rows)
     return _replace(config, sensors=sensors)

@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
 from ..units import MS
-from .arms import Arm, Limits, Measured, Rest, longest_delay
+from .arms import Arm, Limits, Measured, NoiseModel, longest_delay
 from .parameters import rounded, with_arm
 
 _DELAYS = 61  # dead times that are looked at
@@ -91,36 +91,36 @@ def independent(left: FloatArray) -> float:
 
 def plain_arm(measured: Measured) -> PlainArm | None:
     """The arm that leaves the least squares, without outliers; None where nothing follows the commands."""
-    begin = min((int(one.given[0]) for one in measured.recordings), default=0)
+    begin = min((int(recording.told[0]) for recording in measured.recordings), default=0)
     quarters = measured.liveliest(COMMANDS)
     measured = whole = measured.excerpt(COMMANDS, ROWS)
-    if measured.count < 2 * _FEWEST or not any(np.ptp(one.command) > 0.0 for one in measured.recordings):
+    if measured.count < 2 * _FEWEST or not any(np.ptp(recording.command) > 0.0 for recording in measured.recordings):
         return None
-    late, rest = delays(measured).tolist(), measured.white(Arm(0.0, float(LAGS[0])))
+    late, noise = delays(measured).tolist(), measured.white(Arm(0.0, float(LAGS[0])))
     arms = [Arm(delay, lag) for delay in late for lag in LAGS.tolist()]
-    measured = measured.without_far_from(_fitted(measured, arms, rest, 1)[0], _OUTLIER)
-    found = _fitted(measured, arms, rest, _STARTS)
-    rest = measured.white(found[0])
-    begun = [measured.fitted(arm, ["delay", "lag", "gain"], rest, _ANY).arm for arm in found]
-    for one in begun:  # along the ridge on which dead time and plant make up for each other
-        for lag in (one.lag * np.exp(_AROUND)).tolist():
-            arms += [Arm(delay, lag) for delay in np.maximum(one.delay + one.lag - lag + _BESIDE, 0.0).tolist()]
+    measured = measured.without_far_from(_fitted(measured, arms, noise, 1)[0], _OUTLIER)
+    starts = _fitted(measured, arms, noise, _STARTS)
+    noise = measured.white(starts[0])
+    begun = [measured.fitted(arm, ["delay", "lag", "gain"], noise, _ANY).arm for arm in starts]
+    for start in begun:  # along the ridge on which dead time and plant make up for each other
+        for lag in (start.lag * np.exp(_AROUND)).tolist():
+            arms += [Arm(delay, lag) for delay in np.maximum(start.delay + start.lag - lag + _BESIDE, 0.0).tolist()]
     arms += begun
-    log, gains = measured.weighed(arms, rest, _ANY)
-    place = int(np.argmax(log))
-    arm = arms[place]._replace(gain=float(gains[place]))
+    log, gains = measured.weighed(arms, noise, _ANY)
+    best = int(np.argmax(log))
+    arm = arms[best]._replace(gain=float(gains[best]))
     if arm.gain <= 0.0 or measured.count < 2 * _FEWEST:
         return None
-    left, sd = measured.left(arm), float(rest.sd[0])
+    left, sd = measured.left(arm), float(noise.sd[0])
     power = float(left @ left)
     number = independent(left)
     if measured.power - power < min(FOLLOWS / number, _ANYHOW) * power:
         return None
     most = 0.5 * (power * _CHANCE / number + _ROUNDING * measured.power) / sd**2
-    allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
+    allowed = [arm.delay + arm.lag for arm, behind in zip(arms, log[best] - log, strict=True) if behind <= most]
     later = [Arm(delay, float(LAGS[0])) for delay in late]
-    each = [*measured.likeliest(later, rest, None, 1), *_fitted(measured, later, rest, 1)]
-    delayed = min(each, key=lambda one: off(measured, one))
+    each = [*measured.likeliest(later, noise, None, 1), *_fitted(measured, later, noise, 1)]
+    delayed = min(each, key=lambda candidate: off(measured, candidate))
     between = float(min(allowed)), float(max(allowed))
     step = None
     if len(whole.recordings) == 1:  # of several nothing is told
@@ -134,31 +134,34 @@ def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
 
     None where none does. The ``arm`` is near that; the first command was given at ``begin`` [ns].
     """
-    rest = measured.white(arm)
-    arm = measured.fitted(arm, ["delay", "gain"], rest, _ANY).arm
+    noise = measured.white(arm)
+    arm = measured.fitted(arm, ["delay", "gain"], noise, _ANY).arm
     whole = measured.left(arm)
-    least, found = _HALVED * float(whole @ whole), None
-    time = np.sort(np.concatenate([one.time for one in measured.recordings]))
+    least, step = _HALVED * float(whole @ whole), None
+    time = np.sort(np.concatenate([recording.time for recording in measured.recordings]))
     splits = _SPLITS if len(measured.recordings) == 1 else _OF_QUARTERS
-    for place in np.rint(splits * (len(time) - 1)).astype(int).tolist():
-        edge = 0.5 * float(time[place - 1] + time[place])  # between parts of a recording it may be anywhere
+    for row in np.rint(splits * (len(time) - 1)).astype(int).tolist():
+        edge = 0.5 * float(time[row - 1] + time[row])  # between parts of a recording it may be anywhere
         squares, lags = 0.0, list[float]()
         for later in (False, True):
-            mine = [one._replace(weight=one.weight * ((one.time >= edge) == later)) for one in measured.recordings]
-            part = measured.of(mine)
-            fitted = part.fitted(arm, ["delay", "gain"], rest, _ANY).arm
+            parts = [
+                recording._replace(weight=recording.weight * ((recording.time >= edge) == later))
+                for recording in measured.recordings
+            ]
+            part = measured.of(parts)
+            fitted = part.fitted(arm, ["delay", "gain"], noise, _ANY).arm
             left = part.left(fitted)
             squares, lags = squares + float(left @ left), [*lags, fitted.total]
         if squares < least and abs(lags[1] - lags[0]) > _NOTABLE * arm.total:
-            least, found = squares, LagStep((edge - begin) / 1e9, *lags)
-    return found
+            least, step = squares, LagStep((edge - begin) / 1e9, *lags)
+    return step
 
 
-def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list[Arm]:
+def _fitted(measured: Measured, arms: list[Arm], noise: NoiseModel, count: int) -> list[Arm]:
     """The arms that leave the least squares with their best gain."""
-    log, gain = measured.weighed(arms, rest, _ANY)
+    log, gain = measured.weighed(arms, noise, _ANY)
     log = np.where(gain > 0.0, log, -np.inf)
-    return [arms[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:count].tolist()]
+    return [arms[number]._replace(gain=float(gain[number])) for number in np.argsort(-log)[:count].tolist()]
 
 
 class Doubt(NamedTuple):
@@ -218,17 +221,20 @@ def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[s
 
     Play, a fastest speed and a gain of the speed make a lag another one with each motion: then it is not compared.
     """
-    found: dict[str, Doubt] = {}
-    for axis, one in plain.items():
-        if one is not None:
-            mine = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
-            doubt, ends = Doubt(one, off(one.measured, mine), mine.total), (*one.lag_ci95, one.delayed.total)
-            allowed = min(ends) <= mine.total <= max(ends)
-            if doubt.is_worse or not (allowed or mine.play or mine.max_speed or mine.slope):
-                found[axis] = doubt
-    return found
+    doubts_by_axis: dict[str, Doubt] = {}
+    for axis, plain_here in plain.items():
+        if plain_here is not None:
+            configured = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
+            doubt, ends = (
+                Doubt(plain_here, off(plain_here.measured, configured), configured.total),
+                (*plain_here.lag_ci95, plain_here.delayed.total),
+            )
+            allowed = min(ends) <= configured.total <= max(ends)
+            if doubt.is_worse or not (allowed or configured.play or configured.max_speed or configured.slope):
+                doubts_by_axis[axis] = doubt
+    return doubts_by_axis
 
 
 def with_plain_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     """The configuration with an axis's arm by least squares: of first order, with a gain that stays."""
-    return with_arm(config, axis, Arm(*(rounded(one) for one in arm)))
+    return with_arm(config, axis, Arm(*(rounded(number) for number in arm)))

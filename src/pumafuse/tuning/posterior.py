@@ -46,7 +46,7 @@ class Model(NamedTuple):
         return self.order + GAINS.index(self.gain)
 
 
-MODELS = tuple(Model(*one) for one in product((1, 2), GAINS))
+MODELS = tuple(Model(*pair) for pair in product((1, 2), GAINS))
 
 
 @dataclass(frozen=True)
@@ -70,23 +70,26 @@ class Branch:
     @property
     def delays(self) -> FloatArray:
         """Of the entries [s], (n,)."""
-        return np.array([one.delay for one in self.entries])
+        return np.array([entry.delay for entry in self.entries])
 
     @property
     def log_density(self) -> FloatArray:
         """Of the entries, (n,)."""
-        return np.array([one.log_density for one in self.entries])
+        return np.array([entry.log_density for entry in self.entries])
 
     def at(self, delays: FloatArray) -> FloatArray:
         """The log-density at delays, (m,): beyond the ends as it falls there; where it does not, that is not known."""
-        known, found = self.delays, self.log_density
-        if len(known) < 2:
-            return np.where(np.abs(delays - known[0]) < SHORTEST, found[0], -np.inf)
-        middle = np.interp(delays, known, found)
-        low, high = (found[1] - found[0]) / (known[1] - known[0]), (found[-1] - found[-2]) / (known[-1] - known[-2])
-        below = found[0] + low * (delays - known[0]) if low > 0.0 else -np.inf
-        above = found[-1] + high * (delays - known[-1]) if high < 0.0 else -np.inf
-        return np.where(delays < known[0], below, np.where(delays > known[-1], above, middle))
+        delays_here, logs = self.delays, self.log_density
+        if len(delays_here) < 2:
+            return np.where(np.abs(delays - delays_here[0]) < SHORTEST, logs[0], -np.inf)
+        middle = np.interp(delays, delays_here, logs)
+        low, high = (
+            (logs[1] - logs[0]) / (delays_here[1] - delays_here[0]),
+            (logs[-1] - logs[-2]) / (delays_here[-1] - delays_here[-2]),
+        )
+        below = logs[0] + low * (delays - delays_here[0]) if low > 0.0 else -np.inf
+        above = logs[-1] + high * (delays - delays_here[-1]) if high < 0.0 else -np.inf
+        return np.where(delays < delays_here[0], below, np.where(delays > delays_here[-1], above, middle))
 
 
 class Mixture(NamedTuple):
@@ -100,17 +103,17 @@ class Mixture(NamedTuple):
 
     def log_odds(self, chosen: Callable[[Model], bool]) -> float:
         """The logarithm of how much likelier the models that are chosen are than the others."""
-        models = np.array([chosen(one) for one in MODELS])[self.model.astype(np.int64)]
-        mine, others = (float(self.weight[some].sum()) for some in (models, ~models))
-        return math.log(max(mine, _NEVER)) - math.log(max(others, _NEVER))
+        models = np.array([chosen(model) for model in MODELS])[self.model.astype(np.int64)]
+        chosen_weight, others = (float(self.weight[some].sum()) for some in (models, ~models))
+        return math.log(max(chosen_weight, _NEVER)) - math.log(max(others, _NEVER))
 
     def quantiles(self, quantity: Quantity, chosen: Callable[[Model], bool], share: float = 0.95) -> tuple[float, ...]:
         """The ends of the middle ``share`` of a quantity under the models that are chosen."""
         from scipy.special import ndtr  # takes a while to import
 
-        models = np.array([chosen(one) for one in MODELS])
-        mine = models[self.model.astype(np.int64)] & np.isfinite(self.mean[quantity]) & (self.weight > 1e-9)
-        mean, sd, weight = self.mean[quantity][mine], self.sd[quantity][mine], self.weight[mine]
+        models = np.array([chosen(model) for model in MODELS])
+        rows = models[self.model.astype(np.int64)] & np.isfinite(self.mean[quantity]) & (self.weight > 1e-9)
+        mean, sd, weight = self.mean[quantity][rows], self.sd[quantity][rows], self.weight[rows]
         sd = np.maximum(sd, 1e-12)
         grid = np.unique(np.concatenate([mean + times * sd for times in np.linspace(-4.0, 4.0, 33)]))
         if len(grid) > _GRID:
@@ -127,21 +130,21 @@ class AxisPosterior:
 
     def log_density(self, delays: FloatArray) -> FloatArray:
         """The log-density of the delay, all models together, (m,)."""
-        found = np.full(len(delays), -np.inf)
+        densities = np.full(len(delays), -np.inf)
         for model in dict.fromkeys(branch.model for branch in self.branches):  # one order in every process: it rounds
             each = [branch.at(delays) for branch in self.branches if branch.model == model]
-            found = np.logaddexp(found, np.max(each, axis=0))
-        return found
+            densities = np.logaddexp(densities, np.max(each, axis=0))
+        return densities
 
     def mixture(self, others: Iterable[AxisPosterior] = (), sharing: float = 1.0) -> Mixture:
         """The mixture, with what other axes say of the dead time, as it is likely by ``sharing`` that they share it."""
         parts = [self._points(branch) for branch in self.branches]
         delay = np.concatenate([part.delay for part in parts])
-        own = np.concatenate([part.weight for part in parts])
-        shared = own + sum(one.log_density(delay) for one in others)
-        found, alone = (np.exp(logs - logs.max()) for logs in (shared, own))
+        weights = np.concatenate([part.weight for part in parts])
+        shared = weights + sum(other.log_density(delay) for other in others)
+        together, alone = (np.exp(logs - logs.max()) for logs in (shared, weights))
         return Mixture(
-            sharing * found / found.sum() + (1.0 - sharing) * alone / alone.sum(),
+            sharing * together / together.sum() + (1.0 - sharing) * alone / alone.sum(),
             np.concatenate([part.model for part in parts]),
             delay,
             {name: np.concatenate([part.mean[name] for part in parts]) for name in QUANTITIES},
@@ -150,9 +153,9 @@ class AxisPosterior:
 
     def _points(self, branch: Branch) -> Mixture:
         """Points between the entries of a branch; the logarithms of their weights."""
-        known, count = branch.delays, len(branch.entries)
-        place, index = np.linspace(0.0, count - 1.0, _REFINED * (count - 1) + 1), np.arange(count)
-        delay = np.interp(place, index, known)
+        delays, count = branch.delays, len(branch.entries)
+        position, index = np.linspace(0.0, count - 1.0, _REFINED * (count - 1) + 1), np.arange(count)
+        delay = np.interp(position, index, delays)
         width = np.gradient(delay) if len(delay) > 1 else np.array([SHORTEST])
         log = branch.at(delay) + np.log(width)
         for other in self.branches:  # of two maxima that meet, each counts where it is the higher one
@@ -160,14 +163,14 @@ class AxisPosterior:
                 log = np.where(other.at(delay) > branch.at(delay) + 1e-9, -np.inf, log)
 
         def between(values: list[float]) -> FloatArray:
-            return np.asarray(np.interp(place, index, values), dtype=np.float64)
+            return np.asarray(np.interp(position, index, values), dtype=np.float64)
 
         return Mixture(
             np.asarray(log, dtype=np.float64),
             np.full(len(delay), float(MODELS.index(branch.model))),
             np.asarray(delay, dtype=np.float64),
-            {name: between([one.means.get(name, np.nan) for one in branch.entries]) for name in QUANTITIES},
-            {name: between([one.sds.get(name, np.nan) for one in branch.entries]) for name in QUANTITIES},
+            {name: between([entry.means.get(name, np.nan) for entry in branch.entries]) for name in QUANTITIES},
+            {name: between([entry.sds.get(name, np.nan) for entry in branch.entries]) for name in QUANTITIES},
         )
 
 
@@ -184,7 +187,7 @@ def sharing(posteriors: Mapping[str, AxisPosterior]) -> list[str]:
     gain = _gain_of_sharing(posteriors)
     shares: list[str] = list(posteriors)
     while len(shares) > 1:
-        fewer: list[list[str]] = [[axis for axis in shares if axis != one] for one in shares]
+        fewer: list[list[str]] = [[axis for axis in shares if axis != left_out] for left_out in shares]
         best = max(fewer, key=gain)
         if gain(shares) >= gain(best):
             return shares
@@ -198,7 +201,8 @@ def own_worth(posteriors: Mapping[str, AxisPosterior], shares: Sequence[str]) ->
         return {}
     gain = _gain_of_sharing(posteriors)
     return {
-        axis: gain(one for one in shares if one != axis) - gain(dict.fromkeys([*shares, axis])) for axis in posteriors
+        axis: gain(other for other in shares if other != axis) - gain(dict.fromkeys([*shares, axis]))
+        for axis in posteriors
     }
 
 
@@ -206,7 +210,7 @@ def _gain_of_sharing(posteriors: Mapping[str, AxisPosterior]) -> Callable[[Itera
     """How much likelier one delay for some axes is than one each."""
     grid = _grid(posteriors.values())
     width = np.gradient(grid)
-    logs = {axis: one.log_density(grid) for axis, one in posteriors.items()}
+    logs = {axis: posterior.log_density(grid) for axis, posterior in posteriors.items()}
 
     def evidence(log: FloatArray) -> float:
         top = float(log.max())
@@ -215,11 +219,13 @@ def _gain_of_sharing(posteriors: Mapping[str, AxisPosterior]) -> Callable[[Itera
     alone = {axis: evidence(log) for axis, log in logs.items()}
 
     def gain(axes: Iterable[str]) -> float:
-        mine = list(axes)
-        if len(mine) < 2:
+        together = list(axes)
+        if len(together) < 2:
             return 0.0
-        price = (len(mine) - 1) * (math.log(_OWN_WIDTH) + _SHARED)
-        return evidence(np.sum([logs[axis] for axis in mine], axis=0)) - sum(alone[axis] for axis in mine) + price
+        price = (len(together) - 1) * (math.log(_OWN_WIDTH) + _SHARED)
+        return (
+            evidence(np.sum([logs[axis] for axis in together], axis=0)) - sum(alone[axis] for axis in together) + price
+        )
 
     return gain
 
@@ -227,7 +233,7 @@ def _gain_of_sharing(posteriors: Mapping[str, AxisPosterior]) -> Callable[[Itera
 def shared_delay(posteriors: Sequence[AxisPosterior]) -> float:
     """The delay of axes that share one [s]: the median of what they say together."""
     grid = _grid(posteriors)
-    log: FloatArray = np.sum([one.log_density(grid) for one in posteriors], axis=0)
+    log: FloatArray = np.sum([posterior.log_density(grid) for posterior in posteriors], axis=0)
     weight: FloatArray = np.exp(log - log.max()) * np.asarray(np.gradient(grid), dtype=np.float64)
     below: FloatArray = np.cumsum(weight) - 0.5 * weight
     return float(np.interp(0.5 * float(weight.sum()), below, grid))
@@ -235,11 +241,11 @@ def shared_delay(posteriors: Sequence[AxisPosterior]) -> float:
 
 def _grid(posteriors: Iterable[AxisPosterior]) -> FloatArray:
     """Delays that resolve the densities of all axes [s], ascending."""
-    known = np.unique(np.concatenate([branch.delays for one in posteriors for branch in one.branches]))
-    if len(known) < 2:
-        return known[0] + SHORTEST * np.arange(-1.0, 2.0)
-    place = np.linspace(0.0, len(known) - 1.0, _REFINED * (len(known) - 1) + 1)
-    return np.interp(place, np.arange(len(known)), known)
+    delays = np.unique(np.concatenate([branch.delays for posterior in posteriors for branch in posterior.branches]))
+    if len(delays) < 2:
+        return delays[0] + SHORTEST * np.arange(-1.0, 2.0)
+    position = np.linspace(0.0, len(delays) - 1.0, _REFINED * (len(delays) - 1) + 1)
+    return np.interp(position, np.arange(len(delays)), delays)
 
 
 def chosen_model(mixture: Mixture) -> Model:

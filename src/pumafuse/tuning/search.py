@@ -29,7 +29,7 @@ from .parameters import (
     with_axis_of,
     with_disturbance,
     with_gates,
-    with_rest,
+    with_noise,
     with_shared_delay,
 )
 from .posterior import GAINS, GainKind, Mixture, Model
@@ -73,19 +73,19 @@ class Search:
         With ``one_delay`` all axes whose delay is free share one whatever the measurements say.
         """
         config = self._with_arms(config, one_delay)
-        for one in self.free(config):
-            if one.fit == "latency":
-                config = self._nearest_latency(config, one)
-        found = list[Point]()
+        for parameter in self.free(config):
+            if parameter.fit == "latency":
+                config = self._nearest_latency(config, parameter)
+        points = list[Point]()
         for start in self._noise_models(config):
-            if found:  # an arm that is likeliest under one noise is near that under another
-                start = self._with_arm_of(start, found[0].config)
-            found.append(self._maximum(start))
-        likeliest = self._likeliest(found)
+            if points:  # an arm that is likeliest under one noise is near that under another
+                start = self._with_arm_of(start, points[0].config)
+            points.append(self._maximum(start))
+        likeliest = self._likeliest(points)
         smooth = self._smoothly_disturbed(likeliest)
-        if self._likeliest([*found, *smooth]) != likeliest:
-            found += smooth
-        best = self._without_needless(self._from_wider_gates(self._likeliest(found, told=True)))
+        if self._likeliest([*points, *smooth]) != likeliest:
+            points += smooth
+        best = self._without_needless(self._from_wider_gates(self._likeliest(points, told=True)))
         best = self._under_gates(best, config)
         for axis, why in self.reasons.items():
             if rings(best.config, axis):
@@ -94,40 +94,40 @@ class Search:
 
     def _own(self, config: FusionConfig) -> list[Parameter]:
         """The free parameters that belong to an axis."""
-        return [one for one in self.free(config) if one.axis is not None]
+        return [parameter for parameter in self.free(config) if parameter.axis is not None]
 
     # ---- arms and latencies -----------------------------------------------------------------------------------------
 
     def _with_arms(self, config: FusionConfig, one_delay: bool) -> FusionConfig:
         """The configuration with the likeliest arm of each axis; one delay for those that share it."""
-        searched = {axis: one for axis, one in self.arms.items() if one.freedom.free}
-        delayed = [axis for axis, one in searched.items() if "delay" in one.freedom.free]
-        found, delay = chosen_arms(searched, delayed, one_delay)
-        for axis, one in found.items():
-            config, why = with_arm(config, axis, one.arm), self.reasons[axis]
-            why += _why(searched[axis].freedom, one.mixture, one.model)
+        searched = {axis: search for axis, search in self.arms.items() if search.freedom.free}
+        delayed = [axis for axis, search in searched.items() if "delay" in search.freedom.free]
+        choices, delay = chosen_arms(searched, delayed, one_delay)
+        for axis, choice in choices.items():
+            config, why = with_arm(config, axis, choice.arm), self.reasons[axis]
+            why += _why(searched[axis].freedom, choice.mixture, choice.model)
             if (bent := searched[axis].bent) is not None:
                 why += bent.sentences(config.arm.screen_of(axis))
             if len(delayed) > 1 and axis in delayed:
-                gain = "" if one.worth is None else f" (own {one.worth:+.1f})"
-                why.append(f"delay: {'shared' if one.shares else 'its own'}{gain}")
-        shares = [axis for axis, one in found.items() if one.shares]
+                gain = "" if choice.worth is None else f" (own {choice.worth:+.1f})"
+                why.append(f"delay: {'shared' if choice.shares else 'its own'}{gain}")
+        shares = [axis for axis, choice in choices.items() if choice.shares]
         return config if delay is None else with_shared_delay(config, shares, delay)
 
-    def _nearest_latency(self, config: FusionConfig, one: Parameter) -> FusionConfig:
+    def _nearest_latency(self, config: FusionConfig, latency: Parameter) -> FusionConfig:
         """The configuration with the likeliest latency of a sensor on a grid."""
-        middle, steps = one.get(config), round((LATENCIES[1] - LATENCIES[0]) / _STEP)
+        middle, steps = latency.get(config), round((LATENCIES[1] - LATENCIES[0]) / _STEP)
         shifts: list[float] = np.linspace(*LATENCIES, 1 + steps).tolist()
-        tried = [one.put(config, one.clipped(middle + shift)) for shift in shifts]
+        tried = [latency.put(config, latency.clipped(middle + shift)) for shift in shifts]
         points = (point(self.likelihood, at, self.free(at)) for at in tried)
-        return max(points, key=lambda found: found.log_posterior).config
+        return max(points, key=lambda peak: peak.log_posterior).config
 
     def _with_arm_of(self, config: FusionConfig, other: FusionConfig) -> FusionConfig:
         """The configuration with the arm of another, and with its numbers that all axes share."""
         config = msgspec.structs.replace(config, arm=other.arm)
-        for one in self.free(other):
-            if one.axis is None:
-                config = one.put(config, one.get(other))
+        for parameter in self.free(other):
+            if parameter.axis is None:
+                config = parameter.put(config, parameter.get(other))
         return config
 
     # ---- noise ------------------------------------------------------------------------------------------------------
@@ -141,10 +141,10 @@ class Search:
         for number in range(3):
             model = config
             for axis, search in self.arms.items():
-                model = with_rest(model, axis, search.rests[number], search.sensors)
+                model = with_noise(model, axis, search.noise_models[number], search.sensors)
             models.append(self._with_free_noise(config, model))
-        distinct = [model for place, model in enumerate(models) if model not in models[:place]]
-        return [self._with_quiet(one) for one in distinct]
+        distinct = [model for number, model in enumerate(models) if model not in models[:number]]
+        return [self._with_quiet(model) for model in distinct]
 
     def _smoothly_disturbed(self, config: FusionConfig) -> list[Point]:
         """The maximum with a smooth disturbance of axes that have none, from all that the arm leaves.
@@ -157,33 +157,38 @@ class Search:
         model = config
         for axis in calm:
             model = with_disturbance(model, axis, self.arms[axis].spread, _SLOW)
-        there = self._maximum(model, axes=calm).config
-        return [point(self.likelihood, there, self._own(there))]
+        disturbed = self._maximum(model, axes=calm).config
+        return [point(self.likelihood, disturbed, self._own(disturbed))]
 
     def _with_free_noise(self, config: FusionConfig, model: FusionConfig) -> FusionConfig:
         """The configuration with the noises of a model that are free."""
         for axis in self._may_be_disturbed(config):
             new = model.process[axis]
             config = with_disturbance(config, axis, new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
-        for one in self.free(config):
-            if one.fit == "noise" and (one.sensor or one.path[-1] in _WALKING):
-                none = one.vanishes and one.at_bound(model) == "lower"
-                config = one.put(config, 0.0 if none else one.clipped(one.get(model)))
+        for parameter in self.free(config):
+            if parameter.fit == "noise" and (parameter.sensor or parameter.path[-1] in _WALKING):
+                none = parameter.vanishes and parameter.at_bound(model) == "lower"
+                config = parameter.put(config, 0.0 if none else parameter.clipped(parameter.get(model)))
         return config
 
     def _may_be_disturbed(self, config: FusionConfig) -> list[str]:
         """The axes of which a disturbance is free."""
         for axis in self.likelihood.sensors:
             config = with_disturbance(config, axis, 1.0, 1.0)
-        return [str(one.axis) for one in self.free(config) if one.path[-1] == "disturbance_sd"]
+        return [str(parameter.axis) for parameter in self.free(config) if parameter.path[-1] == "disturbance_sd"]
 
     def _with_quiet(self, config: FusionConfig) -> FusionConfig:
         """The configuration with a little of each free noise that is none in it, from which it can grow."""
-        for one in self.free(config):
-            if one.fit == "noise" and one.vanishes and one.axis in self.arms and one.get(config) <= 30 * one.bounds[0]:
-                share = _QUIET * (10.0 if one.path[-1].startswith("maneuver") else 1.0)
-                little = max(share * self.arms[str(one.axis)].spread, 30.0 * one.bounds[0])
-                config = one.put(config, one.clipped(little))
+        for parameter in self.free(config):
+            if (
+                parameter.fit == "noise"
+                and parameter.vanishes
+                and parameter.axis in self.arms
+                and parameter.get(config) <= 30 * parameter.bounds[0]
+            ):
+                share = _QUIET * (10.0 if parameter.path[-1].startswith("maneuver") else 1.0)
+                little = max(share * self.arms[str(parameter.axis)].spread, 30.0 * parameter.bounds[0])
+                config = parameter.put(config, parameter.clipped(little))
         return config
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
@@ -196,44 +201,46 @@ class Search:
         """
 
         def free(at: FusionConfig) -> list[Parameter]:
-            return [one for one in self.free(at) if axes is None or one.axis in axes]
+            return [parameter for parameter in self.free(at) if axes is None or parameter.axis in axes]
 
         times = _narrower(config) if times is None else times
         gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())
         at = config
         for wider in (times, 1.0) if gated else (1.0,):
             at = with_gates(at, config, wider)
-            if shared := [one for one in free(at) if one.axis is None]:
+            if shared := [parameter for parameter in free(at) if parameter.axis is None]:
                 at = maximise(self.likelihood, at, shared, self.notify, tolerance=_ROUGHLY).config
-            own = [one for one in free(at) if one.axis is not None]
-            at = maximise_by_axis(self.likelihood, at, own, self.notify, _ROUGHLY).config
-        if any(one.axis is None and one.sensor is not None for one in free(at)):  # which trades with noise
+            own_parameters = [parameter for parameter in free(at) if parameter.axis is not None]
+            at = maximise_by_axis(self.likelihood, at, own_parameters, self.notify, _ROUGHLY).config
+        if any(
+            parameter.axis is None and parameter.sensor is not None for parameter in free(at)
+        ):  # which trades with noise
             at = maximise(self.likelihood, at, free(at), self.notify, tolerance=_ROUGHLY).config
-        return point(self.likelihood, at, [one for one in free(at) if one.axis is not None])
+        return point(self.likelihood, at, [parameter for parameter in free(at) if parameter.axis is not None])
 
     def _from_wider_gates(self, config: FusionConfig) -> FusionConfig:
         """The higher maximum of each axis, this one or that reached by way of wider gates, where any are rejected."""
-        found = point(self.likelihood, config, self._own(config))
-        if not self.likelihood.rejecting(found.results):
+        best = point(self.likelihood, config, self._own(config))
+        if not self.likelihood.rejecting(best.results):
             return config
-        peaks = [found, self._maximum(config, _WIDER)]
+        peaks = [best, self._maximum(config, _WIDER)]
         return _best_by_axis(self.likelihood, peaks, [peak.posteriors for peak in peaks])
 
-    def _under_gates(self, best: FusionConfig, given: FusionConfig) -> Point:
+    def _under_gates(self, best: FusionConfig, configured: FusionConfig) -> Point:
         """The highest of the maxima under the gates as given.
 
         Where whole rows are rejected it is looked for from narrower and wider gates.
         """
         free = self.free(best)
-        found = maximise_with_gates(self.likelihood, with_gates(best, given), free, self.notify)
-        whole = any(sensor.gates_rows(given.arm) for sensor in given.sensors.values())
-        if not (whole and self.likelihood.rejecting(found.results)):
-            return found
-        starts = [with_gates(found.config, given, times) for times in (_narrower(given), _WIDER)]
-        for start in [maximise(self.likelihood, one, free, tolerance=_ROUGHLY).config for one in starts]:
-            other = maximise_with_gates(self.likelihood, with_gates(start, given), free, self.notify)
-            found = max(found, other, key=lambda one: one.log_posterior)
-        return found
+        peak = maximise_with_gates(self.likelihood, with_gates(best, configured), free, self.notify)
+        whole = any(sensor.gates_rows(configured.arm) for sensor in configured.sensors.values())
+        if not (whole and self.likelihood.rejecting(peak.results)):
+            return peak
+        starts = [with_gates(peak.config, configured, times) for times in (_narrower(configured), _WIDER)]
+        for start in [maximise(self.likelihood, start, free, tolerance=_ROUGHLY).config for start in starts]:
+            other = maximise_with_gates(self.likelihood, with_gates(start, configured), free, self.notify)
+            peak = max(peak, other, key=lambda peak: peak.log_posterior)
+        return peak
 
     # ---- which noise pays -------------------------------------------------------------------------------------------
 
@@ -249,15 +256,19 @@ class Search:
                     score[number] -= SMOOTHER
             kinds = [_kind(peak.config, axis) for peak in peaks]
             if told and len(set(kinds)) > 1 and axis in self.reasons:
-                mine = dict[str, float]()
+                best_of_kind = dict[str, float]()
                 for kind, score in zip(kinds, scores, strict=True):
-                    mine[kind] = max(float(score[number]), mine.get(kind, -np.inf))
-                gain = max(mine[kind] for kind in mine if kind != "none") - mine.get("none", -np.inf)
+                    best_of_kind[kind] = max(float(score[number]), best_of_kind.get(kind, -np.inf))
+                gain = max(best_of_kind[kind] for kind in best_of_kind if kind != "none") - best_of_kind.get(
+                    "none", -np.inf
+                )
                 why = f"(one {gain:+.1f})"
                 if np.isinf(gain):
                     soon = 1e3 * quickest(peaks[0].config)
                     why = f"(one would be forgotten within {soon:.0f} ms, too soon for an arm)"
-                self.reasons[axis].append(f"disturbance: {max(mine, key=lambda kind: mine[kind])} {why}")
+                self.reasons[axis].append(
+                    f"disturbance: {max(best_of_kind, key=lambda kind: best_of_kind[kind])} {why}"
+                )
         return _best_by_axis(self.likelihood, peaks, scores)
 
     def _without_needless(self, config: FusionConfig) -> FusionConfig:
@@ -269,9 +280,9 @@ class Search:
         needed = _well_known(self.likelihood, config, self.free(config))
         for field in _WALKING:
             without = config
-            for one in self.free(config):
-                if one.path[-1] == field and one.key not in needed:
-                    without = one.put(without, one.bounds[0])
+            for parameter in self.free(config):
+                if parameter.path[-1] == field and parameter.key not in needed:
+                    without = parameter.put(without, parameter.bounds[0])
             if without == config:
                 continue
             peaks = [point(self.likelihood, config, self.free(config))]
@@ -282,18 +293,18 @@ class Search:
 
 
 def arm_searches(
-    likelihood: Likelihood, config: FusionConfig, free: FreeOf, believed: bool, known: Mapping[str, ArmSearch]
+    likelihood: Likelihood, config: FusionConfig, free: FreeOf, believed: bool, searched: Mapping[str, ArmSearch]
 ) -> dict[str, ArmSearch]:
     """The arm of each axis as far as it is free, and what it leaves, by sensors whose latency is known and steady.
 
-    ``believed``: the sensors' noise, to be what second differences show; ``known``: arms that were searched for before.
+    ``believed``: the sensors' noise, to be what second differences show; ``searched``: arms of an earlier search.
     """
-    late = {one.sensor for one in free(config) if one.fit == "latency"}
+    late = {parameter.sensor for parameter in free(config) if parameter.fit == "latency"}
     late |= {name for name, sensor in config.sensors.items() if sensor.latency_sd}
 
     def of(axis: str) -> ArmSearch:
-        if axis in known:
-            return known[axis]
+        if axis in searched:
+            return searched[axis]
         names = [name for name in likelihood.sensors[axis] if name not in late] or list(likelihood.sensors[axis])
         least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
         measured = likelihood.measured(axis, config, names)
@@ -304,35 +315,37 @@ def arm_searches(
 
 def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom:
     """What of an axis's arm the free parameters leave open."""
-    given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
+    arm = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
     bends = {"play": 1e-3, "max_speed": 1.0, "beyond": -0.1}
-    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if given.damping else 1.0, 0.1, **bends))
-    here, there = ({one.path[-1] for one in free(at) if one.axis == axis} for at in (config, other))
-    if any(one.fit == "delay" for one in free(config) if one.axis in (None, axis)):
+    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if arm.damping else 1.0, 0.1, **bends))
+    here, elsewhere = (
+        {parameter.path[-1] for parameter in free(at) if parameter.axis == axis} for at in (config, other)
+    )
+    if any(parameter.fit == "delay" for parameter in free(config) if parameter.axis in (None, axis)):
         here.add("delay")
     plants = {"natural_frequency", "damping"}, {"time_constant"}
-    whole = any(plant <= here for plant in plants) and any(plant <= there for plant in plants)
+    whole = any(plant <= here for plant in plants) and any(plant <= elsewhere for plant in plants)
     gains: Sequence[GainKind] = ("given",)
-    if "intercept" in here and "gain_recovery" in there:
-        here, gains, given = here | {"gain_recovery"}, GAINS, given._replace(gain=1.0, recovery=0.0, slope=0.0)
+    if "intercept" in here and "gain_recovery" in elsewhere:
+        here, gains, arm = here | {"gain_recovery"}, GAINS, arm._replace(gain=1.0, recovery=0.0, slope=0.0)
     elif "intercept" in here:
-        gains = ("recovering" if given.recovery else "static",)
-    here |= plants[0] | (there & {*BENDS, "slope_beyond"}) if whole else here
+        gains = ("recovering" if arm.recovery else "static",)
+    here |= plants[0] | (elsewhere & {*BENDS, "slope_beyond"}) if whole else here
     names = {_NAMES[field] for field in here if field in _NAMES}
-    order = 2 if given.damping else 1
-    return Freedom(given, names, (1, 2) if whole else (order,), gains)
+    order = 2 if arm.damping else 1
+    return Freedom(arm, names, (1, 2) if whole else (order,), gains)
 
 
 def _why(freedom: Freedom, mixture: Mixture, model: Model) -> list[str]:
     """Which order and which kind of gain are likely, and by how much the alternative is behind in log-probability."""
-    found = list[str]()
+    reasons = list[str]()
     if len(freedom.orders) > 1:
-        ahead = mixture.log_odds(lambda one: one.order == 2)
-        found.append(f"order: {'second' if model.order == 2 else 'first'} (second {ahead:+.1f})")
+        ahead = mixture.log_odds(lambda model: model.order == 2)
+        reasons.append(f"order: {'second' if model.order == 2 else 'first'} (second {ahead:+.1f})")
     if len(freedom.gains) > 1:
-        ahead = mixture.log_odds(lambda one: one.gain == "recovering")
-        found.append(f"gain: {'recovering' if model.gain == 'recovering' else 'constant'} (recovering {ahead:+.1f})")
-    return found
+        ahead = mixture.log_odds(lambda model: model.gain == "recovering")
+        reasons.append(f"gain: {'recovering' if model.gain == 'recovering' else 'constant'} (recovering {ahead:+.1f})")
+    return reasons
 
 
 def _narrower(config: FusionConfig) -> float:
@@ -349,10 +362,10 @@ def _kind(config: FusionConfig, axis: str) -> str:
 
 def _well_known(likelihood: Likelihood, config: FusionConfig, free: Sequence[Parameter]) -> set[str]:
     """The keys of parameters whose logarithm has a small standard deviation by the information."""
-    inside = [one for one in free if one.log and one.at_bound(config) is None]
+    inside = [parameter for parameter in free if parameter.log and parameter.at_bound(config) is None]
     information = derivatives(likelihood, point(likelihood, config, inside), inside).information
     sd = np.sqrt(np.diag(covariance(information, inside)))
-    return {one.key for one, known in zip(inside, sd.tolist(), strict=True) if known < _WELL_KNOWN}
+    return {parameter.key for parameter, sd_here in zip(inside, sd.tolist(), strict=True) if sd_here < _WELL_KNOWN}
 
 
 def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter], of_noise: float = 1.0) -> FloatArray:
@@ -363,12 +376,12 @@ def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter], o
     it is no motion of an arm, but noise of its sensors.
     """
     price = np.zeros(len(likelihood.axes))
-    for one in free:
-        if one.axis is not None and not (one.vanishes and one.at_bound(peak.config) == "lower"):
-            beside = one.path[-1] in _WALKING and peak.config.process[one.axis].disturbance_sd > 0.0
-            price[likelihood.axes.index(one.axis)] += of_noise if beside else 1.0
-            if one.path[-1] == "disturbance_time" and one.at_bound(peak.config) == "lower":
-                price[likelihood.axes.index(one.axis)] = np.inf
+    for parameter in free:
+        if parameter.axis is not None and not (parameter.vanishes and parameter.at_bound(peak.config) == "lower"):
+            beside = parameter.path[-1] in _WALKING and peak.config.process[parameter.axis].disturbance_sd > 0.0
+            price[likelihood.axes.index(parameter.axis)] += of_noise if beside else 1.0
+            if parameter.path[-1] == "disturbance_time" and parameter.at_bound(peak.config) == "lower":
+                price[likelihood.axes.index(parameter.axis)] = np.inf
     return peak.posteriors - 0.5 * price * np.log(np.maximum(likelihood.count, 2))
 
 

@@ -82,38 +82,40 @@ def run_stage(
     config: FusionConfig,
     plan: Plan,
     notify: Notify = ignore,
-    known: Mapping[str, ArmSearch] | None = None,
+    earlier: Mapping[str, ArmSearch] | None = None,
 ) -> Stage:
     """Fit the parameters of a plan; where a combination is not identifiable, fix one of it and go on.
 
-    ``known``: the arms of axes that were searched for already. Raises a PumafuseError where nothing can be fitted.
+    ``earlier``: the arms of axes that were searched for already. Raises a PumafuseError where nothing can be fitted.
     """
     likelihood = likelihood_of(runs, config, plan)
     excited, fixed = excited_axes(likelihood, config), list[NotIdentifiable]()
     believed: dict[tuple[str, str], float] = {}  # noise of sensors, when arms are known
 
     def free(at: FusionConfig) -> list[Parameter]:
-        names = [*plan.fixed, *(one.fixed for one in fixed)]
+        names = [*plan.fixed, *(combination.fixed for combination in fixed)]
         every = parameters(at, config, likelihood.sensors, plan.fit, names, likelihood.resolution, believed)
-        return for_few(likelihood, [one for one in every if _may_vary(one, at, plan, excited)])
+        return for_few(likelihood, [parameter for parameter in every if _may_vary(parameter, at, plan, excited)])
 
     start, notes = likelihood.config, list[str]()
-    own = with_own_delays(start, excited)
-    if any(one.fit == "delay" for one in free(own)):
-        start = own
+    own_delays = with_own_delays(start, excited)
+    if any(parameter.fit == "delay" for parameter in free(own_delays)):
+        start = own_delays
     if "bias" in plan.fit:
         drifting = with_drifts(start)
         fixed += lone_drifts(likelihood.sensors, free(drifting), config)
-        start = with_drifts(start, [one.fixed for one in fixed])
+        start = with_drifts(start, [combination.fixed for combination in fixed])
     if "noise" in plan.fit:
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
-    arms = arm_searches(likelihood, start, free, plan.sd_prior, known or {})
-    searched = {axis: one for axis, one in arms.items() if one.freedom.free}
+    arms = arm_searches(likelihood, start, free, plan.sd_prior, earlier or {})
+    searched = {axis: search for axis, search in arms.items() if search.freedom.free}
     if plan.sd_prior:
         believed |= likelihood.scatter
-        believed |= {(name, axis): noise for axis, one in arms.items() for name, noise in one.likely_noise.items()}
+        believed |= {
+            (name, axis): noise for axis, search in arms.items() for name, noise in search.likely_noise.items()
+        }
     best, orders = Search(likelihood, free, arms, notify).found(start, plan.one_delay)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
@@ -156,19 +158,23 @@ def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: 
     return Likelihood(runs, config, plan.sensors, until=until, latest=latest)
 
 
-def _may_vary(one: Parameter, config: FusionConfig, plan: Plan, excited: Sequence[str]) -> bool:
+def _may_vary(parameter: Parameter, config: FusionConfig, plan: Plan, excited: Sequence[str]) -> bool:
     """Whether a parameter is not the trusted sensor's, and measurements of its axis can tell it."""
-    if one.fit == "delay" and one.axis is None:
+    if parameter.fit == "delay" and parameter.axis is None:
         return plan.trusted is None and any(config.arm.axes[axis].delay is None for axis in excited)
-    moves = one.axis is None or one.axis in excited or any(as_length(part) in _AT_REST for part in one.key.split("."))
-    return moves and (plan.trusted is None or one.sensor not in (None, plan.trusted))
+    moves = (
+        parameter.axis is None
+        or parameter.axis in excited
+        or any(as_length(part) in _AT_REST for part in parameter.key.split("."))
+    )
+    return moves and (plan.trusted is None or parameter.sensor not in (None, plan.trusted))
 
 
 def _identified(
     likelihood: Likelihood,
     best: Point,
     free: FreeOf,
-    known: FusionConfig,
+    configured: FusionConfig,
     fixed: list[NotIdentifiable],
     notify: Notify,
 ) -> Point:
@@ -177,21 +183,25 @@ def _identified(
     It is fixed as configured, unless the measurements know better than that: then as it was found.
     """
 
-    def as_configured(one: Parameter) -> FusionConfig:
-        return changed(best.config, one.path, one.given(known))
+    def as_configured(parameter: Parameter) -> FusionConfig:
+        return changed(best.config, parameter.path, parameter.configured(configured))
 
-    while len(fixed) < _MOST_FIXED and (found := not_identifiable(likelihood, best, free(best.config))) is not None:
-        (one,) = (one for one in free(best.config) if one.key == found.fixed)
-        other_order = one.fit == "plant" and one.given(known) is None  # while no recovery can be set back to none
-        starts = [best.config] if other_order else [as_configured(one), best.config]
-        fixed.append(found)
+    while (
+        len(fixed) < _MOST_FIXED and (combination := not_identifiable(likelihood, best, free(best.config))) is not None
+    ):
+        (fixed_one,) = (parameter for parameter in free(best.config) if parameter.key == combination.fixed)
+        other_order = (
+            fixed_one.fit == "plant" and fixed_one.configured(configured) is None
+        )  # while no recovery can be set back to none
+        starts = [best.config] if other_order else [as_configured(fixed_one), best.config]
+        fixed.append(combination)
         peaks = (maximise_with_gates(likelihood, start, free(start), notify) for start in starts)
-        best = next((one for one in peaks if one.log_posterior > best.log_posterior - 0.5 * Z95**2), best)
-    for one in not_identifiable_noise(likelihood, best, free(best.config)):
-        start = as_configured(one)
-        without = maximise_with_gates(likelihood, start, [other for other in free(start) if other.key != one.key])
+        best = next((peak for peak in peaks if peak.log_posterior > best.log_posterior - 0.5 * Z95**2), best)
+    for fixed_one in not_identifiable_noise(likelihood, best, free(best.config)):
+        start = as_configured(fixed_one)
+        without = maximise_with_gates(likelihood, start, [other for other in free(start) if other.key != fixed_one.key])
         if without.log_posterior > best.log_posterior - 0.5 * Z95**2:
-            fixed.append(NotIdentifiable((one.key,), one.key))
+            fixed.append(NotIdentifiable((fixed_one.key,), fixed_one.key))
             best = without
     return best
 
@@ -233,7 +243,7 @@ def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str])
                 continue
             before = likelihood.evaluate(config).log_likelihood
             biased = [_with_bias(config, name, kind, width) for width in _BIAS_WIDTHS]
-            gains = [likelihood.evaluate(one).log_likelihood - before for one in biased]
+            gains = [likelihood.evaluate(biased_config).log_likelihood - before for biased_config in biased]
             best_width = int(np.argmax(gains))
             if gains[best_width] > _BIAS_GAIN:
                 config = biased[best_width]
@@ -248,7 +258,7 @@ def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str])
 def _may_be_biased(config: FusionConfig, name: str, kind: Kind, fixed: Sequence[str]) -> bool:
     """Whether a sensor without a bias on the axes of a kind may be given one."""
     sensor = config.sensors[name]
-    biased = any(sensor.bias_sd_of(axis) for axis, one in config.arm.axes.items() if one.kind == kind)
+    biased = any(sensor.bias_sd_of(axis) for axis, model in config.arm.axes.items() if model.kind == kind)
     return not biased and not is_fixed(f"sensors.{name}.{of_kind('bias_sd_mm', kind)}", fixed)
 
 
@@ -257,5 +267,5 @@ def _with_bias(config: FusionConfig, name: str, kind: Kind, width: float) -> Fus
     new = float(f"{width:.0e}")
     if len(config.arm.kinds) > 1:
         sensor, axes = config.sensors[name], config.arm.axes.items()
-        new = {axis: new if one.kind == kind else sensor.bias_sd_of(axis) for axis, one in axes}
+        new = {axis: new if model.kind == kind else sensor.bias_sd_of(axis) for axis, model in axes}
     return changed(config, ("sensors", name, "bias_sd"), new)

@@ -18,18 +18,18 @@ def bounded_step(
     The matrix is scaled to a diagonal of 1 + λ. A parameter without any information does not move.
     """
     diagonal = np.diag(information)
-    known = diagonal > 0.0
-    step, size = np.zeros(len(diagonal)), 1.0 / np.sqrt(diagonal[known])
-    matrix = information[np.ix_(known, known)] * np.outer(size, size) + np.diag(damping[known] + _ROUNDING)
-    lowest, highest = low[known] / size, high[known] / size
-    inner = _between(matrix, size * score[known], lowest, highest)
+    informed = diagonal > 0.0
+    step, size = np.zeros(len(diagonal)), 1.0 / np.sqrt(diagonal[informed])
+    matrix = information[np.ix_(informed, informed)] * np.outer(size, size) + np.diag(damping[informed] + _ROUNDING)
+    lowest, highest = low[informed] / size, high[informed] / size
+    inner = _between(matrix, size * score[informed], lowest, highest)
     if inner is None:
         from scipy.optimize import lsq_linear  # takes a while to import, and is seldom needed
 
         root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
-        aim = np.asarray(np.linalg.solve(root, size * score[known]), dtype=np.float64)
+        aim = np.asarray(np.linalg.solve(root, size * score[informed]), dtype=np.float64)
         inner = lsq_linear(root.T, aim, (lowest, highest), method="bvls").x
-    step[known] = size * inner
+    step[informed] = size * inner
     return step
 
 

@@ -145,16 +145,16 @@ def fitted_lags(
     Intervals are ``around`` it, from :func:`lag_intervals`; where least squares doubt the arm they cover what these
     say, and where the arm is theirs they are that.
     """
-    found, slopes = dict[str, FittedLag](), lag_slopes(free, after)
-    for axis in (one for one in dict.fromkeys([*slopes, *doubts]) if one not in lost):
+    lags, slopes = dict[str, FittedLag](), lag_slopes(free, after)
+    for axis in (axis for axis in dict.fromkeys([*slopes, *doubts]) if axis not in lost):
         lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
         low, high = max(lag - below, min(lag, 0.0)), lag + above  # no arm is there before its commands
         if axis in doubts:
             least, most = doubts[axis].lag_ci95
             low, high = (min(low, least), max(high, most)) if axis in slopes else (least, most)
         ends = [end * MS if abs(end) <= LONGEST else None for end in (low, high)]
-        found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
-    return found
+        lags[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
+    return lags
 
 
 def open_interval(ci95: tuple[float | None, float | None]) -> tuple[float, float]:
@@ -163,68 +163,74 @@ def open_interval(ci95: tuple[float | None, float | None]) -> tuple[float, float
     return -math.inf if low is None else low, math.inf if high is None else high
 
 
-def text(found: TuningSummary) -> str:
+def text(summary: TuningSummary) -> str:
     """A tuning as plain text, as statistical packages print their results."""
-    width = max([len(one.key) for one in found.parameters], default=0)
-    lines = [f"tuned on {', '.join(found.runs)}: {', '.join(found.fit)}", ""]
-    for axis, one in found.likelihood.items():
-        lines.append(f"{axis}: log-likelihood {one.before:.1f} -> {one.after:.1f} of {one.components:,} components")
-    for axis, lag in found.lags.items():
+    width = max([len(parameter.key) for parameter in summary.parameters], default=0)
+    lines = [f"tuned on {', '.join(summary.runs)}: {', '.join(summary.fit)}", ""]
+    for axis, by_axis in summary.likelihood.items():
+        lines.append(
+            f"{axis}: log-likelihood {by_axis.before:.1f} -> {by_axis.after:.1f} of {by_axis.components:,} components"
+        )
+    for axis, lag in summary.lags.items():
         low, high = open_interval(lag.lag_ms_ci95)
         lines.append(f"{axis}: lag {lag.before_ms:.4g} -> {lag.lag_ms:.4g} ms ({low:.4g} to {high:.4g})")
     lines += ["", f"{'':{width}}  {'before':>10}  {'value':>10}  {'[0.025':>10}  {'0.975]':>10}"]
-    for one in found.parameters:
-        before = "" if one.before is None else f"{one.before:.4g}"
-        low, high = open_interval(one.ci95)
-        lines.append(f"{one.key:{width}}  {before:>10}  {one.value:>10.4g}  {low:>10.4g}  {high:>10.4g}")
-    notes = [*found.notes, *found.not_identifiable]
+    for likelihood in summary.parameters:
+        before = "" if likelihood.before is None else f"{likelihood.before:.4g}"
+        low, high = open_interval(likelihood.ci95)
+        lines.append(f"{likelihood.key:{width}}  {before:>10}  {likelihood.value:>10.4g}  {low:>10.4g}  {high:>10.4g}")
+    notes = [*summary.notes, *summary.not_identifiable]
     return "\n".join([*lines, *(["", *notes] if notes else [])])
 
 
 def encode(summary: TuningSummary) -> str:
     """The text of ``tuning.json``: what belongs to an axis is in the units of its kind."""
-    tree = msgspec.to_builtins(summary) | {"biases": [toml.reported(one, one.kind) for one in summary.biases]}
+    tree = msgspec.to_builtins(summary) | {"biases": [toml.reported(bias, bias.kind) for bias in summary.biases]}
     if summary.validation is not None:
-        tree["validation"] = [toml.reported(one, one.kind) for one in summary.validation]
+        tree["validation"] = [toml.reported(check, check.kind) for check in summary.validation]
     encoder = msgspec.json.Encoder(decimal_format="number")
     return msgspec.json.format(encoder.encode(tree), indent=2).decode() + "\n"
 
 
-def fitted(one: Parameter, before: FusionConfig, after: FusionConfig, interval: ConfidenceInterval | None) -> Fitted:
+def fitted(
+    parameter: Parameter, before: FusionConfig, after: FusionConfig, interval: ConfidenceInterval | None
+) -> Fitted:
     """A parameter in the unit of its key; without its interval where none was computed."""
-    earlier, value = one.given(before), one.get(after)
+    earlier, value = parameter.configured(before), parameter.get(after)
     ends: tuple[float | None, float | None] = (None, None)
     if interval is not None:
         low, high = interval.ci95
-        ends = (None if interval.open[0] else low / one.unit, None if interval.open[1] else high / one.unit)
-        if interval.open[0] and one.vanishes:
+        ends = (None if interval.open[0] else low / parameter.unit, None if interval.open[1] else high / parameter.unit)
+        if interval.open[0] and parameter.vanishes:
             ends = (0.0, ends[1])
     return Fitted(
-        key=one.key,
-        before=None if earlier is None else earlier / one.unit,
-        value=value / one.unit,
+        key=parameter.key,
+        before=None if earlier is None else earlier / parameter.unit,
+        value=value / parameter.unit,
         ci95=ends,
         profiled=interval is not None and interval.profiled,
-        notes="" if interval is None else _notes(one, interval),
+        notes="" if interval is None else _notes(parameter, interval),
     )
 
 
-def _notes(one: Parameter, interval: ConfidenceInterval) -> str:
-    bounds = {name: f"{bound / one.unit:g}" for name, bound in zip(("lower", "upper"), one.bounds, strict=True)}
-    if interval.at == "lower" and one.vanishes:
+def _notes(parameter: Parameter, interval: ConfidenceInterval) -> str:
+    bounds = {
+        name: f"{bound / parameter.unit:g}" for name, bound in zip(("lower", "upper"), parameter.bounds, strict=True)
+    }
+    if interval.at == "lower" and parameter.vanishes:
         return "not significant"
-    if interval.at == "lower" and one.is_noise and one.bounds[0] > SD_BOUNDS[0]:
+    if interval.at == "lower" and parameter.is_noise and parameter.bounds[0] > SD_BOUNDS[0]:
         return "that of the steps in which its values come"
     if interval.at is not None:
         return f"at its {interval.at} bound ({bounds[interval.at]}): the model does not fit"
     if all(interval.open):
         return "not identifiable"
     if interval.open[0]:
-        return "not significant: the interval includes 0" if one.vanishes else f"open down to {bounds['lower']}"
+        return "not significant: the interval includes 0" if parameter.vanishes else f"open down to {bounds['lower']}"
     if interval.open[1]:
         return f"open up to {bounds['upper']}"
     low, high = interval.ci95
-    if one.sensor and one.prior and math.log(high / low) > _FROM_PRIOR * 2.0 * Z95 * one.prior[1]:
+    if parameter.sensor and parameter.prior and math.log(high / low) > _FROM_PRIOR * 2.0 * Z95 * parameter.prior[1]:
         return "mostly by its prior, what second differences show within a factor of 2: the likelihood hardly tells it"
     return "the likelihood has two maxima along it" if interval.profile.bimodal else ""
 
@@ -234,7 +240,7 @@ def found_biases(run: Run, config: FusionConfig) -> list[FoundBias]:
     if not any(sensor.bias_sd_of(axis) for sensor in config.sensors.values() for axis in config.arm.axes):
         return []
     return [
-        FoundBias(run=run.name, sensor=sensor, axis=axis, kind=config.arm.axes[axis].kind, bias=one.value, sd=one.sd)
+        FoundBias(run=run.name, sensor=sensor, axis=axis, kind=config.arm.axes[axis].kind, bias=bias.value, sd=bias.sd)
         for sensor, by_axis in fused(run, config).biases.items()
-        for axis, one in by_axis.items()
+        for axis, bias in by_axis.items()
     ]

@@ -69,11 +69,11 @@ class Tuning:
     @property
     def params(self) -> dict[str, float]:
         """The fitted numbers by their keys as in the files, in the units of these: ``sensors.camera.latency_ms``."""
-        return {one.key: one.value for one in self.details.parameters}
+        return {parameter.key: parameter.value for parameter in self.details.parameters}
 
     def conf_int(self) -> dict[str, tuple[float, float]]:
         """The 95 % interval of each of :attr:`params`, infinite at an end that the measurements do not limit."""
-        return {one.key: open_interval(one.ci95) for one in self.details.parameters}
+        return {parameter.key: open_interval(parameter.ci95) for parameter in self.details.parameters}
 
     def summary(self) -> str:
         """The result as a table in plain text: likelihood, lag of each axis, parameters with intervals, notes."""
@@ -136,25 +136,25 @@ def tune(
     plan = Plan(kinds, fixed, sd_prior=sd_prior, one_delay="delay" in share)
     pipeline = Pipeline(runs, config, plans(config, plan, trust), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
-    found: dict[str, Doubt] = {}
+    doubted_axes: dict[str, Doubt] = {}
     doubted: list[str] = []
     until = None
     if len(runs) == 1 and validate is None and _FITTED_ON * least_count(pipeline.whole) >= FEWEST:
         until = _fitted_until(runs[0])
     asked = kinds if intervals is None else kinds_of(intervals)
-    known: dict[str, ConfidenceInterval] = {}
+    by_key: dict[str, ConfidenceInterval] = {}
     around: dict[str, Distances] = {}
     validation: list[Check] | None = None
     interrupted = False
     try:
         pipeline.fit()
-        found = pipeline.doubts() if "noise" in kinds else {}
-        sentences = {axis: one.sentence(pipeline.result(), axis) for axis, one in found.items()}
+        doubted_axes = pipeline.doubts() if "noise" in kinds else {}
+        sentences = {axis: doubt.sentence(pipeline.result(), axis) for axis, doubt in doubted_axes.items()}
         doubted = [f"{axis}: {sentence}" for axis, sentence in sentences.items() if sentence]
-        if refuted := [axis for axis, one in found.items() if one.refutes]:
+        if refuted := [axis for axis, doubt in doubted_axes.items() if doubt.refutes]:
             held, start = replace(plan, fixed=[*fixed, *(f"axes.{axis}" for axis in refuted)]), config
             for axis in refuted:
-                start = with_plain_arm(start, axis, found[axis].plain.arm)
+                start = with_plain_arm(start, axis, doubted_axes[axis].plain.arm)
             pipeline = Pipeline(runs, start, plans(start, held, trust), progress, pipeline.arms_but(refuted))
             pipeline.fit()
         if validate is not None:
@@ -165,21 +165,21 @@ def tune(
         for stage in pipeline.stages:
             progress("computing intervals", stage.best.log_likelihood)
             around |= lag_intervals(stage.likelihood, stage.best, stage.free)
-            some = [one for one in stage.free if one.fit in asked]
-            known |= confidence_intervals(stage.likelihood, stage.best, stage.free, some, drawn=profiles)
+            some = [parameter for parameter in stage.free if parameter.fit in asked]
+            by_key |= confidence_intervals(stage.likelihood, stage.best, stage.free, some, drawn=profiles)
     except KeyboardInterrupt:
         interrupted = True
         pipeline.keep_the_better()
     stages, names = pipeline.stages, [run.name for run in runs]
-    free = [one for stage in stages for one in stage.free]
+    free = [parameter for stage in stages for parameter in stage.free]
     if not stages:  # the configuration as given, or interrupted before a stage was complete
         free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed)
-    result, arms = pipeline.result(), {axis: one for stage in stages for axis, one in stage.arms.items()}
-    lost = [axis for axis, one in arms.items() if one.plain is None or result.arm.lag_of(axis) > LONGEST]
+    result, arms = pipeline.result(), {axis: search for stage in stages for axis, search in stage.arms.items()}
+    lost = [axis for axis, search in arms.items() if search.plain is None or result.arm.lag_of(axis) > LONGEST]
     untold = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]  # nobody measures these
-    lags = fitted_lags(free, config, result, around, found, untold)
-    tuned = _with_provenance(result, free, known, {} if interrupted else lags, names)
-    doubted += [f"{axis}: {one.plain.step}" for axis, one in arms.items() if one.plain and one.plain.step]
+    lags = fitted_lags(free, config, result, around, doubted_axes, untold)
+    tuned = _with_provenance(result, free, by_key, {} if interrupted else lags, names)
+    doubted += [f"{axis}: {search.plain.step}" for axis, search in arms.items() if search.plain and search.plain.step]
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
@@ -200,18 +200,20 @@ def tune(
         interrupted=interrupted,
         likelihood=_likelihoods(pipeline.whole, config, tuned),
         lags=lags,
-        parameters=[fitted(one, config, tuned, known.get(one.key)) for one in free],
-        biases=[one for run in runs for one in found_biases(run, tuned)],
-        correlations=[one for stage in stages for one in correlations(stage.likelihood, stage.best, stage.free)],
-        not_identifiable=[str(one) for stage in stages for one in stage.not_identifiable],
+        parameters=[fitted(parameter, config, tuned, by_key.get(parameter.key)) for parameter in free],
+        biases=[bias for run in runs for bias in found_biases(run, tuned)],
+        correlations=[
+            correlation for stage in stages for correlation in correlations(stage.likelihood, stage.best, stage.free)
+        ],
+        not_identifiable=[str(combination) for stage in stages for combination in stage.not_identifiable],
         orders={axis: why for stage in stages for axis, why in stage.orders.items()},
         validation=validation,
-        worse=any(one.worse for one in validation or ()),
+        worse=any(check.worse for check in validation or ()),
         notes=list(dict.fromkeys(notes)),
     )
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
-    return Tuning(tuned, config, summary, [one.profile for one in known.values()] if profiles else [])
+    return Tuning(tuned, config, summary, [interval.profile for interval in by_key.values()] if profiles else [])
 
 
 def _check(
@@ -262,11 +264,11 @@ class Pipeline:
         config: FusionConfig,
         plans: Sequence[Plan],
         progress: Progress,
-        known: Sequence[Mapping[str, ArmSearch]] = (),
+        searched: Sequence[Mapping[str, ArmSearch]] = (),
     ) -> None:
-        """``known``: of each stage, the arms of axes that were searched for already."""
+        """``searched``: of each stage, the arms of axes that were searched for already."""
         self.runs, self.config, self.plans, self.progress = runs, config, plans, progress
-        self._known = known or [{} for _ in plans]
+        self._known = searched or [{} for _ in plans]
         self.whole = likelihood_of(runs, config, plans[-1])  # of all measurements
         self.best = config  # so far, with the gates of the search and all digits
         self.stages: list[Stage] = []  # that are complete; none where the configuration as given is the result
@@ -280,15 +282,15 @@ class Pipeline:
         """
         config, stages = self.config, list[Stage]()
 
-        def notify(found: Point) -> None:
-            self.best, self.stages = found.config, stages
-            self.progress("searching", found.log_likelihood)
+        def notify(point: Point) -> None:
+            self.best, self.stages = point.config, stages
+            self.progress("searching", point.log_likelihood)
 
-        for plan, known in zip(self.plans, self._known, strict=True):
-            stages.append(run_stage(self.runs, config, plan, notify, known))
+        for plan, searched in zip(self.plans, self._known, strict=True):
+            stages.append(run_stage(self.runs, config, plan, notify, searched))
             config = stages[-1].best.config
         if not any(stage.free for stage in stages):
-            why = [str(one) for stage in stages for one in stage.not_identifiable]
+            why = [str(combination) for stage in stages for combination in stage.not_identifiable]
             raise TuneError("; ".join([*why, "everything that could be fitted is fixed: nothing to fit"]))
         self.best, self.stages = config, stages
         self.notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
@@ -308,19 +310,22 @@ class Pipeline:
 
     def arms_but(self, axes: Collection[str]) -> list[dict[str, ArmSearch]]:
         """The arms that each stage searched for, but for those of some axes."""
-        return [{axis: one for axis, one in stage.arms.items() if axis not in axes} for stage in self.stages]
+        return [{axis: search for axis, search in stage.arms.items() if axis not in axes} for stage in self.stages]
 
     def doubts(self) -> dict[str, Doubt]:
         """Of the arms that were fitted: see :func:`.plain.doubts`."""
-        arms, config = {axis: one for stage in self.stages for axis, one in stage.arms.items()}, self.result()
-        found = doubts({axis: one.plain for axis, one in arms.items()}, config)
-        return {axis: one._replace(is_beaten=self._is_beaten(axis, one, config)) for axis, one in found.items()}
+        arms, config = {axis: search for stage in self.stages for axis, search in stage.arms.items()}, self.result()
+        doubts_by_axis = doubts({axis: search.plain for axis, search in arms.items()}, config)
+        return {
+            axis: doubt._replace(is_beaten=self._is_beaten(axis, doubt, config))
+            for axis, doubt in doubts_by_axis.items()
+        }
 
     def _is_beaten(self, axis: str, doubt: Doubt, config: FusionConfig) -> bool:
         """Whether the arm of least squares predicts the next measurement better, the noise being as it is."""
-        mine = self.whole.of_axis(axis)
+        likelihood = self.whole.of_axis(axis)
         instead = with_plain_arm(config, axis, doubt.plain.arm)
-        return mine.innovation(instead) < _BEATEN * mine.innovation(config)
+        return likelihood.innovation(instead) < _BEATEN * likelihood.innovation(config)
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
@@ -334,19 +339,22 @@ class Pipeline:
 
         A maximum may lie where a gate just takes a row: numbers that leave it by being rounded keep their digits.
         """
-        found, exact = self._written(self.best, rounded), self._written(self.best, float)
+        rounded_config, exact = self._written(self.best, rounded), self._written(self.best, float)
         lost = (
-            _evaluated(one.likelihood, exact).log_likelihood - _evaluated(one.likelihood, found).log_likelihood
-            for one in self.stages
+            _evaluated(stage.likelihood, exact).log_likelihood
+            - _evaluated(stage.likelihood, rounded_config).log_likelihood
+            for stage in self.stages
         )
-        return exact if any(one > _NOTHING for one in lost) else found
+        return exact if any(loss > _NOTHING for loss in lost) else rounded_config
 
     def _written(self, config: FusionConfig, number: Callable[[float], float]) -> FusionConfig:
         """A configuration with the numbers as they are to be written."""
         best = with_gates(config, self.config)
-        for one in (one for stage in self.stages for one in stage.free if one.given(best) is not None):
-            none = one.vanishes and one.at_bound(best) == "lower"
-            best = one.put(best, 0.0 if none else one.clipped(number(one.get(best))))
+        for parameter in (
+            parameter for stage in self.stages for parameter in stage.free if parameter.configured(best) is not None
+        ):
+            none = parameter.vanishes and parameter.at_bound(best) == "lower"
+            best = parameter.put(best, 0.0 if none else parameter.clipped(number(parameter.get(best))))
         return best
 
 
@@ -360,14 +368,14 @@ def _same(run: Run, other: Run) -> bool:
     (since, until), (begin, end) = run.ends(0), other.ends(0)
     if until <= begin or end <= since:
         return False
-    one, two = (
+    rows, other_rows = (
         {
             name: (source.stamp.tobytes(), {axis: value.tobytes() for axis, value in source.values.items()})
             for name, source in each.sensors.items()
         }
         for each in (run, other)
     )
-    return one == two
+    return rows == other_rows
 
 
 def _fitted_until(run: Run) -> float | None:
@@ -378,8 +386,8 @@ def _fitted_until(run: Run) -> float | None:
     since, end = run.since or 0.0, float(stamp.max() - stamp.min()) / 1e9
     end = min(end, run.until or end)
     first = min(
-        float(np.min(one.stamp[one.stamp != NO_STAMP], initial=NEVER) - stamp.min()) / 1e9
-        for one in run.sensors.values()
+        float(np.min(sensor.stamp[sensor.stamp != NO_STAMP], initial=NEVER) - stamp.min()) / 1e9
+        for sensor in run.sensors.values()
     )
     if since + _LATE * (end - since) < first < end:
         since = first
@@ -389,7 +397,7 @@ def _fitted_until(run: Run) -> float | None:
 def _likelihoods(likelihood: Likelihood, before: FusionConfig, after: FusionConfig) -> dict[str, AxisLikelihood]:
     old, new = (_evaluated(likelihood, config).axes.tolist() for config in (before, after))
     numbers = zip(likelihood.axes, likelihood.count.tolist(), old, new, strict=True)
-    return {axis: AxisLikelihood(components=n, before=one, after=two) for axis, n, one, two in numbers if n}
+    return {axis: AxisLikelihood(components=n, before=value, after=two) for axis, n, value, two in numbers if n}
 
 
 def _with_provenance(
@@ -400,25 +408,25 @@ def _with_provenance(
     runs: list[str],
 ) -> FusionConfig:
     """The configuration with the intervals of the arm's parameters and lags, and the runs they were fitted on."""
-    arm = [one for one in free if one.path[0] == "arm" and one.key in intervals]
-    for one in arm:
-        found = intervals[one.key]
+    arm = [parameter for parameter in free if parameter.path[0] == "arm" and parameter.key in intervals]
+    for parameter in arm:
+        interval = intervals[parameter.key]
         low, high = (
             sign * math.inf if is_open else rounded(end)
-            for sign, is_open, end in zip((-1, 1), found.open, found.ci95, strict=True)
+            for sign, is_open, end in zip((-1, 1), interval.open, interval.ci95, strict=True)
         )
-        config = changed(config, (*one.path[:-1], f"{one.path[-1]}_ci95"), (low, high))
-    for axis, one in lags.items():
-        low, high = (rounded(end / MS) for end in open_interval(one.lag_ms_ci95))
+        config = changed(config, (*parameter.path[:-1], f"{parameter.path[-1]}_ci95"), (low, high))
+    for axis, parameter in lags.items():
+        low, high = (rounded(end / MS) for end in open_interval(parameter.lag_ms_ci95))
         config = changed(config, ("arm", "axes", axis, "lag_ci95"), (low, high))
     earlier = _tuned_on(config)  # what is not fitted now is from there
-    return changed(config, ("arm", "provenance", "tuned_on"), [*(one for one in earlier if one not in runs), *runs])
+    return changed(config, ("arm", "provenance", "tuned_on"), [*(run for run in earlier if run not in runs), *runs])
 
 
 def _tuned_on(config: FusionConfig) -> list[str]:
     """The runs on which a configuration was fitted, by the provenance of its arm."""
-    found: object = config.arm.provenance.get("tuned_on", [])
-    return [str(one) for one in cast(list[object], found)] if isinstance(found, list) else [str(found)]
+    tuned_on: object = config.arm.provenance.get("tuned_on", [])
+    return [str(run) for run in cast(list[object], tuned_on)] if isinstance(tuned_on, list) else [str(tuned_on)]
 
 
 def _seen_before(config: FusionConfig, run: Run, validation: Sequence[Check] | None) -> list[str]:
@@ -432,15 +440,15 @@ def _seen_before(config: FusionConfig, run: Run, validation: Sequence[Check] | N
     ]
 
 
-def _validation_notes(validation: Sequence[Check] | None, known: bool, interrupted: bool) -> list[str]:
-    """What to know of the validation; ``known``: it was on a run that was fitted on."""
+def _validation_notes(validation: Sequence[Check] | None, seen: bool, interrupted: bool) -> list[str]:
+    """What to know of the validation; ``seen``: it was on a run that was fitted on."""
     beside = "what was fitted, beside what it began with, on measurements that neither was fitted on"
-    notes = [f"{one.run}, {one.axis}: {beside}: {one.verdict}" for one in validation or () if one.worse]
+    notes = [f"{check.run}, {check.axis}: {beside}: {check.verdict}" for check in validation or () if check.worse]
     why = ""
     if validation is None and not interrupted:
         why = "no run was left to validate on (--validate RUN)"
     elif validation == []:
         why = "the part to validate on has no measurement of a sensor that is used"
-    elif known and validation:
+    elif seen and validation:
         why = "validated on a run that was fitted on"
     return [*notes, f"{why}: whether the numbers hold elsewhere is not known"] if why else notes

@@ -120,7 +120,7 @@ def _check(run: str, axis: str, since: float, before: Estimates, after: Estimate
     head: str = change
     if doubts and change == "better":
         head += f", but its error bars do not hold ({', '.join(doubts)})"
-    simple = [f"{name} {one.skill:.2f}" for name, one in new.sensors.items() if (one.skill or 0.0) > _WORSE]
+    simple = [f"{name} {check.skill:.2f}" for name, check in new.sensors.items() if (check.skill or 0.0) > _WORSE]
     if simple:
         verdict += f"; a simpler way predicts the next measurement better (error over its: {', '.join(simple)})"
     return Check(
@@ -141,16 +141,16 @@ def _check(run: str, axis: str, since: float, before: Estimates, after: Estimate
 def _doubts(est: Estimates, axis: str, state: State) -> list[str]:
     """Why error bars do not hold: a noise at a bound; NIS, or coverage on the reference, off by more than chance."""
     sd = of_kind("sd_mm", est.config.arm.axes[axis].kind)
-    found = [f"{sd} of {name} is at its bound" for name in state.sensors if est.config.sensors[name].is_at_bound(axis)]
-    for name, one in state.sensors.items():
-        low, high = chi_square_band(one.count)
-        if one.nis < min(low, _NIS[0]) or one.nis > max(high, _NIS[1]):
-            found.append(f"NIS of {name} {one.nis:.2f}")
+    doubts = [f"{sd} of {name} is at its bound" for name in state.sensors if est.config.sensors[name].is_at_bound(axis)]
+    for name, check in state.sensors.items():
+        low, high = chi_square_band(check.count)
+        if check.nis < min(low, _NIS[0]) or check.nis > max(high, _NIS[1]):
+            doubts.append(f"NIS of {name} {check.nis:.2f}")
     if state.coverage is not None and state.coverage < _COVERAGE:
         inside = np.sqrt(_squares(est, axis)) <= Z95 * est[axis].position_sd
         if _beyond_chance(_COVERAGE - inside.astype(np.float64)):
-            found.append(f"coverage {state.coverage:.0%}")
-    return found
+            doubts.append(f"coverage {state.coverage:.0%}")
+    return doubts
 
 
 def _squares(est: Estimates, axis: str) -> FloatArray:
@@ -174,9 +174,12 @@ def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
     If both are equally good, the sum has a variance of about Σ gain² (Vuong, Econometrica 57, 1989).
     """
     old, new = _of_axis(before, axis), _of_axis(after, axis)
-    keys = [np.rint(one.stamp * 1e6).astype(np.int64) * len(one.sensors) + one.sensor for one in (old, new)]
-    _, there, here = np.intersect1d(keys[0], keys[1], return_indices=True)
-    return _bounded(new)[here] - _bounded(old)[there]
+    keys = [
+        np.rint(components.stamp * 1e6).astype(np.int64) * len(components.sensors) + components.sensor
+        for components in (old, new)
+    ]
+    _, elsewhere, here = np.intersect1d(keys[0], keys[1], return_indices=True)
+    return _bounded(new)[here] - _bounded(old)[elsewhere]
 
 
 def _bounded(components: Measurements) -> FloatArray:
@@ -186,26 +189,26 @@ def _bounded(components: Measurements) -> FloatArray:
 
 
 def _state(est: Estimates, axis: str) -> State:
-    mine = _of_axis(est, axis)
-    found = None
+    components = _of_axis(est, axis)
+    scored = None
     if est.reference is not None and len(est.time):
-        found = score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)
+        scored = score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)
     sensors: dict[str, SensorCheck] = {}
-    for name in mine.sensors:
-        one = consistency(est, name, axis)
-        if one is not None and len(one.correlation):
+    for name in components.sensors:
+        check = consistency(est, name, axis)
+        if check is not None and len(check.correlation):
             predicted = skill(est, est.measurements.of(name, axis))
             sensors[name] = SensorCheck(
-                count=one.count,
-                nis=one.nis,
-                whiteness_p=one.whiteness,
-                correlation=float(one.correlation[0]),
+                count=check.count,
+                nis=check.nis,
+                whiteness_p=check.whiteness,
+                correlation=float(check.correlation[0]),
                 skill=None if predicted is None else predicted.of_best_other,
             )
     return State(
-        log_likelihood=float(densities_of(mine, est.config.sensors).sum()),
-        rejected=int(np.count_nonzero(mine.outcome == Outcome.REJECTED)),
+        log_likelihood=float(densities_of(components, est.config.sensors).sum()),
+        rejected=int(np.count_nonzero(components.outcome == Outcome.REJECTED)),
         sensors=sensors,
-        rmse=None if found is None else found.rmse,
-        coverage=None if found is None else found.coverage,
+        rmse=None if scored is None else scored.rmse,
+        coverage=None if scored is None else scored.coverage,
     )
