@@ -310,7 +310,7 @@ def shares(
         found = fit_stage(sim.run, wrong(sim.config), fit, "disturbance_sd_mm")
         ends = intervals_of(found)
         for one in found.free:
-            known = one.given(sim.config) is not None  # else the plant is of another order
+            known = one.configured(sim.config) is not None  # else the plant is of another order
             inside[one.key].append(known and contains(ends[one.key], one, sim.config))
     every = [hit for hits in inside.values() for hit in hits]
     often = {key: float(np.mean(hits)) for key, hits in inside.items() if len(hits) >= len(seeds) / 2}
