@@ -155,6 +155,7 @@ WORLDS = {
     "stamped 20 ms late": (lambda: recorded(late=LATENCY + 0.02), config(), Cause.LAG, 0.02),
     "stamped 20 ms early": (lambda: recorded(late=LATENCY - 0.02), config(), Cause.LAG, -0.02),
     "a delay": (lambda: recorded(model=arm(delay=DELAY + 0.03)), config(), Cause.LAG, 0.03),
+    "a delay of several periods": (lambda: recorded(model=arm(delay=DELAY + 0.09)), config(), Cause.LAG, 0.09),
     "a plant": (lambda: recorded(model=arm(TAU + 0.03)), config(), Cause.PLANT, 0.03),
     "delay for plant": (lambda: recorded(model=arm(TAU + 0.03, DELAY - 0.03)), config(), Cause.DYNAMICS, 0.0),
     "scale": (lambda: recorded(seen=lambda z: 1.04 * z), config(), Cause.POSITION, 0.04),

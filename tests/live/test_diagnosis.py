@@ -14,6 +14,8 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.filter.response import response
+from pumafuse.fusion.consistency import consistency
+from pumafuse.fusion.verdicts import sentence
 from pumafuse.logs.run import Source
 from streams import Both, events_of, feed
 
@@ -63,6 +65,11 @@ def turned(one: Source) -> Source:
     return replace(one, values={**one.values, **seen})
 
 
+def noisy(one: Source) -> Source:
+    rng = np.random.default_rng(2)
+    return replace(one, values={axis: v + 1.2e-3 * rng.standard_normal(len(v)) for axis, v in one.values.items()})
+
+
 def zero_while_lost(one: Source) -> Source:
     """Half a second of zeros every four, to the last digit but one."""
     is_lost = np.arange(len(one.stamp)) // 50 % 8 == 7
@@ -104,6 +111,34 @@ def test_a_sensor_that_tells_nonsense_is_named_once(slip: str) -> None:
     except pf.PumafuseError as error:  # another unit is refused
         offline = (str(error),)
     assert any(words in one for one in offline)
+
+
+def longer_delay(config: pf.FusionConfig) -> pf.FusionConfig:
+    return msgspec.structs.replace(config, arm=msgspec.structs.replace(config.arm, delay=config.arm.delay + 0.07))
+
+
+@pytest.mark.parametrize(
+    ("slip", "configured", "words"),
+    [
+        (later(0.05), lambda config: config, "ms too small (latency_ms, delay_ms or plant)"),
+        (later(0.0), longer_delay, "ms too large (latency_ms, delay_ms or plant)"),
+        (noisy, lambda config: config, "sd_mm is too small"),
+    ],
+    ids=["late by less than a look sees", "a delay of the arm", "noise"],
+)
+def test_innovations_that_are_too_large_are_explained_as_fuse_explains_them(
+    slip: Callable[[Source], Source], configured: Callable[[pf.FusionConfig], pf.FusionConfig], words: str
+) -> None:
+    """Where no fault shows: once, with the verdict that `fuse` has of the whole, on the axis where it is worst."""
+    run, config = tracked()
+    run, config = slipped(run, slip), configured(config)
+    notices, live = said(run, config)
+    explained = [one for one in notices if words in one]
+    assert len(explained) == 1 and explained[0].startswith("sensor 'tracker' on ")
+    assert len([one for one in live.health().faults if words in one]) == 1
+    axis = explained[0].removeprefix("sensor 'tracker' on ").partition(":")[0]
+    verdict = consistency(pf.fuse(run, config), "tracker", axis)
+    assert verdict is not None and words in sentence(verdict)
 
 
 def test_a_sensor_of_a_kilohertz_is_named_as_one_of_100_hz() -> None:

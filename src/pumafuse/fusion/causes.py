@@ -58,7 +58,7 @@ _PLAYS = (1.0, 4.0, 16.0)  # half the play, over sd
 _STILL = 1e-9  # m or rad; a shape that is smaller is none
 _LIMITS = (0.95, 0.85, 0.7)  # of the speed, over the highest
 _LEAST_DRIFT = 0.03  # 1/√s: density of the least drift, over the smallest sd, that is made larger; none stays none
-_LAG = 1.0  # update periods: a lag as long is looked for as a whole: an accurate sensor sees more of it than velocity
+_WHOLE_LAGS = 1.0, 3.0  # update periods: lags looked for as a whole: an accurate sensor sees more of them than velocity
 _SLOWER = 1.1  # times the plant's lag: a derivative by it
 
 
@@ -410,9 +410,11 @@ def _shapes(part: _Part) -> Iterator[tuple[Tried, FloatArray]]:
     """What a cause of unit size adds to the measurements [m or rad], (m,)."""
     arm, time, led, scale, measured = part.config.arm, part.time, part.led, part.scale, part.measured
     model, used = arm.axes[part.axis], part.sensors
-    ns = round(_LAG * arm.update_period * 1e9)
-    late, early = part.position(model, time - ns) - led, part.position(model, time + ns) - led
-    lags = {0.0: 0.5e9 / ns * (late - early), 1e-9 * ns: 1e9 / ns * late, -1e-9 * ns: -1e9 / ns * early}
+    lags = dict[float, FloatArray]()
+    for ns in (round(periods * arm.update_period * 1e9) for periods in _WHOLE_LAGS):
+        late, early = part.position(model, time - ns) - led, part.position(model, time + ns) - led
+        lags.setdefault(0.0, 0.5e9 / ns * (late - early))
+        lags |= {1e-9 * ns: 1e9 / ns * late, -1e-9 * ns: -1e9 / ns * early}
     slow, quick = (part.position(_slower(model, factor), time) for factor in (_SLOWER, 1.0 / _SLOWER))
     by_plant = (slow - quick) / (model.plant.lag * (_SLOWER - 1.0 / _SLOWER))
     only = measured.sensors[used[0]] if len(used) == 1 else ""

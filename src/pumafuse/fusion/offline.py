@@ -109,6 +109,13 @@ def fuse(
     return est
 
 
+def judged(run: Run, segment: Segment, config: FusionConfig) -> Estimates:
+    """What became of the measurements of a run in the arm's axes, which is one ``segment``; no estimate, no note."""
+    times = np.empty(0, dtype=np.int64)
+    part = Part(run, segment, times, filter_segment(segment, config, times, "filtered"))
+    return estimates_of(run, run, None, config, [part])
+
+
 def estimates_of(
     run: Run,
     in_place: Run,

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from ctypes import Array, c_double
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import TypeAlias
 
 import numpy as np
@@ -17,10 +18,14 @@ from ..errors import PumafuseError
 from ..filter.events import COMMAND, Results
 from ..filter.outcome import Outcome
 from ..filter.window import Window
+from ..fusion.causes import Cause, evidence_of
 from ..fusion.chi_square import quantile
 from ..fusion.config import FusionConfig
+from ..fusion.consistency import consistency
 from ..fusion.faults import Fault, faults_of, settled
+from ..fusion.offline import judged
 from ..fusion.segments import Segment, build
+from ..fusion.verdicts import sentence
 from ..logs.run import Run, Source
 from .rate_limit import RateLimitedLog
 
@@ -83,7 +88,7 @@ class Recent:
         self._rows = [row for row in self._rows if row[0] <= after]
         self._latest = [min(stamp, after) for stamp in self._latest]
 
-    def segment(self, now: int) -> Segment | None:
+    def part(self, now: int) -> tuple[Run, Segment] | None:
         """What came in the span before ``now`` [ns]; None where that is too little. What is older is forgotten."""
         self._rows = [row for row in self._rows if now - _SPAN_NS < row[0] <= now]
         ordered = sorted(self._rows, key=operator.itemgetter(0))
@@ -107,7 +112,7 @@ class Recent:
         start = {name: level for name, level in self._start.items() if name in names}
         try:
             run = Run("stream", rows(np.flatnonzero(commands), "commands"), sensors, start=start, kinds=kinds)
-            return build(run, self._config)
+            return run, build(run, self._config)
         except PumafuseError:  # of what is there nothing can be made
             return None
 
@@ -144,13 +149,18 @@ class Diagnosis:
         self._ends = deque[int](maxlen=_QUARTERS + 2)  # of the window's rows, at the last looks
         self._troubles = dict[_Key, _Trouble]()
         self._large = dict[str, dict[str, int]]()  # by sensor and axis, when innovations were last too large [ns]
+        self._suspected = dict[str, tuple[Cause, str]]()  # by sensor, what the last look found behind that
+        self._verdicts = dict[str, str]()  # by sensor, what was said of it
         self._reacquired = dict[str, int]()  # when each sensor was taken again [ns]
         self.set_back = dict[str, int]()  # when it was said of a sensor that its stamps step back [ns]
 
     @property
     def shown(self) -> tuple[str, ...]:
         """A sentence on each fault that shows now."""
-        large = [f"{_innovations(name, axes)} are far larger than expected" for name, axes in self._large.items()]
+        large = [
+            self._verdicts.get(name) or f"{_innovations(name, axes)} are far larger than expected"
+            for name, axes in self._large.items()
+        ]
         return (*(one.fault.sentence for one in self._troubles.values() if one.is_said), *large)
 
     def look(self, window: Window, now: int) -> None:
@@ -162,7 +172,9 @@ class Diagnosis:
             self._ends.append(port.end)
         if now >= self._faults_due:
             self._faults_due = now + _APART_NS[now >= self._since + _SPAN_NS]
-            self._look_for_faults(now)
+            if (part := self.recent.part(now)) is not None:
+                self._look_for_faults(part[1], now)
+                self._look_for_causes(*part, now)
         stamp, source, results = window.read(max(port.begin, self._ends[0], port.end - _MOST_ROWS), port.end)
         recent = (stamp > now - _SECOND_NS) & (stamp <= now) & (source >= 0)
         stamp, source, results = stamp[recent], source[recent], results.rows(np.flatnonzero(recent))
@@ -176,10 +188,7 @@ class Diagnosis:
 
     # ---- faults of the log ------------------------------------------------------------------------------------------
 
-    def _look_for_faults(self, now: int) -> None:
-        segment = self.recent.segment(now)
-        if segment is None:
-            return
+    def _look_for_faults(self, segment: Segment, now: int) -> None:
         travel = {axis: float(np.ptp(segment.given(axis)[1])) for axis in segment.axes}
         explained = {name for (names, *_), one in self._troubles.items() if one.is_said for name in names}
         faults = [
@@ -214,6 +223,28 @@ class Diagnosis:
         del self._troubles[key]
         if trouble.is_said and not is_replaced and cause in _SHOWS:
             self._log.write(f"{key} over", f"{_named(sensors)}: {_SHOWS[cause]} shows no more at {now / 1e9:.3f} s")
+
+    # ---- causes -----------------------------------------------------------------------------------------------------
+
+    def _look_for_causes(self, run: Run, segment: Segment, now: int) -> None:
+        """Say what explains innovations that are too large, where no fault does: what `fuse` says of the span."""
+        faulty = {name for trouble in self._troubles.values() if trouble.is_said for name in trouble.fault.sensors}
+        names = [name for name in self._large if name not in faulty and name not in self._verdicts]
+        if not names:
+            return
+        estimates = judged(run, segment, self._config)
+        evidence = cache(partial(evidence_of, estimates))
+        for name in names:
+            axes = self._large[name]
+            of_axes = {axis: consistency(estimates, name, axis, partial(evidence, axis)) for axis in axes}
+            axis, worst = max(of_axes.items(), key=lambda pair: pair[1].nis if pair[1] else 0.0)
+            if worst is None or not worst.causes:
+                continue
+            likeliest, before = worst.causes[0][:2], self._suspected.get(name)
+            self._suspected[name] = likeliest
+            if likeliest == before:
+                self._verdicts[name] = f"sensor '{name}' on {axis}: {sentence(worst)}"
+                self._log.write(f"{name} verdict", f"{self._verdicts[name]} (by {now / 1e9:.3f} s)")
 
     # ---- innovations ------------------------------------------------------------------------------------------------
 
@@ -254,6 +285,8 @@ class Diagnosis:
         for name, axes in list(self._large.items()):
             if max(axes.values()) < now - _CALM_NS:
                 del self._large[name]
+                self._verdicts.pop(name, None)
+                self._suspected.pop(name, None)
                 self._log.write(f"{name} NIS over", f"{_innovations(name, axes)} are as expected at {now / 1e9:.3f} s")
 
     def _names(self, pair: int) -> tuple[str, str]:
