@@ -14,14 +14,12 @@ import http.client
 import importlib.util
 import io
 import os
-import shutil
 import socket
 import socketserver
 import subprocess
 import threading
 import time
 from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import quote
 
@@ -33,8 +31,10 @@ _BEHIND_VIEWER = "64MiB"  # of its own server, which only hands on
 _SERVER_MEMORY = "32MiB"  # what a browser gets that is opened later: more than the seconds that are shown
 _OPENED_WITHIN = 30.0  # s
 _PAUSE = 0.5  # s between two tries to find a viewer
-_PASSED_ON = ("Content-Type", "rerun-final-length")  # headers of the page
-_WAIT = 30.0  # s for Rerun's own server, or for a request to come whole
+_WAIT = 30.0  # s for a request to come whole
+_POLICY = (  # the page speaks with nobody but the server of its data
+    "default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; connect-src 'self' http://{}:{}"
+)
 _LONGEST_HEAD = 1 << 16  # bytes
 _HTTP_2 = b"PRI * HTTP/2.0\r\n"  # how rerun-sdk begins; browsers do not, without encryption
 _MISDIRECTED = b"HTTP/1.1 421 Misdirected Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
@@ -75,7 +75,8 @@ class Viewer:
             time.sleep(_PAUSE)
         if self._mode == "web" and not self._opened:
             data, page = self._awaited
-            for server in (_page_server(self._web_port, self._data_port, page), _data_server(self._data_port, data)):
+            policy = _POLICY.format(HOST, self._data_port)
+            for server in (_guard(self._web_port, page, policy), _guard(self._data_port, data)):
                 threading.Thread(target=server.serve_forever, daemon=True).start()
             self._report(f"Rerun: open http://{HOST}:{self._web_port}/?url={quote(_url(self._data_port), safe='')}")
         elif self._own is None or not self._opened:
@@ -148,71 +149,42 @@ def _listens(port: int) -> bool:
 # ---- what a browser reaches ------------------------------------------------------------------------------------------
 
 
-def _is_ours(host: str | None, port: int) -> bool:
-    return (host or "").lower() in {f"{name}:{port}" for name in ("localhost", HOST, "[::1]")}
+def _guard(port: int, rerun: int, policy: str = "") -> socketserver.BaseServer:
+    """Hands connections on to a server of Rerun, byte by byte, once the first request says where it wants to go.
 
-
-def _page_server(web_port: int, port: int, page: int) -> socketserver.BaseServer:
-    """The page, which its policy lets speak with nobody but the server of its data."""
-    policy = (
-        f"default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; connect-src 'self' http://{HOST}:{port}"
-    )
-
-    class Page(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            if not _is_ours(self.headers.get("Host"), web_port):
-                self.send_error(http.HTTPStatus.MISDIRECTED_REQUEST)
-                return
-            behind_it = http.client.HTTPConnection(HOST, page, timeout=_WAIT)
-            try:
-                behind_it.request("GET", self.path.partition("?")[0])
-                answer = behind_it.getresponse()
-                self.send_response(answer.status)
-                for name in _PASSED_ON:
-                    if value := answer.headers.get(name):
-                        self.send_header(name, value)
-                self.send_header("Content-Security-Policy", policy)
-                self.end_headers()
-                shutil.copyfileobj(answer, self.wfile)
-            except OSError:
-                self.close_connection = True  # the browser has gone, or the server
-            finally:
-                behind_it.close()
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Nothing: standard error is nobody's."""
-
-    return ThreadingHTTPServer((HOST, web_port), Page)
-
-
-def _data_server(port: int, data: int) -> socketserver.BaseServer:
-    """Hands connections on to Rerun's server, byte by byte, once the first request says where it wants to go.
-
-    A browser asks only one host on one connection, so the first request speaks for all.
+    A browser asks only one host on one connection, so the first request speaks for all. With a policy for the browser
+    it is the only one: Rerun ends a connection of HTTP/1.0 after its answer.
     """
 
-    class Data(socketserver.BaseRequestHandler):
+    class Connection(socketserver.BaseRequestHandler):
         def handle(self) -> None:
             with contextlib.suppress(OSError):  # either side has gone
                 self.request.settimeout(_WAIT)
                 head = _head(self.request)
-                if not head.startswith(_HTTP_2) and not _is_ours(_host(head), port):
+                if not head.startswith(_HTTP_2) and not _is_ours(head, port):
                     self.request.sendall(_MISDIRECTED)
                     return
                 self.request.settimeout(None)
-                with socket.create_connection((HOST, data)) as rerun:
-                    rerun.sendall(head)
-                    threading.Thread(target=_copy, args=(rerun, self.request), daemon=True).start()
-                    _copy(self.request, rerun)
+                with socket.create_connection((HOST, rerun)) as behind_it:
+                    if policy:
+                        path = head.partition(b" ")[2].partition(b" ")[0].partition(b"?")[0]
+                        behind_it.sendall(b"GET %b HTTP/1.0\r\n\r\n" % path)
+                        header = f"\r\nContent-Security-Policy: {policy}\r\n".encode()
+                        self.request.sendall(_head(behind_it).replace(b"\r\n", header, 1))
+                        _copy(behind_it, self.request)
+                    else:
+                        behind_it.sendall(head)
+                        threading.Thread(target=_copy, args=(behind_it, self.request), daemon=True).start()
+                        _copy(self.request, behind_it)
 
     class Server(socketserver.ThreadingTCPServer):
         allow_reuse_address = daemon_threads = True
 
-    return Server((HOST, port), Data)
+    return Server((HOST, port), Connection)
 
 
 def _head(connection: socket.socket) -> bytes:
-    """What comes first, to the end of a request's headers at least."""
+    """What comes first, to the end of a request's or an answer's headers at least."""
     head = b""
     while b"\r\n\r\n" not in head and len(head) < _LONGEST_HEAD:
         if not (more := connection.recv(_LONGEST_HEAD)):
@@ -221,11 +193,12 @@ def _head(connection: socket.socket) -> bytes:
     return head
 
 
-def _host(head: bytes) -> str | None:
-    """The Host of a request of HTTP/1; None if it has none."""
+def _is_ours(head: bytes, port: int) -> bool:
+    """Whether the Host of a request of HTTP/1 is this machine's loopback."""
     with contextlib.suppress(http.client.HTTPException):
-        return http.client.parse_headers(io.BytesIO(head.partition(b"\r\n")[2])).get("Host")
-    return None
+        host = http.client.parse_headers(io.BytesIO(head.partition(b"\r\n")[2])).get("Host", "")
+        return host.lower() in {f"{name}:{port}" for name in ("localhost", HOST, "[::1]")}
+    return False
 
 
 def _copy(source: socket.socket, target: socket.socket) -> None:
