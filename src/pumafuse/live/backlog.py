@@ -7,30 +7,30 @@ first; commands are not.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from .rate_limit import RateLimitedLog
+from .wire import Event
 
 MOST = 65_536  # items that wait
 _MOST_BYTES = 16 << 20  # of waiting items
+_EVENT_BYTES = 500  # of an event, about
+_COMMAND = b'"command"'  # in a datagram with a command
 _OLD, _FRESH = 0.2, 0.05  # s for which an item waits until that is said, and to which what waits is shed
 _BEHIND = 2.0  # s for which some wait for longer, and do not catch up by half, until they are shed
 _AGAIN = 10.0  # s after that in which they are shed at once
 
-T = TypeVar("T")
+T = TypeVar("T", bytes, Event)
 
 
 class Backlog(Generic[T]):
-    """Items that wait."""
+    """Datagrams or events that wait."""
 
-    def __init__(
-        self, what: str, log: RateLimitedLog, is_command: Callable[[T], bool], size: Callable[[T], int]
-    ) -> None:
-        """Nothing waits of ``what``, in the plural; those with a command are not shed; ``size`` is in bytes."""
-        self.what, self.name = what, ""
+    def __init__(self, what: str, log: RateLimitedLog, name: str = "") -> None:
+        """Nothing waits of ``what``, in the plural, that comes from ``name``."""
+        self.what, self.name = what, name
         self.received = self.dropped = self.shed = 0  # dropped: as too many waited; shed: as they waited for too long
-        self._log, self._is_command, self._size = log, is_command, size
+        self._log = log
         self._waiting, self._bytes = deque[tuple[float, T]](), 0  # when each came [s], and what
         self._since, self._oldest = 0.0, 0.0  # since when they are old, how old they were at most [s]
         self._shed_at = -_AGAIN  # when last [s]
@@ -47,15 +47,15 @@ class Backlog(Generic[T]):
         """Let an item wait that has come at ``now`` [s]."""
         self.received += 1
         self._waiting.append((now, item))
-        self._bytes += self._size(item)
+        self._bytes += _size(item)
         while len(self._waiting) > MOST or self._bytes > _MOST_BYTES:
-            self._bytes -= self._size(self._waiting.popleft()[1])
+            self._bytes -= _size(self._waiting.popleft()[1])
             self.dropped += 1
 
     def take(self, most: int) -> list[T]:
         """The oldest ones, at most so many."""
         taken = [self._waiting.popleft()[1] for _ in range(min(len(self._waiting), most))]
-        self._bytes -= sum(map(self._size, taken))
+        self._bytes -= sum(map(_size, taken))
         return taken
 
     def keep_up(self, now: float) -> None:
@@ -71,12 +71,20 @@ class Backlog(Generic[T]):
         patience = 0.0 if now - self._shed_at < _AGAIN else _BEHIND
         if now - self._since < patience or age < 0.5 * self._oldest:
             return
-        kept = [one for one in self._waiting if one[0] > now - _FRESH or self._is_command(one[1])]
+        kept = [one for one in self._waiting if one[0] > now - _FRESH or _is_command(one[1])]
         self.shed += len(self._waiting) - len(kept)
-        self._waiting, self._bytes = deque(kept), sum(self._size(item) for _, item in kept)
+        self._waiting, self._bytes = deque(kept), sum(_size(item) for _, item in kept)
         self._since, self._oldest, self._shed_at = 0.0, 0.0, now
         self._log.write(
             "shed",
             f"{self.name}: {self.what} waited for {age:.2f} s, longer and longer: {self.shed} of measurements shed so"
             " far, the oldest first; a smaller --window takes less time for rows that come late",
         )
+
+
+def _size(item: bytes | Event) -> int:
+    return len(item) if isinstance(item, bytes) else _EVENT_BYTES
+
+
+def _is_command(item: bytes | Event) -> bool:
+    return _COMMAND in item if isinstance(item, bytes) else not item.sensor

@@ -28,8 +28,6 @@ from .wire import Event, Lines
 _LARGEST = 65_536  # bytes of a datagram, or of a piece of a connection
 _MOST_RECEIVED = 1024  # datagrams that are read from the socket at once
 _MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
-EVENT_BYTES = 500  # of an event, about
-_COMMAND = b'"command"'  # in a datagram with a command
 _RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
 _MOST_CONNECTIONS = 256
@@ -60,7 +58,7 @@ class UdpListener:
     def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
         self._place, self._allowed = place, allowed
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._backlog = Backlog[bytes]("datagrams", self._log, lambda datagram: _COMMAND in datagram, len)
+        self._backlog = Backlog[bytes]("datagrams", self._log)
         self._room = memoryview(bytearray(_LARGEST))  # of the next one: to make it each time scatters memory
         self._dropped_before = self._refused = self._reported = 0
 
@@ -297,8 +295,7 @@ class EventClient(_Client):
 
     def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
         super().__init__(address, notify)
-        self._backlog = Backlog[Event]("events", self._log, lambda event: not event.sensor, lambda _: EVENT_BYTES)
-        self._backlog.name = self._name
+        self._backlog = Backlog[Event]("events", self._log, self._name)
         self._came = threading.Condition()
 
     def get(self) -> list[Event]:

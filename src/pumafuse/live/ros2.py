@@ -29,7 +29,6 @@ from .backlog import MOST, Backlog
 from .estimator import LiveEstimator
 from .health import Health, SensorHealth
 from .messages import Reader, readers_of
-from .network import EVENT_BYTES
 from .rate_limit import RateLimitedLog
 from .results import LiveEstimate, UpdateResult
 from .sources import QUIET
@@ -73,7 +72,7 @@ class Ros2Source:
         self._topics = [Topic(name, [one for one in readers if one.entry.topic == name]) for name in names]
         self._command = readers[-1]
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._backlog = Backlog[Event]("messages", self._log, lambda event: not event.sensor, lambda _: EVENT_BYTES)
+        self._backlog = Backlog[Event]("messages", self._log)
         self._burst = list[tuple[int, Event]]()  # by when each was received [ns]
         self._rclpy, no_signals = load("rclpy"), load("rclpy.signals").SignalHandlerOptions.NO  # pumafuse has its own
         try:
