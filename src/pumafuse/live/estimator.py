@@ -36,16 +36,24 @@ _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _ABSENT = bytes((ABSENT,))
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
-_REJECTED = "its measurements are rejected"
 _STRAY, _HELD = Outcome.STRAY, Outcome.HELD
+_REJECTED = "its measurements are rejected"
 
 
 class _Event(NamedTuple):
-    """What was given, to be fed again; without a sensor it is a command."""
+    """An event whose stamp [ns] is a time; without a sensor it is a command."""
 
     stamp: int
     sensor: str | None
     values: Mapping[str, Any]
+
+
+class _Counted(NamedTuple):
+    """An event that may have to be fed again, and what it was counted as."""
+
+    event: _Event
+    result: UpdateResult
+    as_row: bool  # whether a row was counted, too
 
 
 class EventLog(Protocol):
@@ -127,8 +135,8 @@ class LiveEstimator:
         self._strangers = 0
         self._doubtful = 0  # commands that may have to be taken back
         self._answers: dict[bytes, UpdateResult] = {}
-        self._aside: list[tuple[_Event, Outcome]] = []
-        self._behind: list[tuple[_Event, UpdateResult]] = []  # what came since the commands' clock may be set back
+        self._aside: list[_Counted] = []  # what was refused since the commands' clock may be another one
+        self._behind: list[_Counted] = []  # what came since that clock may be set back within the window
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
         self._watch = CommandWatch(config.arm, config.frame, self._log)
@@ -305,32 +313,30 @@ class LiveEstimator:
     def _take(self, t: Time, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Put an event where its stamp says, if that can be."""
         try:
-            stamp = nanoseconds(t)
+            event = _Event(nanoseconds(t), sensor, values)
             parsed = self._parsed(sensor, values)
         except ValueError as error:
-            return self._refuse(sensor, values, _INVALID, str(error), self._refused)
+            return self._refuse(sensor, values, _INVALID, str(error))
         if sensor is not None and sensor not in self._sensors:
-            why = f"unknown sensor; {suggestion(sensor, self._sensors)}"
-            return self._refuse(sensor, values, _UNKNOWN, why, self._refused)
-        clock = self._clock
+            return self._refuse(sensor, values, _UNKNOWN, f"unknown sensor; {suggestion(sensor, self._sensors)}")
+        clock, stamp = self._clock, event.stamp
         if not clock.low <= stamp <= clock.high:
-            if (told := self._judged(_Event(stamp, sensor, values))) is not None:
-                return told
+            if (refusal := self._judged(event)) is not None:
+                return refusal
         elif clock.newest is not None and stamp > clock.newest:
             clock.settle(stamp)
         if sensor is None and self._aside:
             clock.other, self._aside = [], []
         if self._event_log is not None:
-            self._event_log.append(stamp, sensor, values)
-        result = self._take_in_time(stamp, sensor, values, parsed)
+            self._event_log.append(*event)
+        result = self._take_in_time(event, parsed)
         if self._set_back.take(COMMAND if sensor is None else self._sensors[sensor], stamp):
-            return self._watch_clocks(_Event(stamp, sensor, values), result)
+            return self._watch_clocks(event, result)
         return result
 
-    def _take_in_time(
-        self, stamp: int, sensor: str | None, values: Mapping[str, Any], parsed: Mapping[str, Any]
-    ) -> UpdateResult:
+    def _take_in_time(self, event: _Event, parsed: Mapping[str, Any]) -> UpdateResult:
         """Take an event whose stamp is right, as it came and as it is used."""
+        stamp, sensor, values = event
         if sensor is not None:
             if stamp > self._screen.until:
                 self._settle(self._screen.believed())
@@ -355,19 +361,12 @@ class LiveEstimator:
             self._behind = []
         if not self._set_back.commands:
             return result
-        self._behind.append((event._replace(values=dict(values)), result))
+        self._behind.append(_Counted(event._replace(values=dict(values)), result, True))
         if not (back := self._set_back.of_all()):
             return result
-        for (_, name, _), one in self._behind:  # they are counted anew
-            if name is None:
-                self._counts.outcomes[COMMAND, one.outcome] -= 1
-                continue
-            self._counts.rows[self._sensors[name]] -= 1
-            for outcome in one.axes.values():
-                self._counts.outcomes[self._sensors[name], outcome] -= 1
         told = f"all clocks were set back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s: new segment, filter restarted"
         self._log.write("clock", told)
-        return self._begin_segment([one for one, _ in self._behind])
+        return self._begin_segment(self._behind)
 
     def _parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """An event's values with a pose in the place of joints, and a commanded orientation as axes."""
@@ -406,7 +405,7 @@ class LiveEstimator:
             first = self._parsed(None, self._joints.posed(values, by_stamp.pop(stamp)))
             others = {other: self._parsed(None, self._joints.posed({}, one)) for other, one in by_stamp.items()}
         except ValueError as error:
-            return self._refuse(None, values, _INVALID, str(error), self._refused)
+            return self._refuse(None, values, _INVALID, str(error))
         result = self._enter(stamp, None, first)
         for other, pose in others.items():
             self._enter(other, None, pose, again=True)
@@ -450,15 +449,16 @@ class LiveEstimator:
             return None
         if verdict is Verdict.RESET:
             return self._start_anew(event, newest)
-        outcome = _TOO_LATE if verdict is Verdict.BEHIND else _INVALID
+        if is_late := verdict is Verdict.BEHIND:
+            result = self._refuse_late(stamp, sensor, values, self._refused)
+        else:
+            ahead = f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others"
+            result = self._refuse(sensor, values, _INVALID, ahead)
         if len(clock.other) == 1 and command:
             self._aside = []
         if clock.other and len(self._aside) < _MOST_ASIDE:
-            self._aside.append((event._replace(values=dict(values)), outcome))
-        if verdict is Verdict.AHEAD:
-            why = f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others"
-            return self._refuse(sensor, values, outcome, why, self._refused)
-        return self._refuse_late(stamp, sensor, values, self._refused)
+            self._aside.append(_Counted(event._replace(values=dict(values)), result, is_late))
+        return result
 
     def _forget(self, after: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""
@@ -481,18 +481,21 @@ class LiveEstimator:
     def _start_anew(self, event: _Event, newest: int) -> UpdateResult:
         """A new segment from the events that have shown the commands' clock to be another."""
         aside, self._aside = self._aside, []
-        first = next(other.stamp for other, _ in aside if other.sensor is None)
-        for (_, sensor, values), outcome in aside:
-            self._count(sensor, values, outcome, self._refused, -1)
-            if sensor is not None and outcome == _TOO_LATE:
-                self._counts.rows[self._sensors[sensor]] -= 1
+        first = next(one.event.stamp for one in aside if one.event.sensor is None)
         way = "back" if first < newest else "ahead"
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
         self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
-        return self._begin_segment([*(other for other, _ in aside), event])
+        return self._begin_segment(aside, event)
 
-    def _begin_segment(self, events: Sequence[_Event]) -> UpdateResult:
-        """Begin a segment with events of the new clock; what becomes of the last."""
+    def _begin_segment(self, counted: Sequence[_Counted], *new: _Event) -> UpdateResult:
+        """Begin a segment with events of the new clock, which are counted anew; what becomes of the last."""
+        for (_, sensor, _), result, as_row in counted:
+            source = COMMAND if sensor is None else self._sensors[sensor]
+            for outcome in [result.outcome] if sensor is None else result.axes.values():
+                self._counts.outcomes[source, outcome] -= 1
+            if sensor is not None:
+                self._counts.rows[source] -= as_row
+        events = [*(one.event for one in counted), *new]
         self.segment += 1
         self._start = {}
         if self._joints is not None:
@@ -516,7 +519,7 @@ class LiveEstimator:
             try:
                 frame_start.place(event.stamp, x, y)
             except RunError as error:
-                return self._refuse(None, event.values, _INVALID, str(error), self._refused)
+                return self._refuse(None, event.values, _INVALID, str(error))
             early = [one for one in self._early if one.stamp >= oldest]
             self._begin(self._before)
             self._early, self._frame_start = early, frame_start
@@ -721,19 +724,19 @@ class LiveEstimator:
         return self._refuse(sensor, values, _TOO_LATE, why, outcomes)
 
     def _refuse(
-        self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str, outcomes: IntArray
+        self,
+        sensor: str | None,
+        values: Mapping[str, Any],
+        outcome: Outcome,
+        reason: str,
+        outcomes: IntArray | None = None,
     ) -> UpdateResult:
-        """Count an event that never comes into the window, among ``outcomes``."""
-        self._count(sensor, values, outcome, outcomes, 1)
-        return refused(axes_of(values), outcome, reason)
-
-    def _count(
-        self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, outcomes: IntArray, times: int
-    ) -> None:
-        """Count what is refused, a measurement for each of its components; ``times`` −1 takes it back."""
+        """Count an event that never comes into the window, a measurement for each of its axes, among ``outcomes``."""
+        outcomes, result = self._refused if outcomes is None else outcomes, refused(axes_of(values), outcome, reason)
         if sensor is None:
-            outcomes[COMMAND, outcome] += times
+            outcomes[COMMAND, outcome] += 1
         elif sensor in self._sensors:
-            outcomes[self._sensors[sensor], outcome] += times * len(axes_of(values))
+            outcomes[self._sensors[sensor], outcome] += len(result.axes)
         else:
-            self._strangers += times
+            self._strangers += 1
+        return result
