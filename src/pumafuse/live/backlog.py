@@ -12,8 +12,9 @@ from typing import Generic, TypeVar
 from .rate_limit import RateLimitedLog
 from .wire import Event
 
-MOST = 65_536  # items that wait
+_MOST = 65_536  # items that wait
 _MOST_BYTES = 16 << 20  # of waiting items
+_MOST_AT_ONCE = 64  # items handed out until the next ones are let in: about a ms of work
 _EVENT_BYTES = 500  # of an event, about
 _COMMAND = b'"command"'  # in a datagram with a command
 _OLD, _FRESH = 0.2, 0.05  # s for which an item waits until that is said, and to which what waits is shed
@@ -48,18 +49,26 @@ class Backlog(Generic[T]):
         self.received += 1
         self._waiting.append((now, item))
         self._bytes += _size(item)
-        while len(self._waiting) > MOST or self._bytes > _MOST_BYTES:
+        while len(self._waiting) > _MOST or self._bytes > _MOST_BYTES:
             self._bytes -= _size(self._waiting.popleft()[1])
             self.dropped += 1
 
-    def take(self, most: int) -> list[T]:
-        """The oldest ones, at most so many."""
-        taken = [self._waiting.popleft()[1] for _ in range(min(len(self._waiting), most))]
+    def some(self, now: float) -> list[T]:
+        """Some of the oldest ones, at ``now`` [s]; that they wait for long is said, and where it goes on, some go."""
+        self._keep_up(now)
+        taken = [self._waiting.popleft()[1] for _ in range(min(len(self._waiting), _MOST_AT_ONCE))]
         self._bytes -= sum(map(_size, taken))
         return taken
 
-    def keep_up(self, now: float) -> None:
-        """Say that items wait for long, and shed measurements where that goes on; it is ``now`` [s]."""
+    def rest(self) -> list[T]:
+        """All that wait."""
+        taken = [item for _, item in self._waiting]
+        self._waiting.clear()
+        self._bytes = 0
+        return taken
+
+    def _keep_up(self, now: float) -> None:
+        """Say that items wait for long, and shed measurements where that goes on."""
         age = now - self._waiting[0][0] if self._waiting else 0.0
         if age < _OLD:
             self._since = 0.0

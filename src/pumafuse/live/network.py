@@ -16,18 +16,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol, TypeAlias, TypeVar
+from typing import Protocol, TypeAlias
 
 from ..errors import ConfigError, RunError
 from .address import Address, Allowed, SocketAddress, host_port, listener, receiver
-from .backlog import MOST, Backlog
+from .backlog import Backlog
 from .rate_limit import RateLimitedLog
 from .sources import QUIET
 from .wire import Event, Lines
 
 _LARGEST = 65_536  # bytes of a datagram, or of a piece of a connection
-_MOST_RECEIVED = 1024  # datagrams that are read from the socket at once
-_MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
+_MOST_RECEIVED, _MOST_LEFT = 1024, 65_536  # datagrams that are read from the socket at once, and at the end
 _RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
 _MOST_CONNECTIONS = 256
@@ -38,7 +37,6 @@ _PATIENCE = 10.0  # s for a connection to be made
 _SILENT = RateLimitedLog(lambda _: None)  # at the end: a thread that writes while the process ends would stop it
 
 Items: TypeAlias = Sequence[bytes | Event]
-_Piece = TypeVar("_Piece", bound=Items)
 
 
 def source(address: Address, listen: str | None, allow: list[str], notify: Callable[[str], None]) -> Remote:
@@ -78,15 +76,14 @@ class UdpListener:
         if (lost := self._lost()) > self._reported:
             self._reported = lost
             self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
-        self._backlog.keep_up(time.monotonic())
-        return self._lines(_MOST_AT_ONCE)
+        return _lines(self._backlog.some(time.monotonic()))
 
     def stop(self) -> list[bytes]:
         """Close the socket, and return the lines that have come and were not given yet."""
-        self._receive(MOST)
+        self._receive(_MOST_LEFT)
         self._lost()  # for the last time
         self._socket.close()
-        return self._lines(MOST)
+        return _lines(self._backlog.rest())
 
     def summary(self) -> str:
         """How many came, and how many were lost or refused."""
@@ -94,9 +91,6 @@ class UdpListener:
         taken = waited.received - waited.dropped - waited.shed
         text = f"{self._name}: {taken} datagrams taken in, {self._lost()} lost{waited.shed_words}"
         return f"{text}, {self._refused} refused" if self._refused else text
-
-    def _lines(self, most: int) -> list[bytes]:
-        return [line for datagram in self._backlog.take(most) for line in datagram.split(b"\n")]
 
     def _receive(self, most: int) -> None:
         """Read at most so many datagrams from the socket, which is to be empty soon: the system keeps few."""
@@ -121,25 +115,39 @@ class UdpListener:
         return self._backlog.dropped + self._dropped_before
 
 
-class _Tcp:
-    """Connections, each read by a thread, whose lines are put together in the order in which they come."""
+def _lines(datagrams: list[bytes]) -> list[bytes]:
+    return [line for datagram in datagrams for line in datagram.split(b"\n")]
+
+
+class _Merged:
+    """What several threads put together, in the order in which it comes; they wait where it is too much."""
+
+    def __init__(self) -> None:
+        self._pieces = queue.Queue[Items](_MOST_PIECES)
+
+    def get(self) -> Items:
+        """Some of one thread; none after a tenth of a second without any."""
+        try:
+            return self._pieces.get(timeout=QUIET)
+        except queue.Empty:
+            return []
+
+
+class _Tcp(_Merged):
+    """Connections of lines, each read by a thread."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
+        super().__init__()
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._pieces = queue.Queue[list[bytes]](_MOST_PIECES)
 
-    def get(self) -> list[bytes]:
-        """Some of one connection; none after a tenth of a second without any."""
-        return _some(self._pieces)
-
-    def stop(self) -> list[bytes]:
+    def stop(self) -> Items:
         """What has come and was not given yet; the connections end with the process."""
         self._log = _SILENT
-        found: list[bytes] = []
+        left = list[bytes | Event]()
         with contextlib.suppress(queue.Empty):
             for _ in range(_MOST_PIECES + _MOST_CONNECTIONS):  # and one that each thread holds; a flood has no end
-                found += self._pieces.get(timeout=_HANDED_OVER)
-        return found
+                left += self._pieces.get(timeout=_HANDED_OVER)
+        return left
 
 
 def _read_lines(
@@ -275,7 +283,7 @@ class TcpClient(_Client, _Tcp):
         _Tcp.__init__(self, notify)
         _Client.__init__(self, address, notify)
 
-    def stop(self) -> list[bytes]:
+    def stop(self) -> Items:
         """What has come and was not given yet; no connection is made any more."""
         self._end()
         return super().stop()
@@ -303,14 +311,13 @@ class EventClient(_Client):
         with self._came:
             if not self._backlog:
                 self._came.wait(QUIET)
-            self._backlog.keep_up(time.monotonic())
-            return self._backlog.take(_MOST_AT_ONCE)
+            return self._backlog.some(time.monotonic())
 
     def stop(self) -> list[Event]:
         """The events that have come and were not given yet; no connection is made any more."""
         self._end()
         with self._came:
-            return self._backlog.take(MOST)
+            return self._backlog.rest()
 
     def summary(self) -> str:
         """How often the connection was made, how many events came, and how many were lost."""
@@ -357,13 +364,12 @@ class Remote(Protocol):
         ...
 
 
-class Several:
-    """Sources, as a robot's controller and a tracker, each asked by a thread of its own: what comes, in its order."""
+class Several(_Merged):
+    """Sources, as a robot's controller and a tracker, each asked by a thread of its own."""
 
     def __init__(self, sources: Sequence[Remote]) -> None:
-        self._sources = sources
-        self._pieces = queue.Queue[Items](_MOST_PIECES)
-        self._ended = threading.Event()
+        super().__init__()
+        self._sources, self._ended = sources, threading.Event()
         self._error: Exception | None = None
 
     def start(self) -> None:
@@ -376,15 +382,15 @@ class Several:
         """Some of one source; none after a tenth of a second without any. What a source has raised is raised."""
         if self._error is not None:
             raise self._error
-        return _some(self._pieces)
+        return super().get()
 
     def stop(self) -> Items:
         """Those that have come and were not given yet."""
         self._ended.set()
-        found = list[bytes | Event]()
+        left = list[bytes | Event]()
         while any(thread.is_alive() for thread in self._threads) or not self._pieces.empty():
-            found += _some(self._pieces)
-        return [*found, *(item for source in self._sources for item in source.stop())]
+            left += super().get()
+        return [*left, *(item for source in self._sources for item in source.stop())]
 
     def summary(self) -> str:
         """How many came from each."""
@@ -397,14 +403,6 @@ class Several:
                     self._pieces.put(items)
         except Exception as error:  # it is the thread that takes what comes that is to end by it
             self._error = error
-
-
-def _some(pieces: queue.Queue[_Piece]) -> _Piece | list[Any]:
-    """The next piece; nothing after a tenth of a second without any."""
-    try:
-        return pieces.get(timeout=QUIET)
-    except queue.Empty:
-        return []
 
 
 def _listen(listening: socket.socket, kind: str, place: tuple[str, int], notify: Callable[[str], None]) -> str:

@@ -25,7 +25,7 @@ from ..logs.manifest import Manifest
 from ..model.arm import CANONICAL_AXES
 from ..space.rotations import TURNING
 from ..units import MS
-from .backlog import MOST, Backlog
+from .backlog import Backlog
 from .estimator import LiveEstimator
 from .health import Health, SensorHealth
 from .messages import Reader, readers_of
@@ -38,7 +38,6 @@ EXTRA = "pip install 'pumafuse[ros2]'"
 FRAME_ID = "frame_id"  # the node's parameter
 _NAME = "pumafuse"  # of the node, where --ros-args names none
 _DEPTH = 1000  # messages of a topic that the middleware keeps
-_MOST_AT_ONCE = 64  # events taken in before the node looks for messages again
 _LOOK = 0.5  # s between two looks at who publishes
 _ALONE = 5.0  # s without a publisher until that is said
 _EVERY = 1.0  # s between two diagnostics
@@ -106,15 +105,14 @@ class Ros2Source:
         self._executor.spin_once(timeout_sec=0.0 if self._backlog else wait)
         now = time.monotonic()
         self._receive(now)
-        self._backlog.keep_up(now)
         if now - self._looked > _LOOK:
             self._look(now)
-        return self._backlog.take(_MOST_AT_ONCE)
+        return self._backlog.some(now)
 
     def stop(self) -> list[Event]:
         """The events that have come and were not given yet."""
         self._receive(time.monotonic())
-        return self._backlog.take(MOST)
+        return self._backlog.rest()
 
     def close(self) -> None:
         """End the node."""
