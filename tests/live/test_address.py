@@ -19,6 +19,8 @@ from pumafuse.live.address import Address, listener, receiver
         ("udp://:5005", Address("udp", port=5005)),
         ("tcp-listen://[::1]:5005", Address("tcp-listen", host="::1", port=5005)),
         ("tcp://tracker.cell:5005", Address("tcp", host="tracker.cell", port=5005)),
+        ("rtde:cell/run.toml?host=[::1]:4", Address("rtde", "cell/run.toml", host="::1", port=4)),
+        ("igtl://tracker?time=received", Address("igtl", host="tracker", port=18944, on_receipt=True)),
     ],
 )
 def test_sources_are_parsed(text: str, expected: Address) -> None:
@@ -26,35 +28,25 @@ def test_sources_are_parsed(text: str, expected: Address) -> None:
     assert Address.parse(text) == expected
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        *("stdout", "", "replay", "udp", "http://127.0.0.1:80"),
-        *("replay:a?speed=0", "replay:a?speed=fast", "replay:a?x=1"),
-        *("udp:127.0.0.1:5005", "udp://127.0.0.1", "udp://127.0.0.1:66000", "udp://127.0.0.1:port"),
-        *("udp://user@127.0.0.1:5005", "udp://127.0.0.1:5005/path", "udp://[127.0.0.1:5005"),
-        *("tcp://:5005", "tcp://127.0.0.1:0", "igtl:a"),
+REFUSED = {
+    "no source '.*'; there are: stdin": ["stdout", "", "replay", "udp", "http://127.0.0.1:80", "igtl:a", "udp:a:5005"],
+    r"expected \?speed=": ["replay:a?speed=0", "replay:a?speed=fast", "replay:a?x=1", "replay:a?"],
+    "expected udp://HOST:PORT": [
+        *("udp://127.0.0.1", "udp://127.0.0.1:66000", "udp://127.0.0.1:port", "udp://[127.0.0.1:5005"),
+        *("udp://user@127.0.0.1:5005", "udp://127.0.0.1:5005/path"),
     ],
-)
-def test_other_sources_are_refused(text: str) -> None:
-    """With what is accepted."""
-    with pytest.raises(pf.ConfigError, match="source"):
-        Address.parse(text)
+    "expected tcp://HOST:PORT": ["tcp://:5005", "tcp://127.0.0.1:0"],
+    "expected igtl://HOST": ["igtl://", "igtl://a/b", "igtl://a:b", "igtl://a:0", "igtl://a?time=sent"],
+    r"expected rtde:run\.toml\?host=HOST": [
+        *("rtde:run.toml", "rtde:run.toml?host=", "rtde:?host=a", "rtde:run.toml?port=3", "rtde:run.toml?host=a/b"),
+    ],
+}
 
 
-@pytest.mark.parametrize("text", ["igtl://", "igtl://a/b", "igtl://a:b", "igtl://a?time=sent"])
-def test_servers_of_poses_are_refused(text: str) -> None:
+@pytest.mark.parametrize(("expected", "text"), [(why, text) for why, texts in REFUSED.items() for text in texts])
+def test_other_sources_are_refused(expected: str, text: str) -> None:
     """With what is expected."""
-    with pytest.raises(pf.ConfigError, match="expected igtl://HOST"):
-        Address.parse(text)
-
-
-@pytest.mark.parametrize(
-    "text", ["rtde:run.toml", "rtde:run.toml?host=", "rtde:?host=a", "rtde:run.toml?port=3", "rtde:run.toml?host=a/b"]
-)
-def test_robots_without_a_host_are_refused(text: str) -> None:
-    """With what is expected."""
-    with pytest.raises(pf.ConfigError, match=r"expected rtde:run\.toml\?host=HOST"):
+    with pytest.raises(pf.ConfigError, match=expected):
         Address.parse(text)
 
 

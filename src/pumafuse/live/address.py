@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import socket
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 from typing import TypeAlias
@@ -129,43 +129,42 @@ def _replay(text: str, rest: str) -> Address:
 def _rtde(text: str, rest: str) -> Address:
     path, _, option = rest.rpartition("?")
     name, _, place = option.partition("=")
-    server = _server(place, _RTDE) if path and name == "host" else None
-    if server is None:
+    host, port = _host_and_port(place, _RTDE)
+    if not (path and name == "host" and host and port):
         raise ConfigError(
             f"source '{text}': expected rtde:run.toml?host=HOST or HOST:PORT, the address of the robot's controller"
         )
-    return replace(server, kind="rtde", path=path)
+    return Address("rtde", path, host=host, port=port)
 
 
 def _poses(text: str, rest: str) -> Address:
     place, question, option = rest.removeprefix("//").partition("?")
-    server = _server(place, _IGTL)
-    if server is None or (question and option != "time=received"):
+    host, port = _host_and_port(place, _IGTL)
+    if not (host and port) or (question and option != "time=received"):
         raise ConfigError(
             f"source '{text}': expected igtl://HOST or igtl://HOST:PORT, and ?time=received for times of receipt"
         )
-    return replace(server, kind=POSES, on_receipt=bool(question))
-
-
-def _server(place: str, port: int) -> Address | None:
-    """The server at HOST or HOST:PORT, if that is one."""
-    try:
-        return _network_address(f"tcp://{place}" if ":" in place else f"tcp://{place}:{port}", "")
-    except ConfigError:
-        return None
+    return Address(POSES, host=host, port=port, on_receipt=bool(question))
 
 
 def _network_address(text: str, where: str) -> Address:
-    kind = text.partition(":")[0]
-    try:
-        parts = urlsplit(text)
-        host, port = parts.hostname or "", parts.port
-    except ValueError:
-        host, port = "", None
-    plain = port is not None and text.lower() == f"{kind}://{host_port(host, port)}"
-    if port is None or not plain or (kind == "tcp" and not (host and port)):
+    kind, _, place = text.partition("://")
+    host, port = _host_and_port(place)
+    if port is None or (kind == "tcp" and not (host and port)):
         raise ConfigError(f"{where}: expected {kind}://HOST:PORT, as in {kind}://{_LOOPBACK}:5005")
     return Address(kind, host=host, port=port)
+
+
+def _host_and_port(place: str, usual: int | None = None) -> tuple[str, int | None]:
+    """Host and port of HOST:PORT, or of HOST with the usual port; no port of anything else."""
+    place = place if ":" in place or usual is None else f"{place}:{usual}"
+    try:
+        parts = urlsplit(f"//{place}")
+        host, port = parts.hostname or "", parts.port
+    except ValueError:
+        return "", None
+    plain = port is not None and place.lower() == host_port(host, port)
+    return host, port if plain else None
 
 
 def _network(text: str) -> IPv4Network | IPv6Network:

@@ -295,12 +295,8 @@ class LiveEstimator:
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
         self._tool = tool_of(self.config, self._log)
         self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled, as is known
-        self._watch.restart()
-        self._screen.restart()
-        self._holds.restart()
-        self._diagnosis.restart()
-        self._set_back.restart()
-        counts.restart()
+        for one in (self._watch, self._screen, self._holds, self._diagnosis, self._set_back, counts):
+            one.restart()
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
         # what came is fed again then, and counted anew.
         self._early: list[_Event] | None = [] if self._frame_start.waits else None
@@ -352,11 +348,11 @@ class LiveEstimator:
         stamp, sensor, values = event
         if sensor is not None and (back := self._set_back.of_sensor(self._sensors[sensor])):
             self._diagnosis.set_back[sensor] = stamp
-            self._log.write(
-                f"{sensor} set back",
+            told = (
                 f"sensor '{sensor}': its stamps step back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s and go on there:"
-                " was its clock set? If it was right before, its measurements are stamped too early by that now",
+                " was its clock set? If it was right before, its measurements are stamped too early by that now"
             )
+            self._log.write(f"{sensor} set back", told)
         if sensor is None and self._set_back.commands == 1:
             self._behind = []
         if not self._set_back.commands:
@@ -463,14 +459,11 @@ class LiveEstimator:
     def _forget(self, after: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""
         self._counts.forget(self._window, after)
-        self._window.forget(after)
-        self._commands.forget(after)
-        self._watch.forget(after)
-        self._diagnosis.recent.forget(after)
+        for one in (self._window, self._commands, self._watch, self._diagnosis.recent, self._joints):
+            if one is not None:
+                one.forget(after)
         if self._tool is not None:
             self._place_again(self._tool.forget(after))
-        if self._joints is not None:
-            self._joints.forget(after)
         self._screen.restart()
         if self._event_log is not None:
             self._event_log.discard(after)
