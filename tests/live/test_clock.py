@@ -44,11 +44,10 @@ def test_three_commands_of_another_time_are_a_reset(to: int, verdict: Verdict) -
 
 def test_a_command_of_the_right_time_rules_out_a_reset() -> None:
     """Two stale commands, a current one, two stale ones: no restart."""
-    clock = at(100.0)
-    for step in range(4):
-        assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
-        if step == 1:
-            clock.other = []
+    live = pf.LiveEstimator(CONFIG)
+    for t in (100.0, 50.0, 50.028, 100.028, 50.056, 50.084):
+        live.command(t, radial=0.5)
+    assert live.segment == 0
 
 
 @pytest.mark.parametrize(

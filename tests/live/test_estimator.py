@@ -134,7 +134,12 @@ def test_a_row_that_is_good_in_part_is_used_in_part() -> None:
 
 
 def test_commands_answer_too() -> None:
-    """Taken, said before, repeated within half a period, not finite, of no axis."""
+    """Taken, said before, repeated within half a period, not finite, of no axis; also the first one of all."""
+    live = pf.LiveEstimator(CONFIG)
+    for nowhere in (1e300, math.nan):
+        assert live.command(0, radial=nowhere).outcome is pf.Outcome.INVALID
+    assert live.command(28_000_000, radial=0.5).outcome is pf.Outcome.FUSED
+    assert live.estimate(28_000_000)["radial"].position == 0.5
     live = running()
     assert live.command(1.1, radial=0.58).outcome is pf.Outcome.FUSED
     assert live.command(1.1, radial=0.58).outcome is pf.Outcome.DUPLICATE
@@ -333,13 +338,3 @@ def test_two_senders_are_named_and_no_command_is_called_missing(later: float) ->
     twice = np.sort(np.concatenate([np.arange(len(t)), np.arange(0, len(t), 50)]))  # some rows are there twice
     recorded = clock_faults(pf.Run.from_arrays(t[twice], {"radial": u[twice]}), PERIOD, [])
     assert len(recorded) == 1 and words in recorded[0]
-
-
-def test_a_first_command_that_is_no_position_is_invalid() -> None:
-    """An arm with limits, and nothing commanded yet: the command is refused, the stream goes on."""
-    live = pf.LiveEstimator(pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")))
-    assert live.config.arm.validity.max_speed is not None
-    assert live.command(0, radial=1e300).outcome is pf.Outcome.INVALID
-    assert live.command(1, radial=float("nan")).outcome is pf.Outcome.INVALID
-    assert live.command(28_000_000, radial=0.5).outcome is pf.Outcome.FUSED
-    assert live.estimate(28_000_000)["radial"].position == 0.5

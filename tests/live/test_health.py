@@ -129,17 +129,6 @@ def test_what_leaves_at_once_is_counted_all_the_same() -> None:
     assert camera.nis == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 9000.0))
 
 
-def test_what_is_kept_is_no_more_than_the_window_needs() -> None:
-    """After two minutes of rows, and after one that is sent again and again while no time goes by."""
-    live, events = pf.LiveEstimator(CONFIG), events_of(stream(120.0))
-    for event in [*events, *[events[-2]] * 1000]:
-        feed(live, event)
-    health = live.health()
-    assert health.sensors["tracker"].outcomes["duplicate"] + health.commands["duplicate"] == 1000
-    assert sum(len(given) for given in live._commands._given) < 80  # two seconds
-    assert len(live._counts._came) < 128
-
-
 def test_what_is_taken_back_is_invalid_and_nothing_else_remains_of_it() -> None:
     """A sensor runs half a minute ahead for ten rows: they came, and all else is as without them."""
     live, clean = pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)

@@ -148,11 +148,6 @@ def test_in_any_order(longest: float, run: pf.Run) -> None:
         assert expected[sensor]["rejected"] < 40
 
 
-def test_estimates_at_the_time_are_as_live() -> None:
-    """Fed in order, the estimate at each command is that of `fuse --as-live`."""
-    estimates_are_as_live(RUN, KNOWN)
-
-
 @ALL_RUNS
 def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path, run: pf.Run) -> None:
     """Lines with orientations, which go out as quaternions."""
@@ -164,8 +159,9 @@ def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path, run: pf.Run) 
     assert off.magnitude() == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_replay_is_as_live() -> None:
-    """A run that is replayed as a stream, a tenth of its rows without an orientation, gives the estimates of `fuse`."""
+def test_estimates_at_the_time_are_as_live() -> None:
+    """Fed in order, at each command; and replayed, of a run whose rows are in a tenth without an orientation."""
+    estimates_are_as_live(RUN, KNOWN)
     run = run_of(noisy=True)
     run.sensors["mocap"].orientation[::10] = np.nan
     replay_is_as_live(run, KNOWN)
