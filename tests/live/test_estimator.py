@@ -164,25 +164,6 @@ def test_silence_only_makes_the_estimate_less_certain() -> None:
     assert live.estimate(live.newest + 10_000_000_000).stale == ("radial", "vertical")
 
 
-def test_the_start_level_is_where_the_arm_rests() -> None:
-    """With a start level the first command is a step from there; without one the arm is there already."""
-    told, untold = pf.LiveEstimator(CONFIG, start={"radial": 0.5}), pf.LiveEstimator(CONFIG)
-    for live in (told, untold):
-        live.command(0.0, radial=0.57)
-    assert told.estimate(0.0)["radial"].position == 0.5
-    assert untold.estimate(0.0)["radial"].position == 0.57
-    assert abs(told.estimate(5.0)["radial"].position - 0.57) < 1e-3
-
-
-def test_int_times_are_nanoseconds() -> None:
-    """Stamps of a clock since 1970 keep their nanoseconds."""
-    live, origin = pf.LiveEstimator(CONFIG), 1_700_000_000_123_456_789
-    live.command(origin, radial=0.57)
-    live.measurement(np.int64(origin + 10_000_001), "tracker", radial=0.57)
-    assert live.newest == origin + 10_000_001
-    assert live.estimate().stamp == origin + 10_000_001
-
-
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -225,19 +206,6 @@ def test_x_and_y_mean_nothing_before_the_frame_has_its_place() -> None:
     assert live.command(0.01, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
     assert live.command(0.03, x=0.1, y=0.5).outcome is pf.Outcome.FUSED
     assert live.estimate().outcome is pf.Outcome.FUSED
-
-
-def test_an_axis_with_a_start_level_is_there_before_its_first_command() -> None:
-    """An axis that is commanded late, and whose level is known, is measured from the first command of all on."""
-    told, untold = pf.LiveEstimator(CONFIG, start={"vertical": 0.1}), pf.LiveEstimator(CONFIG)
-    for live in (told, untold):
-        for step in range(200):
-            live.command(step * PERIOD, radial=0.57)
-            live.measurement(step * PERIOD + 0.01, "tracker", radial=0.57, vertical=0.1001)
-        live.command(5.6, vertical=0.1)
-    assert told.health().sensors["tracker"].outcomes["before_start"] == 0
-    assert untold.health().sensors["tracker"].outcomes["before_start"] > 0
-    assert told.estimate()["vertical"].position_sd < 1e-3
 
 
 def test_commands_beyond_the_models_limits_are_said() -> None:

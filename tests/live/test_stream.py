@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -31,20 +30,6 @@ def test_pieces_of_any_size() -> None:
     assert cut.stream.bad == 0
     assert [found["t"] for found in whole.estimates] == [step * 28 / 1000 for step in range(36)]
     assert whole.said == []
-
-
-def test_an_even_grid_is_as_live() -> None:
-    """With a rate the estimates are those of `fuse --as-live --rate`, to the last bit."""
-    data = files("pumafuse") / "data"
-    run, config = pf.Run.read(str(data / "scan1")), pf.FusionConfig.load(str(data / "fusion.toml"))
-    rate = 33.3
-    offline, both = pf.fuse(run, config, rate=rate, mode="as-live"), Both(config, rate)
-    both.replay(run)
-    found = both.estimates
-    assert 0 <= len(found) - len(offline.time) <= 1  # up to the last stamp, 8 ms after the last valid time
-    for axis, track in offline.axes.items():
-        positions = [one[axis]["position_mm"] for one in found[: len(offline.time)]]
-        assert positions == (track.position * 1e3).tolist()
 
 
 def test_silence_goes_on_by_the_wall_clock() -> None:
@@ -223,8 +208,8 @@ def test_a_replay_follows_the_controllers_grid() -> None:
 
 
 @pytest.mark.parametrize("pause", [1.5, 20.0])
-@pytest.mark.parametrize("commands_first", [True, False])
-def test_the_grid_goes_on_over_a_pause(pause: float, commands_first: bool) -> None:
+@pytest.mark.parametrize(("commands_first", "rate"), [(True, 100.0), (False, 33.3)])
+def test_the_grid_goes_on_over_a_pause(pause: float, commands_first: bool, rate: float) -> None:
     """All pause for longer than the window: each point of `fuse --as-live --rate` is there, to the last bit."""
     rng = np.random.default_rng(0)
     first, again = (-0.003, 0.5) if commands_first else (1.2, 0.0)
@@ -235,8 +220,9 @@ def test_the_grid_goes_on_over_a_pause(pause: float, commands_first: bool) -> No
     run = pf.Run.from_arrays(command, {"radial": 0.57 + 1e-3 * rng.random(len(command))}, read)
     sensors = {"fast": pf.Sensor(sd=5e-5, latency=0.008), "slow": pf.Sensor(sd=5e-4, latency=0.1)}
     config = pf.FusionConfig(arm=TRACKED.arm, sensors=sensors)
-    offline, both = pf.fuse(run, config, rate=100.0, mode="as-live"), Both(config, 100.0, window=1.0)
+    offline, both = pf.fuse(run, config, rate=rate, mode="as-live"), Both(config, rate, window=1.0)
     both.replay(run)
+    assert len(both.estimates) >= len(offline.time)
     found = [(one["t"], one["radial"]["position_mm"]) for one in both.estimates[: len(offline.time)]]
     assert found == list(zip(offline.time.tolist(), (offline.axes["radial"].position * 1e3).tolist(), strict=True))
 

@@ -122,7 +122,7 @@ def test_any_clock_gives_the_same_estimates(stamp: int) -> None:
     def estimates(origin: int) -> list[object]:
         live = pf.LiveEstimator(config_of(), window=3600.0)
         for step in range(20):
-            live.command(origin + step * T, radial=0.5 + 1e-3 * step)
+            live.command(np.int64(origin + step * T), radial=0.5 + 1e-3 * step)
             live.measurement(origin + step * T + 10 * MS, "fast", radial=0.5)
         return [live.estimate(origin + time)["radial"] for time in (0, 300 * MS, 600 * MS)]
 
