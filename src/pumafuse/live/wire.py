@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import codecs
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import UNSET, UnsetType
@@ -18,7 +19,6 @@ from .results import LiveEstimate
 from .tool import NOISE, ORIENTATION
 
 _LONGEST = 64 * 1024  # bytes of a line
-_NAMES = ("t", "t_ns", "command", "sensor", NOISE)
 _QUATERNION = "q"  # x, y, z, w; an arm that does not turn a tool may have an axis of this name
 _KEYS = {  # of an estimate, and their scale
     kind: (f"position_{one.unit}", f"sd_{one.unit}", f"velocity_{one.unit}_s", one.scale)
@@ -72,6 +72,20 @@ class Event(NamedTuple):
     values: Mapping[str, Any]
 
 
+class _Head(msgspec.Struct):
+    """What is no value of a line."""
+
+    t: float | None = None
+    t_ns: int | None = None
+    command: dict[str, Any] | None = None
+    sensor: str | None = None
+    noise: float | None = None
+
+
+_HEAD = _Head.__struct_fields__
+_TREE = msgspec.json.Decoder(dict[str, Any])
+
+
 class LineDecoder:
     """Decoder of lines into events, for one arm's axes."""
 
@@ -80,46 +94,33 @@ class LineDecoder:
     ) -> None:
         """Prepare for axes and joints, and with a frame for x, y, z; none may be called as a part of a line."""
         every: dict[str, Kind] = {**dict.fromkeys(CARTESIAN if framed else (), "length"), **kinds, **joints}
-        self._axes = tuple(dict.fromkeys((*kinds, *every)))
-        self._scales = [SCREEN[every[axis]].scale for axis in self._axes]
-        self._turns = _QUATERNION not in kinds or set(TURNING) <= kinds.keys()
-        self._names = (*_NAMES, _QUATERNION) if self._turns else _NAMES
-        for axis in self._axes:
+        turns = _QUATERNION not in kinds or set(TURNING) <= kinds.keys()
+        parts = (*_HEAD, _QUATERNION) if turns else _HEAD
+        for axis in every:
             what = f"{'joint' if axis in joints else 'axis'} {printable(axis)!r}"
-            if axis in self._names:
-                raise ConfigError(f"{what}: lines of a stream call something else so ({', '.join(self._names)})")
+            if axis in parts:
+                raise ConfigError(f"{what}: lines of a stream call something else so ({', '.join(parts)})")
             if not axis.isprintable() or set(axis) & set('\\"'):
                 raise ConfigError(
                     f"{what}: names in lines of a stream have no quotes, backslashes or control characters"
                 )
-        fields: list[tuple[str, Any, Any]] = [
-            (f"axis_{number}", float | UnsetType | None, UNSET) for number in range(len(self._axes))
-        ]
-        names = {f"axis_{number}": axis for number, axis in enumerate(self._axes)}
-        options: dict[str, Any] = {"rename": names, "forbid_unknown_fields": True, "gc": False}
-        if self._turns:
-            fields.append((_QUATERNION, tuple[float, float, float, float] | UnsetType | None, UNSET))
-        command = msgspec.defstruct("Command", fields, **options)
-        head = [
-            ("t", float | None, None),
-            ("t_ns", int | None, None),
-            ("command", command | None, None),
-            ("sensor", str | None, None),
-            (NOISE, float | UnsetType | None, UNSET),
-        ]
-        self._decoder = msgspec.json.Decoder(msgspec.defstruct("Line", [*head, *fields], **options))
+        types: dict[str, Any] = dict.fromkeys(every, float | UnsetType | None)
+        types |= {_QUATERNION: tuple[float, float, float, float] | UnsetType | None} if turns else {}
+        self._axes = [(axis, SCREEN[kind].scale) for axis, kind in every.items()]
+        self._values, self._turns = frozenset(types), turns
+        fields = [(f"value_{number}", kind, UNSET) for number, kind in enumerate(types.values())]
+        rename = {f"value_{number}": name for number, name in enumerate(types)}
+        self._struct = msgspec.defstruct("Values", fields, rename=rename, gc=False)
 
     def decode(self, line: bytes) -> Event:
         """The event of a line."""
         if len(line) > _LONGEST:
             raise BadLine("longer than 64 KiB")
         try:
-            try:
-                found, unknown = self._decoder.decode(line), {}
-            except msgspec.ValidationError as error:
-                if "unknown field" not in str(error):
-                    raise
-                found, unknown = self._without_unknown(line)
+            tree = _TREE.decode(line)
+            head = msgspec.convert(tree, _Head)
+            given = tree if head.command is None else head.command
+            values = msgspec.structs.astuple(msgspec.convert(given, self._struct))
         except msgspec.ValidationError as error:
             raise BadLine(str(error)) from None
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -127,36 +128,27 @@ class LineDecoder:
             if rest != line and not rest.startswith(codecs.BOM_UTF8):
                 return self.decode(rest)
             raise BadLine(f"not JSON: {error}") from None
-        t, t_ns, command, sensor, noise, *values = msgspec.structs.astuple(found)
-        if command is not None:
-            if sensor is not None or any(value is not UNSET for value in (noise, *values)):
+        if head.command is not None:
+            if head.sensor is not None or NOISE in tree or not self._values.isdisjoint(tree):
                 raise BadLine("gives a command and a measurement at once")
-            sensor, values = "", [*msgspec.structs.astuple(command)]
-        elif not sensor:
-            raise BadLine("gives neither 'command' nor 'sensor'" if sensor is None else "'sensor' is empty")
-        if (t is None) == (t_ns is None):
+        elif not head.sensor:
+            raise BadLine("gives neither 'command' nor 'sensor'" if head.sensor is None else "'sensor' is empty")
+        t = head.t if head.t_ns is None else head.t_ns
+        if t is None or None not in (head.t, head.t_ns):
             raise BadLine("needs one of 't' (s) and 't_ns' (ns)")
-        orientation = values.pop() if self._turns else None
         by_axis: dict[str, Any] = {
-            axis: float("nan") if value is None else cast(float, value) / scale
-            for axis, scale, value in zip(self._axes, self._scales, values, strict=True)
+            axis: math.nan if value is None else value / scale
+            for (axis, scale), value in zip(self._axes, values, strict=False)  # the last one may be a quaternion
             if value is not UNSET
         }
-        if isinstance(orientation, tuple):
-            by_axis[ORIENTATION] = orientation
-        if noise is not UNSET:
-            by_axis[NOISE] = noise
-        return Event(cast(float | int, t if t_ns is None else t_ns), sensor, by_axis | unknown)
-
-    def _without_unknown(self, line: bytes) -> tuple[msgspec.Struct, dict[str, Any]]:
-        """A line without its unknown names, and the values under those."""
-        tree = cast(dict[str, Any], msgspec.json.decode(line))
-        unknown = {name: tree.pop(name) for name in list(tree) if name not in self._names and name not in self._axes}
-        if isinstance(tree.get("command"), dict):
-            command = cast(dict[str, Any], tree["command"])
-            known = {*self._axes, *self._names[len(_NAMES) :]}
-            unknown |= {name: command.pop(name) for name in list(command) if name not in known}
-        return self._decoder.decode(msgspec.json.encode(tree)), unknown
+        if self._turns and isinstance(values[-1], tuple):
+            by_axis[ORIENTATION] = values[-1]
+        if NOISE in tree:
+            by_axis[NOISE] = head.noise
+        by_axis |= {name: value for name, value in tree.items() if name not in self._values and name not in _HEAD}
+        if head.command is not None:
+            by_axis |= {name: value for name, value in head.command.items() if name not in self._values}
+        return Event(t, head.sensor or "", by_axis)
 
 
 def encode(estimate: LiveEstimate, kinds: Mapping[str, Kind], with_ns: bool) -> bytes:
