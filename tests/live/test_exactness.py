@@ -45,7 +45,7 @@ def recorded(name: str, seconds: float = 1e9) -> tuple[pf.Run, pf.FusionConfig]:
 
 
 @pytest.mark.parametrize("longest", [pytest.param(0.0, marks=pytest.mark.long), 1.2])
-@pytest.mark.parametrize("seconds", [10.0, pytest.param(1e9, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seconds", [7.0, pytest.param(1e9, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", ["scan1", *RUNS])
 def test_in_any_order(name: str, seconds: float, longest: float) -> None:
     """Each event up to 1.2 s late, a tenth of them twice: the offline estimates once measurements are in."""
@@ -59,7 +59,7 @@ BENT = ["saturating-servo", "tool-with-play", "sagging-lever"]
 @pytest.mark.parametrize("name", ["scan1", "panel-vision", "cylindrical-cartesian", *BENT])
 def test_estimates_at_the_time_are_as_live(name: str) -> None:
     """Fed in order, the estimate at each command is that of `fuse --as-live`."""
-    estimates_are_as_live(*recorded(name, 10.0))
+    estimates_are_as_live(*recorded(name, 7.0))
 
 
 def test_the_frame_is_where_the_first_command_is_however_late_it_comes() -> None:

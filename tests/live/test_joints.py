@@ -108,8 +108,7 @@ def config(run: pf.Run) -> pf.FusionConfig:
     return known(run)
 
 
-@pytest.mark.parametrize("longest", [0.0, 1.2])
-@pytest.mark.parametrize("later", [True, False])
+@pytest.mark.parametrize(("longest", "later"), [(0.0, True), (1.2, True), (1.2, False)])
 def test_in_any_order(longest: float, later: bool, run: pf.Run) -> None:
     """Each event up to 1.2 s late, a tenth twice: the offline estimates, also where joints answer later.
 

@@ -129,12 +129,11 @@ def test_an_orientation_without_noise_is_not_used_live_either() -> None:
     np.testing.assert_array_equal(some["x"].position, none["x"].position)
 
 
-@ALL_RUNS
 @pytest.mark.parametrize("longest", [0.0, 1.2])
-def test_in_a_frame_of_the_arm(longest: float, run: pf.Run) -> None:
+def test_in_a_frame_of_the_arm(longest: float) -> None:
     """What sensors and commands tell in x, y, z becomes the arm's tangential, radial and vertical, as offline."""
-    offline, live = pf.fuse(run, FRAMED), pf.LiveEstimator(FRAMED)
-    assert differences(live, delayed(events_of(run), longest, seed=2), offline, longest + 0.25) == []
+    offline, live = pf.fuse(NOISY, FRAMED), pf.LiveEstimator(FRAMED)
+    assert differences(live, delayed(events_of(NOISY), longest, seed=2), offline, longest + 0.25) == []
 
 
 @ALL_RUNS
