@@ -84,7 +84,6 @@ class Driven:
 
     @property
     def child(self) -> subprocess.Popen[bytes]:
-        assert self.view._child is not None
         return self.view._child
 
     def noticed(self, words: str) -> bool:

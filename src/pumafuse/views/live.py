@@ -2,7 +2,7 @@
 
 The drawing is done by a process of its own (:mod:`pumafuse.views.live_drawer`), which gets a frame twice a second
 through a pipe. Whatever becomes of it, of the viewer or of the connection between them, the estimator does not wait:
-a frame that does not fit into the pipe is left out.
+a thread writes into the pipe, and a frame that comes while others wait is left out.
 
 Entities: ``<axis>/command``, ``/estimate`` with its variance, ``/<sensor>`` and ``/<sensor>/rejected``;
 ``residual/<axis>/<sensor>``, the measurement minus the estimate, about ``residual/<axis>/estimate``, 0 with the
@@ -17,12 +17,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import IO, TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
@@ -76,7 +78,7 @@ class LiveView:
     """Plots of the events and estimates of a live estimator.
 
     Attributes:
-        dropped: How many frames were left out because the pipe was full.
+        dropped: How many frames were left out because others waited.
     """
 
     def __init__(self, mode: str, config: FusionConfig, notify: Callable[[str], None]) -> None:
@@ -103,14 +105,16 @@ class LiveView:
         self._events: dict[str, list[Any]] = {name: [] for name in ("", *config.sensors)}
         self._estimates: list[Any] = []
         self._sent = self._health_read = 0.0
-        self._unsent, self._notices = b"", b""
-        self._child: subprocess.Popen[bytes] | None
-        self._child, self._stdin, self._stdout = _start()
+        self._waiting = queue.Queue[bytes | None](1)
+        self._child, self._draws, self._closed = _start(), True, False
+        threading.Thread(target=self._write_all, name="frames", daemon=True).start()
+        self._listener = threading.Thread(target=self._listen, name="notices", daemon=True)
+        self._listener.start()
         self._write(header)
 
     def event(self, event: Event, result: UpdateResult) -> None:
         """Take in an event and what became of it."""
-        if self._child is None or result.outcome not in COMPARED:
+        if not self._draws or result.outcome not in COMPARED:
             return
         t, sensor, values = event
         moment = t if type(t) is float else t / 1e9
@@ -120,7 +124,7 @@ class LiveView:
 
     def estimate(self, estimate: LiveEstimate) -> None:
         """Take in an estimate."""
-        if self._child is None or self._origin is None or estimate.outcome is not Outcome.FUSED:
+        if not self._draws or self._origin is None or estimate.outcome is not Outcome.FUSED:
             return
         moment = estimate.stamp / 1e9 - self._origin
         self._newest = max(moment, self._newest)
@@ -128,12 +132,10 @@ class LiveView:
 
     def tick(self, health: Callable[[], Health]) -> None:
         """Send a frame if it is due, now and then with the health."""
-        self._flush()
         now = time.monotonic()
-        if self._child is None or now - self._sent < _FRAME:
+        if not self._draws or now - self._sent < _FRAME:
             return
         self._sent = now
-        self._pass_on_notices()
         frame = self._frame()
         if now - self._health_read >= _HEALTH:
             self._health_read = now
@@ -142,18 +144,14 @@ class LiveView:
 
     def close(self) -> None:
         """Send the last frame and end the drawing."""
-        if self._child is None:
-            return
-        child, deadline = self._child, time.monotonic() + _LONGEST_END
-        self._write(self._frame())
-        while self._unsent and time.monotonic() < deadline:
-            time.sleep(0.01)
-            self._flush()
-        self._stdin.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(max(deadline - time.monotonic(), 0.0))
-        self._pass_on_notices()
-        self._end()
+        self._closed, deadline = True, time.monotonic() + _LONGEST_END
+        with contextlib.suppress(queue.Full):
+            for message in (_encoded(self._frame()), None) if self._draws else ():
+                self._waiting.put(message, timeout=max(deadline - time.monotonic(), 0.0))
+        self._listener.join(max(deadline - time.monotonic(), 0.0))
+        if self._listener.is_alive():
+            self._kill()
+        self._listener.join()
 
     def _frame(self) -> Frame:
         """Everything since the frame before, evenly thinned where there is too much."""
@@ -197,51 +195,40 @@ class LiveView:
                 frame[f"nis/{name}"] = [(self._newest, sensor.nis)]
 
     def _write(self, message: Header | Frame) -> None:
-        """Put a message into the pipe; leave it out if the one before has not gone in yet."""
-        self._flush()
-        if self._unsent:
+        """Have a message written; leave it out if the one before waits."""
+        if self._waiting.full():
             self.dropped += 1
         else:
-            self._unsent = msgspec.json.encode(message, enc_hook=float) + b"\n"
-            self._flush()
+            self._waiting.put(_encoded(message))
 
-    def _flush(self) -> None:
-        """Write what is left, as far as the pipe takes it."""
-        if self._child is None or not self._unsent:
-            return
-        try:
-            self._unsent = self._unsent[os.write(self._stdin.fileno(), self._unsent) :]
-        except BlockingIOError:
-            return
-        except OSError:
-            self._unsent = b""  # nobody reads: its end is noticed with the next frame
+    def _write_all(self) -> None:
+        """Write what waits, as soon as the pipe takes it."""
+        assert self._child.stdin is not None
+        with contextlib.suppress(OSError), self._child.stdin as pipe:  # nobody reads: its end is noticed
+            while (message := self._waiting.get()) is not None:
+                pipe.write(message)
+                pipe.flush()
 
-    def _pass_on_notices(self) -> None:
-        """Pass on what the drawing process reports; notice its end."""
-        child = self._child
-        if child is None:
-            return
-        with contextlib.suppress(BlockingIOError):
-            self._notices += os.read(self._stdout.fileno(), 1 << 16)
-        *lines, self._notices = self._notices.split(b"\n")
-        for line in lines:
-            self._notify(line.decode(errors="replace"))
-        if code := child.poll():
+    def _listen(self) -> None:
+        """Pass on what the drawing process reports, and its end, of which nothing is left behind."""
+        assert self._child.stdout is not None
+        with self._child.stdout as reports:
+            for line in reports:
+                self._notify(line.decode(errors="replace").removesuffix("\n"))
+        self._draws, code = False, self._child.wait()
+        self._kill()
+        if code and not self._closed:
             how = f"signal {-code}" if code < 0 else f"exit status {code}"
             self._notify(f"Rerun: the drawing process ended by itself ({how}); nothing more is drawn")
-        if child.returncode is not None:
-            self._end()
 
-    def _end(self) -> None:
-        """Leave nothing behind of the drawing process, its server included."""
-        child, self._child = self._child, None
-        if child is None:
-            return
+    def _kill(self) -> None:
+        """End the drawing process, its server included."""
         with contextlib.suppress(OSError):
-            os.killpg(child.pid, signal.SIGKILL)
-        child.wait()
-        self._stdin.close()
-        self._stdout.close()
+            os.killpg(self._child.pid, signal.SIGKILL)
+
+
+def _encoded(message: Header | Frame) -> bytes:
+    return msgspec.json.encode(message, enc_hook=float) + b"\n"
 
 
 def _taken(rows: list[Any]) -> list[Any]:
@@ -251,17 +238,12 @@ def _taken(rows: list[Any]) -> list[Any]:
     return taken
 
 
-def _start() -> tuple[subprocess.Popen[bytes], IO[bytes], IO[bytes]]:
+def _start() -> subprocess.Popen[bytes]:
     """The process that draws, in a group of its own: Ctrl-C is for the estimator, which then ends it."""
-    child = subprocess.Popen(
+    return subprocess.Popen(
         [sys.executable, "-P", "-m", "pumafuse.views.live_drawer"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        bufsize=0,
         start_new_session=True,
     )
-    assert child.stdin is not None and child.stdout is not None
-    os.set_blocking(child.stdin.fileno(), False)
-    os.set_blocking(child.stdout.fileno(), False)
-    return child, child.stdin, child.stdout
