@@ -6,6 +6,7 @@ import contextlib
 import signal
 import socket
 import subprocess
+import threading
 from collections.abc import Generator
 from pathlib import Path
 
@@ -26,12 +27,19 @@ class Live:
         words += ["--out", f"udp://127.0.0.1:{self.estimates.getsockname()[1]}"] if out else []
         self.process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
-    def port(self) -> int:
+    def until(self, words: str) -> str:
+        """Read the log up to a sentence with these words."""
         assert self.process.stderr is not None
-        for notice in self.process.stderr:
-            if "listening at" in notice:
-                return int(notice.rsplit(":", 1)[1])
-        raise AssertionError(self.process.wait())
+        last, log = threading.Timer(LONGEST, self.process.kill), ""
+        last.start()
+        while words not in log and (line := self.process.stderr.readline()):
+            log += line
+        last.cancel()
+        assert words in log, f"it ended without '{words}': {log}"
+        return log
+
+    def port(self) -> int:
+        return int(self.until("listening at").rsplit(":", 1)[1])
 
     def received(self, count: int) -> list[bytes]:
         return [self.estimates.recv(65536) for _ in range(count)]
@@ -52,8 +60,8 @@ class Live:
 
 
 @contextlib.contextmanager
-def live(source: str, config: Path, *options: str) -> Generator[Live]:
-    process = Live(source, config, *options)
+def live(source: str, config: Path, *options: str, out: bool = True) -> Generator[Live]:
+    process = Live(source, config, *options, out=out)
     try:
         yield process
     finally:

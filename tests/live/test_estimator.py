@@ -10,7 +10,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.clock import clock_faults
-from pumafuse.logs.frames import Cylindrical, Rotated
+from pumafuse.logs.frames import Cylindrical
 
 ARM = pf.ArmModel.load("puma560-internal")
 CONFIG = pf.FusionConfig(
@@ -182,23 +182,8 @@ def test_what_is_wrong_at_the_start_is_refused(wrong: dict) -> None:
         pf.LiveEstimator(CONFIG, **wrong)
 
 
-@pytest.mark.parametrize("frame", [Cylindrical(positive="clockwise"), Rotated(azimuth=math.radians(90.0))])
-def test_x_y_z_in_and_out(frame: Cylindrical | Rotated) -> None:
-    """With a frame events come in x, y, z and estimates go back there."""
-    live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=frame))
-    for step in range(100):
-        t = step * PERIOD
-        assert live.command(t, x=0.01, y=0.56, z=-0.1).outcome is pf.Outcome.FUSED
-        assert live.measurement(t + 0.01, "tracker", x=0.0101, y=0.5601, z=-0.1002).outcome is pf.Outcome.FUSED
-    found = live.estimate().cartesian
-    assert found is not None
-    np.testing.assert_allclose([found["x"], found["y"], found["z"]], [0.0101, 0.5601, -0.1002], atol=2e-5)
-    half = live.measurement(2.9, "tracker", x=0.01)
-    assert {axis: outcome.word for axis, outcome in half.axes.items()} == {"tangential": "invalid", "radial": "invalid"}
-
-
 def test_x_and_y_mean_nothing_before_the_frame_has_its_place() -> None:
-    """A frame about the base waits for a command in x and y; on the base's axis there is no place."""
+    """A frame about the base waits for a command in x and y; on the base's axis there is no place. x alone is none."""
     live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=Cylindrical()))
     told = live.measurement(0.0, "tracker", x=0.1, y=0.5)
     assert told.outcome is pf.Outcome.BEFORE_START
@@ -206,6 +191,8 @@ def test_x_and_y_mean_nothing_before_the_frame_has_its_place() -> None:
     assert live.command(0.01, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
     assert live.command(0.03, x=0.1, y=0.5).outcome is pf.Outcome.FUSED
     assert live.estimate().outcome is pf.Outcome.FUSED
+    half = live.measurement(0.04, "tracker", x=0.1)
+    assert dict(half.axes) == dict.fromkeys(("tangential", "radial"), pf.Outcome.INVALID)
 
 
 def test_commands_beyond_the_models_limits_are_said() -> None:

@@ -197,15 +197,6 @@ def test_a_cylindrical_stream_is_recorded_with_its_frame(tmp_path: Path) -> None
     assert offline["tangential"].position[-1] == recorded.live.estimate(49 * T)["tangential"].position
 
 
-def test_every_float_comes_back(tmp_path: Path) -> None:
-    """Whatever unit a stream has: what is read back from a record is the same to the bit."""
-    recorded, value = Recorded(tmp_path / "record", TRACKED), np.random.default_rng(4).uniform(-0.5, 0.5, 500)
-    for step, one in enumerate(value.tolist()):
-        recorded.live.command(step * T, radial=0.0)
-        recorded.live.measurement(step * T + 1, "tracker", radial=one)
-    assert np.array_equal(recorded.close().sensors["tracker"].values["radial"], value)
-
-
 def test_a_full_disk_is_reported_and_nothing_is_written_twice(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:

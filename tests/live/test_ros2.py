@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
 import runpy
-import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from importlib.util import find_spec
@@ -25,10 +23,10 @@ import pytest
 import bag_files
 import pumafuse as pf
 from executable import EXECUTABLE, pumafuse, refused
+from listening import LONGEST, Live, live
 
 pytestmark = pytest.mark.skipif(find_spec("rclpy") is None, reason="there are wheels of ROS 2 for Linux alone")
 PLAYER = Path(__file__).parents[1] / "ros2_player.py"
-LONGEST = 60.0  # s that anything here may take
 BEGIN = bag_files.START_NS
 
 
@@ -42,49 +40,18 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(PLAYER.parent))
 
 
-class Node:
-    """`pumafuse live ros2:` as a process."""
-
-    def __init__(self, folder: Path, *options: str) -> None:
-        words = [str(EXECUTABLE), "live", f"ros2:{folder / 'run.toml'}", "-c", str(folder / "fusion.toml"), *options]
-        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        assert self.process.stderr is not None
-        assert "listening at" in (first := self.process.stderr.readline()), first + self.process.stderr.read()
-
-    def until(self, words: str) -> str:
-        """Read the log up to a sentence with these words."""
-        assert self.process.stderr is not None
-        last, log = threading.Timer(LONGEST, self.process.kill), ""
-        last.start()
-        while words not in log and (line := self.process.stderr.readline()):
-            log += line
-        last.cancel()
-        assert words in log, f"it ended without '{words}'"
-        return log
-
-    def end(self) -> str:
-        """Ask for an end; what was logged since."""
-        begin = time.monotonic()
-        self.process.send_signal(signal.SIGTERM)
-        out, log = self.process.communicate(timeout=LONGEST)
-        assert time.monotonic() - begin < 10.0
-        assert (self.process.returncode, out) == (0, ""), log
-        return log
-
-
 @pytest.fixture
-def start() -> Generator[Callable[..., Node]]:
-    """Starts nodes, and ends those that are left."""
-    nodes = list[Node]()
+def start() -> Generator[Callable[..., Live]]:
+    """Starts nodes, `pumafuse live ros2:`, and ends those that are left."""
+    with contextlib.ExitStack() as stack:
 
-    def begin(folder: Path, *options: str) -> Node:
-        nodes.append(Node(folder, *options))
-        return nodes[-1]
+        def begin(folder: Path, *options: str) -> Live:
+            words = f"ros2:{folder / 'run.toml'}", folder / "fusion.toml", *options
+            node = stack.enter_context(live(*words, out=False))
+            node.until("listening at")
+            return node
 
-    yield begin
-    for node in nodes:
-        node.process.kill()
-        node.process.communicate()
+        yield begin
 
 
 def cell(folder: Path, run: str = bag_files.ROS) -> None:
@@ -121,7 +88,7 @@ STAMPED = bag_files.ROS[: bag_files.ROS.index("[sensors.level]")]  # without wha
 
 
 @pytest.mark.filterwarnings("ignore::pumafuse.errors.PumafuseWarning")  # the arm is not the one that moved
-def test_poses_are_those_of_the_bag_fused_as_live(tmp_path: Path, start: Callable[..., Node]) -> None:
+def test_poses_are_those_of_the_bag_fused_as_live(tmp_path: Path, start: Callable[..., Live]) -> None:
     """To the last bit, with covariance and frame; the record fuses to the same; diagnostics tell of each sensor."""
     cell(tmp_path, STAMPED)
     node = start(tmp_path, "--record", str(tmp_path / "record"))
@@ -149,7 +116,7 @@ def test_poses_are_those_of_the_bag_fused_as_live(tmp_path: Path, start: Callabl
     assert first["pumafuse: estimates"][:2] == [3, "no command yet"]  # STALE
 
 
-def test_publishers_come_late_leave_and_return(tmp_path: Path, start: Callable[..., Node]) -> None:
+def test_publishers_come_late_leave_and_return(tmp_path: Path, start: Callable[..., Live]) -> None:
     """Each is said, as two of commands and a wrong type are; --ros-args move topics and the node, and give a frame."""
     cell(tmp_path, STAMPED.replace('topic = "/command"', 'topic = "/orders"').replace("/joints", "/level"))
     arguments = ["-r", "__node:=left", "-r", "/orders:=/command", "-p", "frame_id:=cell"]
@@ -255,7 +222,7 @@ def states(begin: int, count: int) -> list[bag_files.Sent]:
     return [("/joint_states", kind, begin + t, {"header": bag_files.header(0), **one}) for t, one in every]
 
 
-def test_joints_by_a_trajectory(tmp_path: Path, start: Callable[..., Node]) -> None:
+def test_joints_by_a_trajectory(tmp_path: Path, start: Callable[..., Live]) -> None:
     """A path is commanded as time goes by from when it comes; the joint is published at each command."""
     lever(tmp_path, time="path.time_ns", column="path.position[elbow]", stamps="log_time")
     node = start(tmp_path, "--record", str(tmp_path / "record"))
@@ -277,7 +244,7 @@ def test_joints_by_a_trajectory(tmp_path: Path, start: Callable[..., Node]) -> N
     assert all(abs(one["position"][0] - 0.2) < 0.2 for one in joints[20:])
 
 
-def test_the_time_of_a_simulation(tmp_path: Path, start: Callable[..., Node]) -> None:
+def test_the_time_of_a_simulation(tmp_path: Path, start: Callable[..., Live]) -> None:
     """What has no stamp is stamped by /clock, which runs at half the pace of the day."""
     lever(tmp_path, time="log_time", column="data[0]", stamps="log_time")
     node = start(tmp_path, "--record", str(tmp_path / "record"), "--ros-args", "-p", "use_sim_time:=true")
@@ -297,7 +264,7 @@ def test_the_time_of_a_simulation(tmp_path: Path, start: Callable[..., Node]) ->
 
 
 def test_the_launch_file_starts_the_node(
-    tmp_path: Path, start: Callable[..., Node], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, start: Callable[..., Live], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its words, with the arguments as a launch fills them in, are ones that the command takes."""
     cell(tmp_path, STAMPED)
@@ -335,7 +302,7 @@ def moved(begin: int, seconds: float, phase: float) -> tuple[list[bag_files.Sent
 
 
 @pytest.mark.long
-def test_from_a_bag_to_the_node_nothing_is_edited(tmp_path: Path, start: Callable[..., Node]) -> None:
+def test_from_a_bag_to_the_node_nothing_is_edited(tmp_path: Path, start: Callable[..., Live]) -> None:
     """`fuse BAG` prints the line that runs the node; its estimates are twice as good as the sensor."""
     (tmp_path / "drive").mkdir()
     bag_files.messages(tmp_path / "drive" / "drive_0.mcap", moved(1_790_000_000 * 10**9, 40.0, 0.0)[0])
