@@ -7,12 +7,23 @@ import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Generator
+import time
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 from executable import EXECUTABLE
+from pumafuse.live.network import Items, Remote
 
 LONGEST = 60.0  # s that anything here may take
+
+
+def until(source: Remote, enough: Callable[[Items], object]) -> Items:
+    """Lines or events of a source as they come, until there are enough."""
+    taken, give_up = [], time.monotonic() + LONGEST
+    while not enough(taken):
+        assert time.monotonic() < give_up, taken[-10:]
+        taken += source.get()
+    return taken
 
 
 class Live:

@@ -11,24 +11,16 @@ from collections.abc import Callable
 import pytest
 
 import pumafuse as pf
+from listening import until
 from pumafuse.live import backlog, network
 from pumafuse.live.address import Address
-from pumafuse.live.network import Remote, TcpClient, TcpListener, UdpListener, UdpSender
+from pumafuse.live.network import TcpClient, TcpListener, UdpListener, UdpSender
 
 LOOPBACK = (socket.AF_INET, ("127.0.0.1", 0))
 
 
 def everybody(_: str) -> bool:
     return True
-
-
-def until(source: Remote, enough: Callable[[list[bytes]], bool]) -> list[bytes]:
-    """Lines as they come, until there are enough; half a minute is too long for anything here."""
-    lines, give_up = list[bytes](), time.monotonic() + 30.0
-    while not enough(lines):
-        assert time.monotonic() < give_up, lines[-10:]
-        lines += source.get()
-    return lines
 
 
 def place_of(notices: list[str]) -> tuple[str, int]:

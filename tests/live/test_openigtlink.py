@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
 import turning
-from listening import live
+from listening import live, until
 from pumafuse.live.address import Address
 from pumafuse.live.openigtlink import OpenIgtLinkSource
 from pumafuse.live.wire import Event
@@ -56,21 +56,19 @@ def taken(
     enough: Callable[[list[Event], list[str]], object] = lambda found, _: found,
 ) -> tuple[list[Event], list[str]]:
     """The events of what a server sends before it hangs up, and the notices."""
-    notices, found = list[str](), list[Event]()
+    notices = list[str]()
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = Address.parse(f"igtl://127.0.0.1:{server.getsockname()[1]}{option}")
         source = OpenIgtLinkSource(address, config, notices.append)
         source.start()
         with server.accept()[0] as connection:
             threading.Thread(target=connection.sendall, args=(sent,)).start()
-            until = time.monotonic() + 30.0
-            while not enough(found, notices) and time.monotonic() < until:
-                found += source.get()
+            found = until(source, lambda found: enough(found, notices))
             with contextlib.suppress(OSError):  # it has hung up
                 connection.shutdown(socket.SHUT_RDWR)
         while not any("ended" in notice for notice in notices):
             time.sleep(0.01)
-        return found + source.stop(), notices
+        return [*found, *source.stop()], notices
 
 
 def transform(device: str = "camera", version: int = 1, **metadata: str) -> bytes:

@@ -18,10 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from listening import live
+from listening import live, until
 from pumafuse.live.address import Address
 from pumafuse.live.rtde import RtdeSource
-from pumafuse.live.wire import Event
 from pumafuse.logs import manifest
 
 RUN = """
@@ -153,20 +152,12 @@ def source(robot: Robot, run: str, notices: list[str]) -> RtdeSource:
     return RtdeSource(Address.parse(f"rtde:run.toml?host=127.0.0.1:{robot.port}"), listed, 125.0, notices.append)
 
 
-def events(found: RtdeSource, enough: Callable[[list[Event]], bool]) -> list[Event]:
-    """What comes until it is enough, or nothing more is to be expected."""
-    taken, until = list[Event](), time.monotonic() + 30.0
-    while not enough(taken) and time.monotonic() < until:
-        taken += found.get()
-    return taken
-
-
 def test_a_running_robot_is_what_its_record_says(tmp_path: Path, robot: Callable[..., Robot]) -> None:
     """Row by row as the CSV file that UR's record.py writes is read; asked for no more than is needed."""
     run, one = pf.Run.read(written(tmp_path).parent), robot()
     found = source(one, RUN, [])
     found.start()
-    came = events(found, lambda taken: len(taken) >= 2 * ROWS)[: 2 * ROWS]
+    came = until(found, lambda taken: len(taken) >= 2 * ROWS)[: 2 * ROWS]
     found.stop()
     assert one.asked[0][0] == 125.0
     assert sorted(one.asked[0][1]) == ["actual_q", "target_TCP_pose", "target_q", "timestamp"]
@@ -183,7 +174,7 @@ def test_a_robot_that_hangs_up_is_called_again(robot: Callable[..., Robot]) -> N
     one = robot(rows=20)
     found = source(one, RUN, notices)
     found.start()
-    assert len(events(found, lambda taken: len(taken) >= 60)) >= 60
+    until(found, lambda taken: len(taken) >= 60)
     found.stop()
     assert any("the connection has ended" in notice for notice in notices)
     assert "connections made: 2" in found.summary()
@@ -206,7 +197,7 @@ def test_what_a_robot_refuses_is_said(
     notices = list[str]()
     found = source(robot(**more), run, notices)
     found.start()
-    assert events(found, lambda _: any(words in notice for notice in notices)) == []
+    assert until(found, lambda _: any(words in notice for notice in notices)) == []
     found.stop()
     assert sum(words in notice for notice in notices) == 1
 
@@ -223,7 +214,7 @@ elbow = { column = "target_q_2", unit = "rad" }
     found = source(robot(), run, [])
     found.start()
     begin = time.time_ns()
-    came = events(found, lambda taken: len(taken) >= 10)
+    came = until(found, lambda taken: len(taken) >= 10)
     found.stop()
     assert [round(1e3 * event.values["x"]) for event in came[:10]] == list(range(10))
     assert [event.values["elbow"] for event in came[:10]] == [state(k)["target_q"][2] for k in range(10)]
