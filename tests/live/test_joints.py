@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +14,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
-from executable import EXECUTABLE
 from pumafuse.fusion.config import Placement
 from pumafuse.fusion.placing import with_tool
 from pumafuse.live.wire import LineDecoder
@@ -28,8 +25,8 @@ from streams import (
     differences,
     estimates_are_as_live,
     events_of,
+    record_is_as_live,
     replay_is_as_live,
-    wired,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -215,18 +212,8 @@ def test_joints_on_the_wire() -> None:
         LineDecoder(ARM.kind_of, framed=False, joints={"t": "angle"})
 
 
-def test_lines_in_joints_as_a_user_gives_them(tmp_path: Path, run: pf.Run, config: pf.FusionConfig) -> None:
-    """`[robot]` in fusion.toml is all that `pumafuse live` needs: the estimates are those of the record as live."""
-    (tmp_path / "saved").mkdir()
-    config.save(tmp_path / "saved")
-    words = [EXECUTABLE, "live", "stdin", "-c", tmp_path / "saved" / "fusion.toml", "--record", tmp_path / "record"]
-    done = subprocess.run(words, input=b"\n".join(wired(run)) + b"\n", capture_output=True, timeout=120, check=True)
-    assert b"not heeded" not in done.stderr
-    found = pf.Run.read(tmp_path / "record")
-    assert found.notes == () and len(found.command.stamp) == len(run.command.stamp)
+def test_lines_in_joints_are_recorded_as_they_are(tmp_path: Path, run: pf.Run, config: pf.FusionConfig) -> None:
+    """The estimates of lines are those of the record as live, which has joints where these came."""
+    found, _, _ = record_is_as_live(tmp_path / "record", run, config)
+    assert len(found.command.stamp) == len(run.command.stamp)
     assert found.command.joints is not None and found.sensors["tracker"].joints is None
-    offline, given = pf.fuse(found, config, mode="as-live"), [json.loads(line) for line in done.stdout.splitlines()]
-    for axis, track in offline.axes.items():
-        unit, scale = ("deg", 180.0 / math.pi) if axis.startswith("r") else ("mm", 1e3)
-        assert [one[axis][f"position_{unit}"] for one in given] == (track.position * scale).tolist()
-        assert [one[axis][f"sd_{unit}"] for one in given] == (track.position_sd * scale).tolist()
