@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import FloatArray, TimeArray, median
 from ..discovery.matching import Grid, Rows, best_shift, lateness, without_spikes
-from .config import FusionConfig
+from ..model.arm import ArmModel
 from .segments import Segment
 
 _LEAST_NS, _MOST_NS = 40_000_000, 1_200_000_000  # by which stamps leap
@@ -34,10 +34,10 @@ _BETTER = math.log(2.0)  # what is left about the lateness of the other side, ov
 
 
 class Leap(NamedTuple):
-    """Where stamps of a sensor leap."""
+    """Where instants by the stamps of a sensor leap."""
 
-    last: int  # the stamp before [ns]
-    first: int  # the stamp after it [ns]
+    last: int  # the one before [ns]
+    first: int  # the one after it [ns]
     by: float  # by how much more time goes by than the rows take [s]; below 0 there are more rows than time
     rows: int  # how many intervals that are
     usual: float  # the usual one [s]
@@ -85,21 +85,18 @@ class _Side(NamedTuple):
         return math.sqrt(_PARTS - 1) * float(np.std(each))
 
 
-def clock_steps(
-    segment: Segment, config: FusionConfig, name: str, stamp: TimeArray, given: Mapping[str, Rows]
-) -> list[ClockStep]:
+def clock_steps(segment: Segment, arm: ArmModel, valid: TimeArray, positions: Mapping[str, Rows]) -> list[ClockStep]:
     """Where the clock of a sensor was set, in the order of time.
 
     Args:
         segment: Has the commands.
-        config: Says how the arm answers.
-        name: The sensor.
-        stamp: Its stamps, also of rows that measure nothing, ascending [ns], (n,).
-        given: What it measures, by axis.
+        arm: How it answers.
+        valid: When measurements are valid, also of rows that measure nothing, ascending [ns], (n,).
+        positions: What the sensor measures, by axis.
     """
-    found, every, edges = list[ClockStep](), leaps(stamp), list[int]()
+    found, every, edges = list[ClockStep](), leaps(valid), list[int]()
     while every:
-        likely = [step for leap in every if (step := _clock_step(segment, config, name, given, leap, edges))]
+        likely = [step for leap in every if (step := _clock_step(segment, arm, positions, leap, edges))]
         if likely:  # near a clock that was set, an outage looks like another one until rows beyond are left out
             found.append(max(likely, key=lambda step: abs(step.change) / step.error))
             edges += [found[-1].leap.last, found[-1].leap.first]
@@ -131,12 +128,7 @@ def leaps(stamp: TimeArray) -> list[Leap]:
 
 
 def _clock_step(
-    segment: Segment,
-    config: FusionConfig,
-    name: str,
-    given: Mapping[str, Rows],
-    leap: Leap,
-    edges: Sequence[int],
+    segment: Segment, arm: ArmModel, positions: Mapping[str, Rows], leap: Leap, edges: Sequence[int]
 ) -> ClockStep | None:
     """The leap as a clock that was set; None where the motion does not show surely that it was.
 
@@ -144,8 +136,7 @@ def _clock_step(
     """
     begin = max([leap.last - _SPAN_NS, *(edge for edge in edges if edge <= leap.last)])
     end = min([leap.first + _SPAN_NS, *(edge for edge in edges if edge >= leap.first)])
-    earlier = _side(segment, config, name, given, begin, leap.last)
-    later = _side(segment, config, name, given, leap.first, end)
+    earlier, later = (_side(segment, arm, positions, *ends) for ends in ((begin, leap.last), (leap.first, end)))
     if earlier is None or later is None:
         return None
     left = earlier.unexplained(), later.unexplained()
@@ -160,24 +151,21 @@ def _clock_step(
     return step if agrees and abs(step.change) > _SURELY * step.error else None
 
 
-def _side(
-    segment: Segment, config: FusionConfig, name: str, given: Mapping[str, Rows], begin: int, end: int
-) -> _Side | None:
-    """What is measured between two stamps [ns]; None where that is too little."""
-    latency, scale = round(config.sensors[name].latency * 1e9), config.sensors[name].scale
+def _side(segment: Segment, arm: ArmModel, positions: Mapping[str, Rows], begin: int, end: int) -> _Side | None:
+    """What is measured between two instants [ns]; None where that is too little."""
     rows = dict[str, Rows]()
-    for axis, (stamp, value) in given.items():
-        mine = slice(*np.searchsorted(stamp, (begin, end + 1)).tolist())
-        alike = without_spikes(value[mine])
+    for axis, (valid, position) in positions.items():
+        mine = slice(*np.searchsorted(valid, (begin, end + 1)).tolist())
+        alike = without_spikes(position[mine])
         if np.count_nonzero(alike) >= _FEW:
-            rows[axis] = stamp[mine][alike] - latency, value[mine][alike] / scale
+            rows[axis] = valid[mine][alike], position[mine][alike]
     if not rows:
         return None
-    first, last = min(int(stamp[0]) for stamp, _ in rows.values()), max(int(stamp[-1]) for stamp, _ in rows.values())
+    first, last = min(int(valid[0]) for valid, _ in rows.values()), max(int(valid[-1]) for valid, _ in rows.values())
     if last - first < _SHORTEST_NS:
         return None
     grid = Grid.around(first, (last - first) / 1e9, _BIN, round(_REACH / _BIN))
-    led = {axis: segment.led(config.arm, axis, grid.time) for axis in rows}
+    led = {axis: segment.led(arm, axis, grid.time) for axis in rows}
     return _Side({axis: grid.mean(*one) for axis, one in rows.items()}, led, grid)
 
 

@@ -14,7 +14,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from ..arrays import FloatArray, TimeArray, median
-from ..discovery.matching import FOLLOWS, GAIN, SMALL_SHIFT, Grid, Match, Tracking, matches, without_spikes
+from ..discovery.matching import FOLLOWS, GAIN, SMALL_SHIFT, Grid, Match, Rows, Tracking, matches, without_spikes
 from ..discovery.own_frames import angle_of
 from ..errors import RunError
 from ..filter.outcome import ABSENT, Outcome
@@ -88,13 +88,13 @@ def faults_of(segment: Segment, config: FusionConfig, origin: int | None = None)
 
     Times are told since ``origin`` [ns], or the segment's.
     """
-    given = _given(segment, config)
-    trackings = _trackings(segment, config, given)
-    clocks = _clocks_set(segment, config, given, segment.origin if origin is None else origin)
+    positions = _positions(segment, config)
+    trackings = _trackings(segment, config, positions)
+    clocks = _clocks_set(segment, config, positions, segment.origin if origin is None else origin)
     named = {name for one in clocks for name in one.sensors}
     faults = [
         one
-        for one in _not_following(segment, config, given, trackings)
+        for one in _not_following(segment, config, positions, trackings)
         if one.cause not in _OF_CLOCKS or named.isdisjoint(one.sensors)
     ]
     faults = [*clocks, *faults]
@@ -105,8 +105,8 @@ def faults_of(segment: Segment, config: FusionConfig, origin: int | None = None)
 
 def not_following(segment: Segment, config: FusionConfig) -> list[Fault]:
     """What is wrong with sensors whose measurements are not where the commands lead: unit, axis, sign or clock."""
-    given = _given(segment, config)
-    return _not_following(segment, config, given, _trackings(segment, config, given))
+    positions = _positions(segment, config)
+    return _not_following(segment, config, positions, _trackings(segment, config, positions))
 
 
 def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
@@ -116,7 +116,8 @@ def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
     together must follow a motion that was there before, at least half of it, rather than one that begins.
     """
     speeds = {axis: speed for axis in segment.axes if (speed := _first_speed(segment, axis))}
-    evidence = [_evidence(segment, config, axis, speed) for axis, speed in speeds.items()]
+    positions: _Positions = _positions(segment, config) if speeds else {}
+    evidence = [_evidence(segment, config, axis, speed, positions) for axis, speed in speeds.items()]
     score, information = sum(one[0] for one in evidence), sum(one[1] for one in evidence)
     if score <= _MOVED * information + 3.0 * math.sqrt(information):  # three standard deviations
         return []
@@ -143,14 +144,14 @@ def latency_questions(config: FusionConfig, names: Iterable[str]) -> list[str]:
 # ---- where the commands lead ----------------------------------------------------------------------------------------
 
 
-_Given: TypeAlias = Mapping[str, Mapping[str, tuple[TimeArray, FloatArray]]]  # stamps and values, by sensor and axis
+_Positions: TypeAlias = Mapping[str, Mapping[str, Rows]]  # when valid, and without the scale, by sensor and axis
 _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
 
 
 def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
     """A fault for each angle of the commands or of a sensor that begins anew after each turn."""
     found, angles = list[Fault](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
-    given: _Given = _given(segment, config) if angles else {}
+    positions: _Positions = _positions(segment, config) if angles else {}
     for axis in angles:
         if times := len(wraps(segment.given(axis)[1])):
             words = (
@@ -158,8 +159,8 @@ def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
                 " by a turn then; turn_deg = 360 beside their column in run.toml makes them go on"
             )
             found.append(Fault((), (axis,), "turns", times, words))
-        for name, axes in given.items():
-            if axis in axes and (times := len(wraps(axes[axis][1]))):
+        for name, axes in positions.items():
+            if axis in axes and (times := len(wraps(config.sensors[name].scale * axes[axis][1]))):
                 words = (
                     f"sensor '{name}': an angle that begins anew on {axis} after each turn, {times} times: turn_deg ="
                     " 360 in its table makes it go on"
@@ -168,37 +169,35 @@ def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
     return found
 
 
-def _given(segment: Segment, config: FusionConfig) -> _Given:
+def _positions(segment: Segment, config: FusionConfig) -> _Positions:
     """What the filter is given of each configured sensor, by stamp."""
-    found: dict[str, dict[str, tuple[TimeArray, FloatArray]]] = {}
+    found: dict[str, dict[str, Rows]] = {}
     for name, rows in segment.rows_by_sensor().items():
-        if name not in config.sensors:
-            continue
-        known = {axis: rows.known[:, number] == int(Outcome.FUSED) for number, axis in enumerate(segment.axes)}
-        found[name] = {
-            axis: (rows.stamp, rows.value[:, number]) if mine.all() else (rows.stamp[mine], rows.value[mine, number])
-            for number, (axis, mine) in enumerate(known.items())
-            if mine.any()
-        }
+        if (sensor := config.sensors.get(name)) is not None:
+            valid, fused = rows.stamp - round(sensor.latency * 1e9), rows.known == int(Outcome.FUSED)
+            found[name] = {
+                axis: (valid[mine], rows.value[mine, number] / sensor.scale)
+                for number, axis in enumerate(segment.axes)
+                if (mine := fused[:, number]).any()
+            }
     return found
 
 
-def _trackings(segment: Segment, config: FusionConfig, given: _Given) -> _Trackings:
+def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) -> _Trackings:
     """How each sensor tracks the commands until 1 s after the last command, without axes of which there is little.
 
     Where most of it lies outside of the commands it is the clock that is wrong: the rest would tell of anything.
     """
-    found: dict[str, dict[str, Tracking]] = {name: {} for name in given}
+    found: dict[str, dict[str, Tracking]] = {name: {} for name in positions}
     every, until = segment.rows_by_sensor(), int(segment.commands[-1]) + _TAIL_NS
     for number, axis in enumerate(segment.axes):
-        some: dict[str, tuple[TimeArray, FloatArray]] = {}
-        for name, (stamp, value) in ((name, axes[axis]) for name, axes in given.items() if axis in axes):
-            count = int(np.searchsorted(stamp, until, side="right"))
+        some: dict[str, Rows] = {}
+        for name, (valid, position) in ((name, axes[axis]) for name, axes in positions.items() if axis in axes):
+            count = int(np.searchsorted(valid, until - round(config.sensors[name].latency * 1e9), side="right"))
             if count >= max(_FEW, np.count_nonzero(every[name].known[:, number] != ABSENT) / 2):
                 chosen = slice(None, count, 1 + count // _ENOUGH)
-                alike = without_spikes(value[chosen])
-                valid = stamp[chosen][alike] - round(config.sensors[name].latency * 1e9)
-                some[name] = valid, value[chosen][alike]
+                alike = without_spikes(position[chosen])
+                some[name] = valid[chosen][alike], position[chosen][alike]
         for name, led in _led_at(segment, config, axis, {name: valid for name, (valid, _) in some.items()}).items():
             found[name][axis] = _tracking(segment, config, name, axis, *some[name], *led)
     return found
@@ -223,7 +222,7 @@ def _tracking(
     name: str,
     axis: str,
     valid: TimeArray,
-    value: FloatArray,
+    position: FloatArray,
     led: FloatArray,
     before: FloatArray,
 ) -> Tracking:
@@ -231,7 +230,7 @@ def _tracking(
     of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_drift_sd_of(axis)) / abs(sensor.scale)
     noise = math.hypot(of_sensor, process.disturbance_sd)
     zero_sd = math.hypot(noise, sensor.bias_sd_of(axis) / abs(sensor.scale), config.start.offset_sd_of(axis))
-    measured, turn = value / sensor.scale - segment.start[axis], turn_of(config, name, axis) / abs(sensor.scale)
+    measured, turn = position - segment.start[axis], turn_of(config, name, axis) / abs(sensor.scale)
     if turn:
         measured -= turn * round(median(measured - led) / turn)
     return Tracking((valid - valid[0]) / 1e9, measured, led, before, noise, zero_sd, process.drift)
@@ -330,23 +329,24 @@ def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
 # ---- a clock that was set in mid-run ---------------------------------------------------------------------------------
 
 
-def _clocks_set(segment: Segment, config: FusionConfig, given: _Given, origin: int) -> list[Fault]:
+def _clocks_set(segment: Segment, config: FusionConfig, positions: _Positions, origin: int) -> list[Fault]:
     """A fault for each time that the clock of a sensor was set; ``origin`` [ns] is time 0."""
-    rows = segment.rows_by_sensor()
-    return [
-        Fault((name,), tuple(mine), "set", step.by, _set(name, step, origin), at=step.leap.first)
-        for name, mine in given.items()
-        for step in clock_steps(segment, config, name, rows[name].stamp, mine)
-    ]
+    found, rows = list[Fault](), segment.rows_by_sensor()
+    for name, mine in positions.items():
+        latency = round(config.sensors[name].latency * 1e9)
+        for step in clock_steps(segment, config.arm, rows[name].stamp - latency, mine):
+            at = step.leap.first + latency
+            found.append(Fault((name,), tuple(mine), "set", step.by, _set(name, step, (at - origin) / 1e9), at=at))
+    return found
 
 
-def _set(name: str, step: ClockStep, origin: int) -> str:
+def _set(name: str, step: ClockStep, at: float) -> str:
     """What shows that a clock was set, and what to do; rows that are stamped as they arrive leap with their latency."""
     leap, later, slower, more = (
         ("leap ahead", "later", "slower", "more") if step.by > 0.0 else ("step back", "earlier", "faster", "less")
     )
     return (
-        f"sensor '{name}': its stamps {leap} by {abs(step.by):.3f} s at {(step.leap.first - origin) / 1e9:.2f} s, and"
+        f"sensor '{name}': its stamps {leap} by {abs(step.by):.3f} s at {at:.2f} s, and"
         f" from there on it follows the commands {abs(step.change):.3f} s {later} than before: was its clock set, or is"
         f" it {slower} since? Correct its stamps, or use parts (--to, --from), with {abs(step.by) * 1e3:.0f} {more}"
         " latency_ms in the later one"
@@ -356,30 +356,26 @@ def _set(name: str, step: ClockStep, origin: int) -> str:
 # ---- a sensor that does not follow ----------------------------------------------------------------------------------
 
 
-def _not_following(segment: Segment, config: FusionConfig, given: _Given, trackings: _Trackings) -> list[Fault]:
-    found = _turned_frames(segment, config, given, trackings)
+def _not_following(segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings) -> list[Fault]:
+    found = _turned_frames(segment, config, positions, trackings)
     turned = {name for one in found for name in one.sensors}
     for name, mine in trackings.items():
         if name in turned:
             continue
         if odd := [axis for axis, tracking in mine.items() if not tracking.follows]:
             grid = _busiest(segment, config.arm.update_period)
-            causes = _matches(segment, config, name, {axis: given[name][axis] for axis in mine}, grid)
+            causes = _matches(segment, config, {axis: positions[name][axis] for axis in mine}, grid)
             found += _faults(config, name, mine, {axis: causes[axis] for axis in odd}, grid.margin * grid.step)
     return _of_commands(found, trackings)
 
 
-def _matches(
-    segment: Segment, config: FusionConfig, name: str, given: Mapping[str, tuple[TimeArray, FloatArray]], grid: Grid
-) -> dict[str, Match]:
+def _matches(segment: Segment, config: FusionConfig, positions: Mapping[str, Rows], grid: Grid) -> dict[str, Match]:
     """What explains the motion that a sensor measures on each axis, without single outliers."""
-    sensor = config.sensors[name]
     led = {axis: segment.led(config.arm, axis, grid.time) for axis in segment.axes}
     measured: dict[str, FloatArray] = {}
-    for axis, (stamp, value) in given.items():
-        alike = without_spikes(value)
-        valid = stamp[alike] - round(sensor.latency * 1e9)
-        measured[axis] = grid.mean(valid, value[alike] / sensor.scale - segment.start[axis])
+    for axis, (valid, position) in positions.items():
+        alike = without_spikes(position)
+        measured[axis] = grid.mean(valid[alike], position[alike] - segment.start[axis])
     return matches(measured, led, grid)
 
 
@@ -515,12 +511,12 @@ def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
 # ---- a sensor that is turned against its axes ------------------------------------------------------------------------
 
 
-def _turned_frames(segment: Segment, config: FusionConfig, given: _Given, trackings: _Trackings) -> list[Fault]:
+def _turned_frames(segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings) -> list[Fault]:
     """The faults of sensors that see the commanded motion turned, by 3° or more."""
     found = list[Fault]()
     for name, mine in trackings.items():
         axes = [axis for axis in (CARTESIAN if "x" in mine else CANONICAL_AXES) if axis in mine]
-        if len(axes) < 2 or (turned := _turned_frame(segment, config, name, given[name], axes)) is None:
+        if len(axes) < 2 or (turned := _turned_frame(segment, config, positions[name], axes)) is None:
             continue
         angle, along, back = turned
         lengths = f"{_digits(back * MM, 2)} mm instead of {_digits(along * MM, 2)} mm"
@@ -534,32 +530,25 @@ def _turned_frames(segment: Segment, config: FusionConfig, given: _Given, tracki
 
 
 def _turned_frame(
-    segment: Segment,
-    config: FusionConfig,
-    name: str,
-    given: Mapping[str, tuple[TimeArray, FloatArray]],
-    axes: Sequence[str],
+    segment: Segment, config: FusionConfig, positions: Mapping[str, Rows], axes: Sequence[str]
 ) -> tuple[float, float, float] | None:
     """By how much a sensor is turned [rad], and how far its moves are from the response's as it is and turned back [m].
 
     None where it is not turned surely. Moves of a second are compared, as noise that wanders is no turn. Where the
     response is late is none either: its speed and a constant are fitted beside it.
     """
-    sensor = config.sensors[name]
-    stamp = reduce(_common, (given[axis][0] for axis in axes))
-    stamp = stamp[:: 1 + len(stamp) // _ENOUGH]
-    if len(stamp) < _FEW:
-        return None
-    value = np.column_stack([_at(*given[axis], stamp) for axis in axes]) / sensor.scale
-    alike = np.all([without_spikes(one) for one in value.T], axis=0)
-    valid, value = stamp[alike] - round(sensor.latency * 1e9), value[alike]
+    valid = reduce(_common, (positions[axis][0] for axis in axes))
+    valid = valid[:: 1 + len(valid) // _ENOUGH]
     if len(valid) < _FEW:
         return None
-    every = np.concatenate([valid, valid - round(SMALL_SHIFT * 1e9)])
-    order, led = np.argsort(every, kind="stable"), np.empty((len(every), len(axes)))
-    for column, axis in enumerate(axes):
-        led[order, column] = segment.led(config.arm, axis, every[order])
-    led, before = np.split(led, 2)
+    each = (positions[axis] for axis in axes)
+    value = np.column_stack([position[np.searchsorted(every, valid)] for every, position in each])
+    alike = np.all([without_spikes(one) for one in value.T], axis=0)
+    valid, value = valid[alike], value[alike]
+    if len(valid) < _FEW:
+        return None
+    ends = [_led_at(segment, config, axis, {"": valid})[""] for axis in axes]
+    led, before = (np.column_stack(part) for part in zip(*ends, strict=True))
     over = round(_MOVE / max(float(np.median(np.diff(valid))), 1.0))
     if not 1 <= over < len(valid) // _PARTS:
         return None
@@ -581,7 +570,7 @@ def _turned_frame(
 
 
 def _common(first: TimeArray, other: TimeArray) -> TimeArray:
-    """The stamps that are in both, once each; both are ascending, and not empty (``intersect1d`` imports numpy.ma)."""
+    """The instants of both, once each; both are ascending, and not empty (``intersect1d`` imports numpy.ma)."""
     beside = other[np.searchsorted(other, first).clip(max=len(other) - 1)]
     return first[(beside == first) & (np.diff(first, prepend=first[:1] - 1) > 0)]
 
@@ -605,11 +594,6 @@ def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatAr
     return turn, misfit(led), misfit(led @ turn.T)
 
 
-def _at(stamp: TimeArray, value: FloatArray, chosen: TimeArray) -> FloatArray:
-    """The values of chosen stamps, all of which are there; both ascend."""
-    return value[np.searchsorted(stamp, chosen)]
-
-
 # ---- a begin in mid-motion, a latency below 0 ---------------------------------------------------------
 
 
@@ -629,30 +613,29 @@ def settled(config: FusionConfig, axis: str) -> float:
     return config.arm.delay_of(axis) + _SETTLED * config.arm.axes[axis].plant.lag
 
 
-def _evidence(segment: Segment, config: FusionConfig, axis: str, speed: float) -> tuple[float, float]:
+def _evidence(
+    segment: Segment, config: FusionConfig, axis: str, speed: float, positions: _Positions
+) -> tuple[float, float]:
     """Score and information on the share of a motion at ``speed`` [m/s] that was there before the first command.
 
     What such a motion adds to one from rest is fitted to the measurements until the model has settled, beside a
     constant of each sensor. Score over information is the share, 1/√information its standard deviation.
     """
     model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
-    until, column, score, information = settled(config, axis), segment.axes.index(axis), 0.0, 0.0
+    until, score, information = settled(config, axis), 0.0, 0.0
     (given, command), start = segment.given(axis), segment.start[axis]
     before = np.arange(-min(int(until / period) + 1, _MOST), 0.0)
     earlier = np.concatenate([given[0] + np.rint(before * (period * 1e9)).astype(np.int64), given])
     moving = np.concatenate([start + before * (period * speed), command])
-    for name, rows in segment.rows_by_sensor().items():
-        if (sensor := config.sensors.get(name)) is None:
+    for name, (valid, position) in ((name, axes[axis]) for name, axes in positions.items() if axis in axes):
+        count = int(np.searchsorted(valid, int(given[0]) + round(until * 1e9), side="right"))
+        if count < _FEWEST:
             continue
-        valid = rows.stamp - round(sensor.latency * 1e9)
-        early = (rows.known[:, column] == int(Outcome.FUSED)) & (valid <= given[0] + round(until * 1e9))
-        if np.count_nonzero(early) < _FEWEST:
-            continue
-        valid, value = valid[early], rows.value[early, column] / sensor.scale
+        sensor, valid = config.sensors[name], valid[:count]
         rest = start + response(model, period, delay, given, command, start, valid)
         added = moving[0] + response(model, period, delay, earlier, moving, float(moving[0]), valid) - rest
         added -= added.mean()
-        left = value - rest
+        left = position[:count] - rest
         left -= left.mean()
         along, size = float(added @ left), max(float(added @ added), 1e-30)
         noise = max((sensor.sd_of(axis) or 0.0) / abs(sensor.scale), float(np.std(left - added * (along / size))))
