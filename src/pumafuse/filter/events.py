@@ -82,22 +82,11 @@ class Results(NamedTuple):
 
     def rows(self, chosen: IntArray) -> Results:
         """What became of some of the events, in the order of ``chosen``."""
-        innovation, sd, outcome, contradicts = self
-        return Results(
-            innovation.take(chosen, axis=0),
-            sd.take(chosen, axis=0),
-            outcome.take(chosen, axis=0),
-            contradicts.take(chosen),
-        )
+        return Results._make(part.take(chosen, axis=0) for part in self)
 
 
 def joined(parts: Sequence[Events]) -> Events:
     """The events of several tables, one after the other."""
-    spread = [part.spread for part in parts]
-    if any(len(one) for one in spread):
-        spread = [part.spread if len(part.spread) else np.ones_like(part.value) for part in parts]
-    names = ("time", "source", "stamp", "value", "known")
-    return Events(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},
-        spread=np.concatenate(spread),
-    )
+    if any(len(part.spread) for part in parts):
+        parts = [part if len(part.spread) else part._replace(spread=np.ones_like(part.value)) for part in parts]
+    return Events._make(map(np.concatenate, zip(*parts, strict=True)))

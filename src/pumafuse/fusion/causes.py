@@ -17,6 +17,8 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from operator import add
 from typing import NamedTuple, TypeAlias, cast
@@ -31,6 +33,7 @@ from ..filter.outcome import Outcome
 from ..filter.response import response
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
+from ..units import nanoseconds
 from .config import FusionConfig
 from .estimates import Estimates, Measurements
 from .segments import Segment
@@ -243,7 +246,8 @@ def _highest(tried: Sequence[tuple[float, float]]) -> tuple[float, float]:
 # ---- one pass of the filter -----------------------------------------------------------------------------------------
 
 
-class _Part(NamedTuple):
+@dataclass(frozen=True)
+class _Part:
     """Components of one axis that follow each other, and the commands meanwhile."""
 
     config: FusionConfig
@@ -252,15 +256,19 @@ class _Part(NamedTuple):
     measured: Measurements  # the components, (m,)
     time: TimeArray  # when they are valid, int64 ns, (m,)
     scale: FloatArray  # of their sensors, (m,)
-    led: FloatArray  # where all commands lead the axis [m or rad], (m,)
     start: float  # where it rests before the commands that the filter is given
     given: TimeArray  # when these are given, int64 ns, (k,)
     command: FloatArray  # these [m or rad], (k,)
 
+    @cached_property
+    def led(self) -> FloatArray:
+        """Where all commands lead the axis at ``time`` [m or rad], (m,)."""
+        return self.position(self.config.arm.axes[self.axis], self.time)
+
     @property
     def sensors(self) -> list[int]:
         """Those that measure."""
-        return _distinct(self.measured.sensor)
+        return np.flatnonzero(np.bincount(self.measured.sensor)).tolist()  # numpy's unique imports masked arrays
 
     def position(self, model: AxisModel, time: TimeArray) -> FloatArray:
         """Where all commands lead an axis like this, (n,)."""
@@ -269,7 +277,7 @@ class _Part(NamedTuple):
 
 def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -> _Part:
     """Components with the commands that act meanwhile, or without, where these are many and not needed."""
-    arm, time = est.config.arm, est.origin + np.rint(measured.time * 1e9).astype(np.int64)
+    arm, time = est.config.arm, est.origin + nanoseconds(measured.time)
     given, command = segment.given(axis)
     first, last = np.searchsorted(given + round(arm.delay_of(axis) * 1e9), time[[0, -1]]).tolist()
     if last - first > _COMMANDS * len(time) and not _needs_commands(est.config, axis):
@@ -279,8 +287,7 @@ def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -
         [est.config.sensors[name].scale if name in est.config.sensors else 1.0 for name in measured.sensors]
     )
     commands = start, given[first:last], command[first:last]
-    part = _Part(est.config, segment, axis, measured, time, scales[measured.sensor], np.zeros(0), *commands)
-    return part._replace(led=part.position(arm.axes[axis], time))
+    return _Part(est.config, segment, axis, measured, time, scales[measured.sensor], *commands)
 
 
 def _of_part(part: _Part) -> Evidence:
@@ -311,10 +318,6 @@ def _of_part(part: _Part) -> Evidence:
             gain = _heavy_tailed(normalised[sensor == number, 0], share, times)
             found[Tried(Cause.OUTLIERS, measured.sensors[number], times)] = Weight(gain)
     return found
-
-
-def _distinct(sensor: IndexArray) -> list[int]:
-    return np.flatnonzero(np.bincount(sensor)).tolist()  # numpy's unique imports masked arrays
 
 
 def _model(part: _Part) -> Model:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..filter.outcome import Outcome
-from ..units import MM, Kind
+from ..units import MM, Kind, nanoseconds
 from . import chi_square
 from .causes import Evidence, Suspect, evidence_of, suspects
 from .config import Sensor
@@ -177,7 +177,7 @@ def _is_told_by_one(est: Estimates, sensor: str, axis: str) -> bool:
     others = (name for name in est.measurements.sensors if name != sensor)
     if any(len(est.measurements.of(name, axis).value) for name in others):
         return False
-    strays, time = est[axis].position.copy(), est.origin + np.rint(est.time * 1e9).astype(np.int64)
+    strays, time = est[axis].position.copy(), est.origin + nanoseconds(est.time)
     for number in np.unique(est.segment).tolist():
         rows = est.segment == number
         strays[rows] -= est.segments[number].led(est.config.arm, axis, time[rows])

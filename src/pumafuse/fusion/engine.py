@@ -164,12 +164,9 @@ def _filtered(
     results: Results,
     bias: Callable[[int, int], tuple[float, float] | None],
 ) -> Filtered:
-    axes = {
-        axis: AxisEstimate(segment.start[axis] + outputs[0, number], *outputs[1:, number])
-        for number, axis in enumerate(segment.axes)
-    }
-    biases: dict[str, dict[str, Bias]] = {}
+    axes, biases = dict[str, AxisEstimate](), dict[str, dict[str, Bias]]()
     for number, axis in enumerate(segment.axes):
+        axes[axis] = AxisEstimate(segment.start[axis] + outputs[0, number], *outputs[1:, number])
         for place, name in enumerate(segment.sensors):
             if (known := bias(place, number)) is not None:
                 biases.setdefault(name, {})[axis] = Bias(*known)

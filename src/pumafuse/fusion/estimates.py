@@ -17,7 +17,7 @@ from ..errors import RunError, UnknownNameError
 from ..filter.outcome import Outcome
 from ..logs.frames import CARTESIAN, Placed, in_space
 from ..model.arm import ArmModel
-from ..units import Kind
+from ..units import Kind, nanoseconds
 from .config import FusionConfig
 from .pose import Pose, covariance_in_log, orientation, turning_covariance
 from .score import ReferenceTrack
@@ -348,7 +348,7 @@ def write_tum(track: ReferenceTrack, config: FusionConfig, origin: int, where: s
     turned = orientation(track.position, config)
     if turned is not None:
         row = np.column_stack([row, turned])
-    stamp = origin + np.rint(track.time * 1e9).astype(np.int64)
+    stamp = origin + nanoseconds(track.time)
     kept = np.isfinite(row).all(axis=1) & (np.diff(stamp, prepend=stamp[:1] - 1) > 0)
     unturned = " 0 0 0 1" if turned is None else ""
     lines = (

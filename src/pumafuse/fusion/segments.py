@@ -354,7 +354,8 @@ def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
     note_rows(notes, label, missing, "no stamp: not used")
     note_rows(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
     order = in_order(source.stamp, int(np.count_nonzero(missing)))
-    rows = _classified(_table(source, run.axes, order, COMMAND), policy, 0, np.zeros_like(missing[order]))
+    rows = _table(source, run.axes, order, COMMAND)
+    rows = rows._replace(known=classify(policy, rows, 0, np.zeros_like(missing[order])))
     if len(source.stray):
         rows.known[source.stray[order][:, None] & (rows.known == int(Outcome.INVALID))] = int(Outcome.STRAY)
     note_rows(notes, label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
@@ -421,7 +422,7 @@ def _measurement_rows(
     order = in_order(source.stamp)
     latency = 0 if sensor is None else round(sensor.latency * 1e9)
     rows = _table(source, run.axes, order, number, latency)
-    rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
+    rows = rows._replace(known=classify(policy, rows, origin, lag[order] > TOLERATED_STEP_BACK_NS))
     rows.known[~used[order]] = ABSENT
     if sensor is not None:
         notes += _hold(rows, commands, config, name, label, run.axes, origin)
@@ -505,11 +506,6 @@ def _table(source: Source, axes: tuple[str, ...], order: IntArray | slice, numbe
     if len(source.noise):
         spread *= source.noise[order, None]
     return Events(_valid(stamp, latency), np.full(len(stamp), number, dtype=np.int16), stamp, value, spread, known)
-
-
-def _classified(rows: Events, policy: Model, origin: int, too_late: BoolArray) -> Events:
-    """Rows of one source with every value classified."""
-    return rows._replace(known=classify(policy, rows, origin, too_late))
 
 
 def best_of(known: CodeArray) -> CodeArray:

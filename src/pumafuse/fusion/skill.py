@@ -24,6 +24,7 @@ from .. import toml
 from ..arrays import FloatArray, median
 from ..filter.core import constant_velocity
 from ..filter.outcome import Outcome
+from ..units import nanoseconds
 from .estimates import Estimates, Measurements
 from .setup import turn_of
 
@@ -75,38 +76,31 @@ def skill(est: Estimates, measured: Measurements) -> Skill | None:
     """Errors of predicting the next measurement of a sensor on an axis; None with fewer than two in every segment."""
     predicted = np.isfinite(measured.innovation)
     parts = [measured.where(predicted & (measured.segment == number)) for number in range(len(est.segments))]
-    if turn := _turn(est, measured):
-        parts = [replace(part, value=np.unwrap(part.value, period=turn)) for part in parts]
     parts = [part for part in parts if len(part.value) > 1]
     if not parts:
         return None
+    sensor, axis = measured.sensors[int(measured.sensor[0])], measured.axes[int(measured.axis[0])]
+    if turn := turn_of(est.config, sensor, axis):
+        parts = [replace(part, value=np.unwrap(part.value, period=turn)) for part in parts]
     return Skill(
         predictions=sum(len(part.value) - 1 for part in parts),
         last_held=_summed_up(np.concatenate([np.diff(part.value) for part in parts])),
         constant_velocity=_summed_up(_by_constant_velocity(parts)),
-        command_alone=_summed_up(np.concatenate([_by_command(est, part) for part in parts])),
+        command_alone=_summed_up(np.concatenate([_by_command(est, sensor, axis, part) for part in parts])),
         filter=_summed_up(np.concatenate([part.innovation[1:] for part in parts])),
     )
-
-
-def _turn(est: Estimates, measured: Measurements) -> float:
-    """After which angle the measurements are the same again [rad]; 0: never."""
-    if not len(measured.value):
-        return 0.0
-    return turn_of(est.config, measured.sensors[int(measured.sensor[0])], measured.axes[int(measured.axis[0])])
 
 
 def _summed_up(error: FloatArray) -> PredictionError:
     return PredictionError(rms=float(np.sqrt(error @ error / len(error))), median=median(np.abs(error)))
 
 
-def _by_command(est: Estimates, measured: Measurements) -> FloatArray:
+def _by_command(est: Estimates, sensor: str, axis: str, measured: Measurements) -> FloatArray:
     """Measurements of one segment less what the commands say of them [m or rad], without the first, (n - 1,)."""
-    sensor, axis = measured.sensors[int(measured.sensor[0])], measured.axes[int(measured.axis[0])]
     known, segment = est.config.sensors[sensor], est.segments[int(measured.segment[0])]
-    time = est.origin + np.rint(measured.time * 1e9).astype(np.int64)
+    time = est.origin + nanoseconds(measured.time)
     left = measured.value - known.scale * (segment.start[axis] + segment.led(est.config.arm, axis, time))
-    if turn := _turn(est, measured):
+    if turn := turn_of(est.config, sensor, axis):
         left = left - turn * round(float(left[0]) / turn)
     if known.bias_sd_of(axis) == 0.0:
         return left[1:]
