@@ -1,4 +1,4 @@
-"""The core against a textbook Kalman filter on whole matrices; and what must not change a bit."""
+"""What must not change a bit of what the core makes, and what it refuses."""
 
 from __future__ import annotations
 
@@ -81,12 +81,6 @@ def run(config: FusionConfig, events: Events) -> tuple[FloatArray, Results, Filt
     """Outputs at each event, by what was known until then."""
     results, core = Results.room(*events.known.shape), Filter(model_of(config), 0)
     return core.run(events, results, events.time), results, core
-
-
-# ---- the textbook ---------------------------------------------------------------------------------------------------
-
-
-# ---- to the bit -----------------------------------------------------------------------------------------------------
 
 
 def test_what_a_measurement_does_not_see_keeps_its_bits() -> None:

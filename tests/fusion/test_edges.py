@@ -38,20 +38,17 @@ def arc(frame=None, **spoil):
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_infinite_x_or_y_is_invalid(axis):
-    """Infinite x or y is invalid."""
     est = pf.fuse(arc(**{axis: np.inf}), config(gate=0.0))
     assert est.measurements.of("camera", "tangential").outcome[50] == pf.Outcome.INVALID
 
 
 @pytest.mark.parametrize("sensor", [{"gate": 0.0}, {"gate_rows": False}])
 def test_a_measurement_on_the_base_axis_does_not_poison_the_filter(sensor):
-    """A measurement on the base axis does not poison the filter."""
     est = pf.fuse(arc(x=0.0, y=0.0), config(**sensor))
     assert np.isfinite(est["tangential"].position).all()
 
 
 def test_an_infinite_command_is_no_radius():
-    """An infinite command is no radius."""
     run = arc()
     run.command.values["x"][20] = np.inf
     assert pf.fuse(run, config()).radius == pytest.approx(0.5)
@@ -59,7 +56,6 @@ def test_an_infinite_command_is_no_radius():
 
 @pytest.mark.parametrize("start", [{"x": 0.5}, {"y": 0.5}])
 def test_half_a_start_level_is_refused(start):
-    """Half a start level is refused."""
     with pytest.raises(pf.RunError, match="start"):
         in_axes(replace(arc(), start=start), None)
 
@@ -109,17 +105,14 @@ def small(shift=0.0, spoil=0.0):
 
 
 def test_a_reference_that_covers_nothing_makes_no_picture():
-    """A reference that covers nothing makes no traceback."""
     assert error_figure(pf.fuse(small(shift=1000.0), config())) is None
 
 
 def test_innovations_all_beyond_the_histogram_make_no_warning():
-    """Innovations all beyond the histogram make no warning."""
     assert validation_figure(pf.fuse(small(spoil=1.0), config(gate=0.0))) is not None
 
 
 def test_no_variance_leaves_a_readable_folder(tmp_path):
-    """No variance leaves a readable folder."""
     run = replace(small(), sensors={}, reference=replace(small().reference, values={"radial": np.full(99, 0.5001)}))
     sure = {"radial": pf.Process(input_noise=0.0, drift=0.0)}
     est = pf.fuse(run, pf.FusionConfig(arm=ARM, start=pf.Start(offset_sd=0.0), process=sure))

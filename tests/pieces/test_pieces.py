@@ -167,8 +167,14 @@ def close(found: Any, expected: Any, relative: float) -> bool:
     "how", [{}, {"rate": 100.0}, {"sensors": ["camera"]}, {"part": (5.0, 50.0), "rate": 90.0}, {"part": (30.0, None)}]
 )
 def test_pieces_are_the_whole(log: Path, tmp_path: Path, how: dict[str, Any]) -> None:
-    """Estimates, outcomes and the reference to the last bit; counts equal; scores and NIS to rounding."""
-    expected, found = both_ways(log, tmp_path, **how)
+    """Estimates, outcomes and the reference to the last bit; counts equal; scores and NIS to rounding.
+
+    There are many pieces, in some of which no command is.
+    """
+    shares = list[float]()
+    expected, found = both_ways(log, tmp_path, progress=shares.append, **how)
+    assert len(shares) > 5 and shares == sorted(shares) and shares[-1] == 1.0
+    assert any(f"fused in {len(shares)} pieces" in note for note in found.notes)
     assert found.estimates == expected.estimates and found.duration_s == expected.duration_s
     if how.get("part", (None, None))[1] is None:  # what comes behind the part is not read
         assert (found.commands, found.rows) == (expected.commands, expected.rows)
@@ -191,16 +197,6 @@ def test_pieces_are_the_whole(log: Path, tmp_path: Path, how: dict[str, Any]) ->
             assert other.skill is not None and its.skill is not None
             assert close(other.skill.filter.rms, its.skill.filter.rms, 0.05)
             assert close(other.skill.command_alone.rms, its.skill.command_alone.rms, 0.5)
-
-
-def test_there_are_many_pieces(log: Path, tmp_path: Path) -> None:
-    """The comparison above is one of a dozen pieces, in some of which no command is."""
-    shares = list[float]()
-    found = fusing.fuse_to(log, tmp_path / "out", CONFIG, progress=shares.append)
-    assert len(shares) > 10 and shares == sorted(shares) and shares[-1] == 1.0
-    assert any(f"fused in {len(shares)} pieces" in note for note in found.notes)
-    files = [log] if log.is_file() else log.glob("*.parquet")
-    assert rows_of(log) == sum(pq.read_metadata(file).num_rows for file in files)
 
 
 @pytest.mark.parametrize(("none", "statistics"), [(9999.0, True), (-32768.0, False)])
@@ -302,6 +298,7 @@ def test_what_cannot_be_written_leaves_nothing(log: Path, tmp_path: Path, monkey
 def test_the_command_line_takes_the_way_by_the_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the limits a run goes through in pieces; what needs the whole is done up to a limit, and then refused."""
     path = written(tmp_path / "log", single=False)
+    assert rows_of(path) == sum(pq.read_metadata(file).num_rows for file in path.glob("*.parquet"))
     CONFIG.save(tmp_path)
     monkeypatch.setattr(command, "SHORT", 1000)
 

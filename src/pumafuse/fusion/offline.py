@@ -24,7 +24,7 @@ from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .faults import latency_questions, sensor_faults, starts_in_motion
 from .placing import in_base
-from .score import ReferenceTrack, late_rows, reference_track
+from .score import late_rows, reference_track
 from .segments import NO_STAMP_WORD, Segment, added, best_of, build, counted, on_any_axis, output_times
 from .verdicts import sensor_problems
 
@@ -129,6 +129,7 @@ def estimates_of(
     _, cut, times, filtered = zip(*parts, strict=True)
     origin = cut[0].origin
     references = _references(parts, origin)
+    track = reference_track(references, origin) if references else None
     rows = [_row_counts(segment, part) for segment, part in zip(cut, filtered, strict=True)]
     axes = {
         axis: AxisEstimate(
@@ -143,7 +144,7 @@ def estimates_of(
         cartesian=_cartesian(placed, {axis: one.position for axis, one in axes.items()}),
         measurements=_measurements(cut, filtered),
         biases=filtered[-1].biases,
-        reference=_reference(references, origin, placed),
+        reference=track and replace(track, cartesian=_cartesian(placed, track.position)),
         origin=origin,
         segment=np.repeat(np.arange(len(parts)), [len(part) for part in times]),
         segments=cut,
@@ -214,14 +215,6 @@ def _cartesian(placed: Placed | None, position: Mapping[str, FloatArray]) -> dic
     if "vertical" in position:
         found["z"] = position["vertical"].copy()
     return found
-
-
-def _reference(parts: Sequence[Source], origin: int, placed: Placed | None) -> ReferenceTrack | None:
-    """The reference of a run's segments, where it has one."""
-    if not parts:
-        return None
-    track = reference_track(parts, origin)
-    return replace(track, cartesian=_cartesian(placed, track.position))
 
 
 def _highest_speeds(cut: Sequence[Segment], arm: ArmModel) -> dict[Kind, float]:
