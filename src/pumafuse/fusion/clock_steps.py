@@ -70,10 +70,6 @@ class _Side(NamedTuple):
     led: Mapping[str, FloatArray]  # (n + 2m,)
     grid: Grid
 
-    def unexplained(self) -> FloatArray:
-        """Log of the share of motion that is left at each shift, (2m + 1,)."""
-        return lateness(self.measured, self.led, self.grid)
-
     def error(self) -> float:
         """Standard error of the lateness [s], by leaving out parts."""
         size = len(self.grid.time) - 2 * self.grid.margin
@@ -81,7 +77,7 @@ class _Side(NamedTuple):
         each = list[float]()
         for one in range(_PARTS):
             measured = {axis: np.where(part == one, np.nan, value) for axis, value in self.measured.items()}
-            each.append(best_shift(self._replace(measured=measured).unexplained(), self.grid))
+            each.append(best_shift(lateness(measured, self.led, self.grid), self.grid))
         return math.sqrt(_PARTS - 1) * float(np.std(each))
 
 
@@ -139,7 +135,7 @@ def _clock_step(
     earlier, later = (_side(segment, arm, positions, *ends) for ends in ((begin, leap.last), (leap.first, end)))
     if earlier is None or later is None:
         return None
-    left = earlier.unexplained(), later.unexplained()
+    left = lateness(*earlier), lateness(*later)  # log of the share of motion that is left at each shift, (2m + 1,)
     before, after = (best_shift(one, earlier.grid) for one in left)
     if not all(map(_follows, left)):
         return None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
@@ -211,9 +211,11 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def __post_init__(self) -> None:
         _known_axes("process", self.process, self.arm)
-        for path, part, kind in self._parts():
-            _check(path, part, kind)
+        _check("start", self.start, self.arm.kinds[0])
+        for axis, process in self.process.items():
+            _check(f"process.{axis}", process, self.arm.axes[axis].kind)
         for name, sensor in self.sensors.items():
+            _check(f"sensors.{name}", sensor, self.arm.kinds[0])
             refuse_name("sensor", name)
             if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.latency_sd):
                 raise ConfigError(f"sensors.{name}: scale, latency, gate and sds must be finite")
@@ -224,8 +226,6 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 raise ConfigError(f"sensors.{name}.latency_ms: more than an hour; is it in ms?")
             if sensor.turn and "angle" not in self.arm.kinds:
                 raise ConfigError(f"sensors.{name}.turn_deg: no axis of the arm is an angle")
-            if sensor.scale == 0.0:
-                raise ConfigError(f"sensors.{name}.scale: must not be 0: measurements would not depend on the position")
             if not 1.0 / _LARGEST_SCALE <= abs(sensor.scale) <= _LARGEST_SCALE:
                 raise ConfigError(f"sensors.{name}.scale: {sensor.scale:g} is no sensor's: 1e-9 to 1e9")
         complete = {axis: self.process.get(axis, PROCESS[one.kind]) for axis, one in self.arm.axes.items()}
@@ -235,14 +235,6 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def __repr__(self) -> str:
         sensors = ", ".join(self.sensors) or "no sensor"
         return f"FusionConfig(arm {self.arm.name!r} with {', '.join(self.arm.axes)}; {sensors})"
-
-    def _parts(self) -> Iterator[tuple[str, msgspec.Struct, Kind]]:
-        """Its tables with their places in the file, and of which kind of axis they are."""
-        yield "start", self.start, self.arm.kinds[0]
-        for axis, process in self.process.items():
-            yield f"process.{axis}", process, self.arm.axes[axis].kind
-        for name, sensor in self.sensors.items():
-            yield f"sensors.{name}", sensor, self.arm.kinds[0]
 
     @staticmethod
     def load(path: str | Path) -> FusionConfig:

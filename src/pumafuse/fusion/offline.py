@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar, get_args
@@ -11,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
-from ..errors import PumafuseWarning
+from ..errors import warn
 from ..filter.events import COMMAND
 from ..filter.outcome import ABSENT, Outcome
 from ..logs.clock import clock_faults, segments
@@ -104,8 +103,7 @@ def fuse(
     notes += [*jumps, *_uncovered(est), *config.arm.validity.excess(est.speed, est.radius)]
     parts.clear()  # their tables are as large as what est has of them
     est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen)
-    for note in est.notes:
-        warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
+    warn(f"run '{run.name}': {note}" for note in est.notes)
     return est
 
 

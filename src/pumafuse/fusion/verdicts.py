@@ -29,31 +29,23 @@ def sensor_problems(est: Estimates) -> list[str]:
         mine = slice(ends[number * len(given.axes)], ends[(number + 1) * len(given.axes)])
         rejected = np.count_nonzero(outcome[mine] == int(Outcome.REJECTED)) / count[number].sum()
         reacquired = len(set(given.time[order[mine][outcome[mine] == int(Outcome.REACQUIRED)]].tolist()))
-        times = "once" if reacquired == 1 else f"{reacquired} times"
-        width = _width_of_prior(est, name)
         of_axes = [each for each, some in zip(given.axes, count[number].tolist(), strict=True) if some]
         kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
         sd, bias_sd, offset_sd = (
             "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")
         )
-        problems = [
-            (
-                width > _WIDEST,
-                f"its prior ({offset_sd}, {bias_sd}) is {width:.1e} times its noise: more than double precision"
-                " resolves; use a narrower prior",
-            ),
-            (
-                reacquired > 0,
-                f"its gate reacquired {times}: it contradicts "
-                + (
-                    f"the model; {sd}, latency_ms or the process noise may be wrong"
-                    if alone
-                    else f"the others or the model; if it is off by a constant, give it {bias_sd}"
-                ),
-            ),
-            (rejected > MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}"),
-        ]
-        found += [f"{name}: {problem}" for holds, problem in problems if holds]
+        if (width := _width_of_prior(est, name)) > _WIDEST:
+            found.append(
+                f"{name}: its prior ({offset_sd}, {bias_sd}) is {width:.1e} times its noise: more than double precision"
+                " resolves; use a narrower prior"
+            )
+        if reacquired:
+            times = "once" if reacquired == 1 else f"{reacquired} times"
+            of_all = f"the others or the model; if it is off by a constant, give it {bias_sd}"
+            of_one = f"the model; {sd}, latency_ms or the process noise may be wrong"
+            found.append(f"{name}: its gate reacquired {times}: it contradicts {of_one if alone else of_all}")
+        if rejected > MANY_REJECTED:
+            found.append(f"{name}: {rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}")
     return found
 
 

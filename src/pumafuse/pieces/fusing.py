@@ -7,7 +7,6 @@ the last bit. What the neighbourhood of a row says in words (notes, skill) is sa
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -17,7 +16,7 @@ import numpy as np
 
 from .. import folders
 from ..arrays import ALWAYS, NEVER
-from ..errors import PumafuseWarning, RunError
+from ..errors import RunError, warn
 from ..filter.core import Filter
 from ..fusion import results
 from ..fusion.config import FusionConfig
@@ -76,8 +75,7 @@ def fuse_to(
             raise no_estimates(rate)
         config.save(new)
         (new / results.SUMMARY).write_bytes(encode(summary))
-    for note in summary.notes:
-        warnings.warn(f"run '{summary.run}': {note}", PumafuseWarning, stacklevel=2)
+    warn(f"run '{summary.run}': {note}" for note in summary.notes)
     return summary
 
 

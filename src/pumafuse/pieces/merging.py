@@ -158,10 +158,10 @@ def _consistency(
     mean, power = weighted_mean([one.mean for one in innovations], fused) or 0.0, 0.0
     products = np.zeros(lags)
     for part, one, n in zip(parts, innovations, fused, strict=True):
-        own, aside = n * ((part.nis_mean or 0.0) - one.mean**2), n * (one.mean - mean) ** 2
-        products += aside
-        products[: len(part.correlation)] += own * np.array(part.correlation)
-        power += own + aside
+        within, between = n * ((part.nis_mean or 0.0) - one.mean**2), n * (one.mean - mean) ** 2
+        products += between
+        products[: len(part.correlation)] += within * np.array(part.correlation)
+        power += within + between
     correlation = products / power if power > 0.0 else products
     white = whiteness_of(correlation, count) if lags else 1.0
     decided = sum(part.outcomes.get(one.word, 0) for part in parts for one in Outcome if one <= Outcome.REACQUIRED)
