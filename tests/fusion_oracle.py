@@ -23,7 +23,7 @@ from statistics import NormalDist
 import numpy as np
 
 from pumafuse.fusion.config import FusionConfig
-from pumafuse.fusion.estimates import Estimates, Measurements
+from pumafuse.fusion.estimates import AxisEstimate, Estimates, Measurements
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
@@ -37,7 +37,7 @@ _MANY, _OF_MANY = np.polynomial.legendre.leggauss(24)  # likewise, of one 16 tim
 _decimal = np.frompyfunc(Decimal, 1, 1)
 
 
-def check_estimates(estimate: object, belief: Belief) -> None:
+def check_estimates(estimate: AxisEstimate, belief: AxisEstimate) -> None:
     """Estimates of an axis agree with the oracle's: means to 1e-9 sd + 1e-12 m, variances to 1e-9."""
     for field in FIELDS:
         (mean, sd), (wanted, wanted_sd) = (
@@ -213,20 +213,6 @@ class Rows:
         return self.position + self.offset
 
 
-@dataclass(frozen=True)
-class Belief:
-    """Means and standard deviations in the log's coordinates, SI; arrays are (times,)."""
-
-    position: np.ndarray
-    position_sd: np.ndarray
-    velocity: np.ndarray
-    velocity_sd: np.ndarray
-    offset: np.ndarray
-    offset_sd: np.ndarray
-    disturbance: np.ndarray
-    disturbance_sd: np.ndarray
-
-
 class AxisOracle:
     """One axis of a run, gates off.
 
@@ -300,18 +286,18 @@ class AxisOracle:
                     found[name] = float(_dot(C, w)), float((prior - _dot(C, C)).sqrt())
         return found
 
-    def filtered(self, times: np.ndarray) -> Belief:
+    def filtered(self, times: np.ndarray) -> AxisEstimate:
         """Given every measurement valid at or before each of ``times`` [ns since the first command]."""
         return self._believe(times, self.measurements, [measurement.valid for measurement in self.measurements])
 
-    def as_live(self, times: np.ndarray) -> Belief:
+    def as_live(self, times: np.ndarray) -> AxisEstimate:
         """Given every measurement whose stamp and valid time are at or before each of ``times``."""
         assert not any(self.config.sensors[measurement.sensor].latency_sd for measurement in self.measurements)
         assert not self.jumps
         arrived = sorted(self.measurements, key=lambda measurement: max(measurement.stamp, measurement.valid))
         return self._believe(times, arrived, [max(measurement.stamp, measurement.valid) for measurement in arrived])
 
-    def smoothed(self, times: np.ndarray) -> Belief:
+    def smoothed(self, times: np.ndarray) -> AxisEstimate:
         """Given every measurement there is."""
         found = self._believe(times, self.measurements, [min(times)] * len(self.measurements))
         return replace(found, velocity=np.full(len(times), np.nan), velocity_sd=np.full(len(times), np.nan))
@@ -329,7 +315,7 @@ class AxisOracle:
                     found.append((valid, rank, stamp, row, Measurement(name, row, valid, stamp, float(value))))
         return [measurement for *_, measurement in sorted(found)]
 
-    def _believe(self, times: np.ndarray, order: Sequence[Measurement], known_from: Sequence[int]) -> Belief:
+    def _believe(self, times: np.ndarray, order: Sequence[Measurement], known_from: Sequence[int]) -> AxisEstimate:
         """Given, for each of ``times``, the measurements of ``order`` that are known by then: the first so many."""
         count = np.searchsorted(known_from, times, side="right")
         rows = self._measurements_as_rows(order)
@@ -352,7 +338,7 @@ class AxisOracle:
         has = self.process.disturbance_sd > 0.0
         for part, finest in zip(sd, (1e-9, 1e-9 / self.period, 1e-9, 1e-9 * has), strict=True):
             np.maximum(part, finest, out=part)  # no bar is 0, but of a disturbance that there is not
-        return Belief(*(part for pair in zip(means, sd, strict=True) for part in pair))
+        return AxisEstimate(*(part for pair in zip(means, sd, strict=True) for part in pair))
 
     def _doubts(self, rows: Rows) -> list[np.ndarray]:
         """How far positions and velocities in rows are off where lag or gain is one standard deviation off, (rows,)."""

@@ -66,22 +66,30 @@ _SLOWER = 1.1  # times the plant's lag: a derivative by it
 
 
 class Cause(enum.Enum):
-    """What may be wrong; in brackets what the size of it means."""
+    """What may be wrong, and which ``measure`` of :class:`pumafuse.FoundCause` its size is; "": it has none."""
 
-    NOISE = "noise"  # a sensor's sd (by what to multiply it)
-    CORRELATED = "correlated"  # a sensor's noise goes on from measurement to measurement (none)
-    OUTLIERS = "outliers"  # a few innovations are far larger than the others (none)
-    PROCESS = "process"  # the process noise (by what to multiply it)
-    MANEUVERS = "maneuvers"  # process noise where the commanded speed changes (none)
-    LATENCY = "latency"  # of a sensor beside others (by how much it is too small [s])
-    LAG = "lag"  # of the arm, or the latency of the only sensor, which is named then (by how much too small [s])
-    PLANT = "plant"  # likewise of the plant, as LAG
-    DYNAMICS = "dynamics"  # the lag is right, but not how it is made up: delay, plant, smoothing (none)
-    SCALE = "scale"  # of a sensor beside others (share by which it is too small)
-    POSITION = "position"  # gain or sag, or the scale of the only sensor (share of the position by which it errs)
-    BIAS = "bias"  # a sensor beside others is off by a constant [m]
-    PLAY = "play"  # backlash (its width [m])
-    LIMIT = "limit"  # of the speed (none)
+    measure: str
+
+    def __new__(cls, word: str, measure: str = "") -> Cause:
+        """The word alone is its value."""
+        cause = object.__new__(cls)
+        cause._value_, cause.measure = word, measure
+        return cause
+
+    NOISE = "noise", "factor"  # a sensor's sd
+    CORRELATED = "correlated"  # a sensor's noise goes on from measurement to measurement
+    OUTLIERS = "outliers"  # a few innovations are far larger than the others
+    PROCESS = "process", "factor"  # the process noise
+    MANEUVERS = "maneuvers"  # process noise where the commanded speed changes
+    LATENCY = "latency", "shift"  # of a sensor beside others
+    LAG = "lag", "shift"  # of the arm, or the latency of the only sensor, which is named then
+    PLANT = "plant", "shift"  # likewise of the plant
+    DYNAMICS = "dynamics"  # the lag is right, but not how it is made up: delay, plant, smoothing
+    SCALE = "scale", "share"  # of a sensor beside others
+    POSITION = "position", "share"  # gain or sag, or the scale of the only sensor
+    BIAS = "bias", "size"  # a sensor beside others is off by a constant
+    PLAY = "play", "size"  # backlash
+    LIMIT = "limit"  # of the speed
 
 
 _ALIKE = {Cause.MANEUVERS: Cause.PROCESS, Cause.PLANT: Cause.LAG}  # the better one of two is named
@@ -229,7 +237,7 @@ def _unit(cause: Cause, which: float) -> float:
     """What a shape of size 1 is in the unit of its cause; 0 where it has none."""
     if cause is Cause.PLAY:
         return which
-    return 0.0 if cause in (Cause.LIMIT, Cause.DYNAMICS) or (cause is Cause.POSITION and which) else 1.0
+    return 0.0 if not cause.measure or (cause is Cause.POSITION and which) else 1.0
 
 
 def _highest(tried: Sequence[tuple[float, float]]) -> tuple[float, float]:

@@ -84,11 +84,7 @@ class _Side(NamedTuple):
 def clock_steps(segment: Segment, arm: ArmModel, valid: TimeArray, positions: Mapping[str, Rows]) -> list[ClockStep]:
     """Where the clock of a sensor was set, in the order of time.
 
-    Args:
-        segment: Has the commands.
-        arm: How it answers.
-        valid: When measurements are valid, also of rows that measure nothing, ascending [ns], (n,).
-        positions: What the sensor measures, by axis.
+    Its rows are ``valid`` at these instants, also those that measure nothing, ascending [ns], (n,).
     """
     found, every, edges = list[ClockStep](), leaps(valid), list[int]()
     while every:

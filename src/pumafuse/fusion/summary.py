@@ -18,7 +18,7 @@ from .. import toml
 from ..arrays import FloatArray, IntArray
 from ..filter.outcome import Outcome
 from ..units import SCREEN, Kind, to_si
-from .causes import Cause, Evidence, Suspect, evidence_of
+from .causes import Evidence, Suspect, evidence_of
 from .consistency import Consistency, chi_square_band, consistency, log_likelihood
 from .estimates import AxisEstimate, Bias, Estimates
 from .score import OrientationScore, ReferenceTrack, score, score_orientation, score_velocity
@@ -52,19 +52,6 @@ class FoundCause(toml.Reported, frozen=True, kw_only=True):
     share: float | None = None
     shift: float | None = msgspec.field(name="shift_ms", default=None)
     size: float | None = msgspec.field(name="size_mm", default=None)
-
-
-_SIZE = {
-    Cause.NOISE: "factor",
-    Cause.PROCESS: "factor",
-    Cause.SCALE: "share",
-    Cause.POSITION: "share",
-    Cause.LATENCY: "shift",
-    Cause.LAG: "shift",
-    Cause.PLANT: "shift",
-    Cause.BIAS: "size",
-    Cause.PLAY: "size",
-}  # what the size of a cause means; others have none
 
 
 class SensorSummary(toml.Reported, frozen=True, kw_only=True):
@@ -415,6 +402,5 @@ def sensor_summary(
 
 
 def _found_cause(axis: str, one: Suspect, found: Consistency) -> FoundCause:
-    size = {_SIZE[one.cause]: one.size} if one.cause in _SIZE and 0.0 < abs(one.size) < math.inf else {}
-    words = in_words(one, found)
-    return FoundCause(axis=axis, sensor=one.sensor, cause=one.cause.value, words=words, **size)
+    size = {one.cause.measure: one.size} if one.cause.measure and 0.0 < abs(one.size) < math.inf else {}
+    return FoundCause(axis=axis, sensor=one.sensor, cause=one.cause.value, words=in_words(one, found), **size)
