@@ -20,10 +20,7 @@ from pumafuse.logs.run import Source
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 WORDS = {"fused", "rejected", "reacquired", "duplicate", "before_start", "too_late", "invalid", "unknown"} | {
-    "no_stamp",
-    "stray",
-    "outside",
-    "not_selected",
+    *("no_stamp", "stray", "outside", "not_selected")
 }
 OF_COMMANDS = {"used", "duplicate", "repetition", "invalid", "no_stamp", "stray", "outside"}
 

@@ -20,7 +20,6 @@ import pumafuse as pf
 from fusion.test_oracle import LAG, MS, Case, cases, every, replace_
 from fusion_oracle import AxisOracle, nanoseconds
 from pumafuse.fusion.engine import Filtered, filter_segment
-from pumafuse.fusion.estimates import Mode
 from pumafuse.fusion.segments import build, output_times
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import AxisModel
@@ -148,10 +147,19 @@ def test_fuse_by_filterpy_says_the_same_of_the_scan() -> None:
     assert done == sorted(done)
 
 
-@pytest.mark.parametrize("mode", ["smoothed", "as-live"])
-def test_filterpy_only_filters(mode: Mode) -> None:
-    with pytest.raises(ValueError, match=f"mode '{mode}' needs the compiled one"):
-        pf.fuse(*wide("offset", 1e3), engine="filterpy", mode=mode)
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"rate": 0.0}, "rate must be positive and finite, got 0.0"),
+        ({"engine": "fast"}, "no engine 'fast'; there are: compiled, filterpy"),
+        ({"mode": "as live"}, "no mode 'as live'; there are: filtered, as-live, smoothed"),
+        ({"mode": "smoothed", "engine": "filterpy"}, "mode 'smoothed' needs the compiled one"),
+        ({"mode": "as-live", "engine": "filterpy"}, "mode 'as-live' needs the compiled one"),
+    ],
+)
+def test_a_way_that_there_is_not_is_refused(how: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        pf.fuse(*wide("offset", 1e3), **how)
 
 
 # ---- wide priors ----------------------------------------------------------------------------------------------------

@@ -22,12 +22,6 @@ from pumafuse.logs.run import Run, Source
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 
 
-def test_an_unknown_mode_is_refused() -> None:
-    """With what there is."""
-    with pytest.raises(ValueError, match="no mode 'as live'; there are: filtered, as-live, smoothed"):
-        fuse(*Case().made(), mode="as live")  # pyright: ignore
-
-
 def test_smoothing_does_not_reach_across_a_clock_that_was_set_back() -> None:
     """Each side is smoothed as if it were a run of its own."""
     parts = [Case(one(UNDER), seed=seed).made() for seed in (1, 2)]

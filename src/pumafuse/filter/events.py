@@ -52,8 +52,7 @@ class Events(NamedTuple):
         def of(part: np.ndarray) -> np.ndarray:
             return part[chosen] if isinstance(chosen, slice) else part.take(chosen, axis=0)  # twice as fast
 
-        spread = of(self.spread) if len(self.spread) else self.spread
-        return Events(of(self.time), of(self.source), of(self.stamp), of(self.value), spread, of(self.known))
+        return Events._make(of(part) if len(part) else part for part in self)
 
     def where(self, mask: BoolArray) -> Events:
         """The events that a mask (n,) selects; themselves, not copied, if it selects all."""

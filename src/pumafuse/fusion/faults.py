@@ -198,22 +198,23 @@ def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) ->
                 chosen = slice(None, count, 1 + count // _ENOUGH)
                 alike = without_spikes(position[chosen])
                 some[name] = valid[chosen][alike], position[chosen][alike]
-        for name, led in _led_at(segment, config, axis, {name: valid for name, (valid, _) in some.items()}).items():
-            found[name][axis] = _tracking(segment, config, name, axis, *some[name], *led)
+        led = _led_at(segment, config, axis, [valid for valid, _ in some.values()])
+        for (name, rows), ends in zip(some.items(), led, strict=True):
+            found[name][axis] = _tracking(segment, config, name, axis, *rows, *ends)
     return found
 
 
 def _led_at(
-    segment: Segment, config: FusionConfig, axis: str, valid: Mapping[str, TimeArray]
-) -> dict[str, tuple[FloatArray, FloatArray]]:
+    segment: Segment, config: FusionConfig, axis: str, valid: Sequence[TimeArray]
+) -> list[tuple[FloatArray, FloatArray]]:
     """Where the commands lead an axis at the instants of several sensors, and where they had led shortly before."""
     if not valid:
-        return {}
-    every = np.concatenate([part for one in valid.values() for part in (one, one - round(SMALL_SHIFT * 1e9))])
+        return []
+    every = np.concatenate([part for one in valid for part in (one, one - round(SMALL_SHIFT * 1e9))])
     order, position = np.argsort(every, kind="stable"), np.empty(len(every))  # which merges what is in order
     position[order] = segment.led(config.arm, axis, every[order])
-    parts = iter(np.split(position, np.cumsum([len(one) for one in valid.values() for _ in range(2)])[:-1]))
-    return {name: (next(parts), next(parts)) for name in valid}
+    parts = iter(np.split(position, np.cumsum([len(one) for one in valid for _ in range(2)])[:-1]))
+    return list(zip(parts, parts, strict=True))
 
 
 def _tracking(
@@ -547,7 +548,7 @@ def _turned_frame(
     valid, value = valid[alike], value[alike]
     if len(valid) < _FEW:
         return None
-    ends = [_led_at(segment, config, axis, {"": valid})[""] for axis in axes]
+    ends = [_led_at(segment, config, axis, [valid])[0] for axis in axes]
     led, before = (np.column_stack(part) for part in zip(*ends, strict=True))
     over = round(_MOVE / max(float(np.median(np.diff(valid))), 1.0))
     if not 1 <= over < len(valid) // _PARTS:

@@ -36,11 +36,7 @@ from .summary import ScoreSummary, Summary, decode, encode, score_axis, summaris
 ESTIMATES, MEASUREMENTS, REFERENCE = "estimates.parquet", "measurements.parquet", "reference.parquet"
 SUMMARY, _LOG = "summary.json", "log.json"
 _FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, _LOG, "fusion.toml", ARM_FILE, ROBOT_FILE} | {
-    "fused.rrd",
-    "fused.png",
-    "error.png",
-    "validation.png",
-    "path.png",
+    *("fused.rrd", "fused.png", "error.png", "validation.png", "path.png")
 }  # a folder with anything else in it is never replaced
 _RUN = "run.toml"
 _REFERENCE_PREFIX = "reference."

@@ -39,6 +39,7 @@ from .reading import Log
 
 PIECE = 1_000_000  # rows that are read at a time
 _SETTLED = 10.0  # lags after which a motion is over
+_IN_ORDER = "so long a run is fused piece by piece, in the order of time: cut the log there"
 
 
 def fuse_to(
@@ -143,14 +144,11 @@ def _piece(
     """The estimates of the rows after and until the instants ``own`` [int ns], with notes."""
     moved, steps = going_on(run)
     if moved is not run:
-        raise RunError(f"{steps[0]}; so long a run is fused piece by piece, in the order of time: cut the log there")
+        raise RunError(f"{steps[0]}; {_IN_ORDER}")
     in_place, placed, config = in_base(run, config, whole=False)
     lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
-        raise RunError(
-            f"{label}: the clock is set back by {lag.max():.3f} s; so long a run is fused piece by piece, in the order"
-            " of time: cut the log there"
-        )
+        raise RunError(f"{label}: the clock is set back by {lag.max():.3f} s; {_IN_ORDER}")
     segment = build(in_place, config, chosen, begun, own)
     times = output_times(segment, config, rate, own)
     filtered = filter_piece(segment, core, config, times, own)
