@@ -275,7 +275,7 @@ def test_stray_and_missing_stamps(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written_leaves_nothing(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A full disk, Ctrl-C in the middle, and a run of which nothing is fused."""
+    """A full disk, Ctrl-C in the middle, a run of which nothing is fused, and a part without any estimate."""
     digest = fusing.digest
     for error in (OSError(28, "No space left on device"), KeyboardInterrupt()):
         pieces = iter([None, None, error])
@@ -292,6 +292,8 @@ def test_what_cannot_be_written_leaves_nothing(log: Path, tmp_path: Path, monkey
         assert not list(tmp_path.iterdir())
     with pytest.raises(RunError, match="nothing was fused"):
         fusing.fuse_to(log, tmp_path / "out", msgspec.structs.replace(CONFIG, sensors={}))
+    with pytest.raises(RunError, match=r"there is no tick of 0\.01 Hz in the part of the run"):
+        fusing.fuse_to(log, tmp_path / "out", CONFIG, part=(5.0, 50.0), rate=0.01)
     assert not list(tmp_path.iterdir())
 
 

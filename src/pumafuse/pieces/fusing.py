@@ -70,10 +70,10 @@ def fuse_to(
                 digests.append(digest(est))
                 if progress is not None:
                     progress(done)
+        if not any(one.estimates for one in digests):
+            raise no_estimates(rate)
         summary = merged(digests)
         results.check_fused(summary.rows, config)
-        if not summary.estimates:
-            raise no_estimates(rate)
         config.save(new)
         (new / results.SUMMARY).write_bytes(encode(summary))
     warn(f"run '{summary.run}': {note}" for note in summary.notes)

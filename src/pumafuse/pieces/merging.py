@@ -92,7 +92,7 @@ def merged(digests: Sequence[Digest]) -> Summary:
         )
     whole = replace(
         first,
-        time=np.concatenate([part.time for part in parts] or [np.zeros(1)]),
+        time=np.concatenate([part.time for part in parts]),
         command_counts=added(part.command_counts for part in parts),
         counts={name: added(part.counts[name] for part in parts) for name in first.counts},
         speed=speed,
