@@ -94,10 +94,11 @@ class Segment:
         found = self._latest.get(times)  # a search asks for many configurations of the same times
         if found is None:
             groups = self._groups(config)
-            if groups not in self._tables:
+            table = self._tables.get(groups)
+            if table is None:
                 self._tables.clear()  # threads share it
-                self._tables[groups] = self._joined(groups)
-            events, order = self._ordered(config, *self._tables[groups])
+                table = self._tables[groups] = self._joined(groups)
+            events, order = self._ordered(config, *table)
             place = np.empty(len(order), dtype=np.int64)
             place[order] = np.arange(len(order))
             found = self._latest[times] = events, place[len(order) - len(self.measurement_rows.time) :]
