@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from .. import folders
-from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
+from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray, known_rows
 from ..errors import RunError, UnknownNameError
 from ..filter.outcome import Outcome
 from ..logs.frames import CARTESIAN, Placed, in_space
@@ -348,11 +348,10 @@ def write_tum(track: ReferenceTrack, config: FusionConfig, origin: int, where: s
     turned = orientation(track.position, config)
     if turned is not None:
         row = np.column_stack([row, turned])
-    stamp = origin + nanoseconds(track.time)
-    kept = np.isfinite(row).all(axis=1) & (np.diff(stamp, prepend=stamp[:1] - 1) > 0)
+    stamp, row = known_rows(origin + nanoseconds(track.time), row)
     unturned = " 0 0 0 1" if turned is None else ""
     lines = (
         f"{Decimal(ns).scaleb(-9):f} {' '.join(map(repr, numbers))}{unturned}\n"
-        for ns, numbers in zip(stamp[kept].tolist(), row[kept].tolist(), strict=True)
+        for ns, numbers in zip(stamp.tolist(), row.tolist(), strict=True)
     )
     folders.write_file(path, "".join(lines))

@@ -11,7 +11,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import NO_STAMP, FloatArray, TimeArray, known_rows
 from ..errors import ConfigError, RunError
 from ..filter.core import Record
 from ..filter.response import at_rest, follow, record_of
@@ -132,15 +132,13 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
 
 def _check_turned(name: str, source: Source, oriented: FloatArray, run: Run) -> None:
     """Whether a sensor tells the tool to be turned about as it is commanded to be."""
-    command, given = run.command.orientation, run.command.stamp
-    assert command is not None
-    known = np.flatnonzero(np.isfinite(command).all(axis=1) & (given != NO_STAMP))
-    known = known[np.argsort(given[known], kind="stable")]
-    seen = np.flatnonzero(np.isfinite(oriented).all(axis=1) & (source.stamp != NO_STAMP))
-    if not len(known) or not len(seen):
+    assert run.command.orientation is not None
+    given, commanded = known_rows(run.command.stamp, run.command.orientation)
+    stamp, seen = known_rows(source.stamp, oriented)
+    if not len(given) or not len(stamp):
         return
-    last = np.clip(np.searchsorted(given[known], source.stamp[seen], side="right") - 1, 0, None)
-    off = float(np.median(rotations.angle_between(oriented[seen], command[known[last]])))
+    last = np.clip(np.searchsorted(given, stamp, side="right") - 1, 0, None)
+    off = float(np.median(rotations.angle_between(seen, commanded[last])))
     if off > _ELSEWHERE:
         raise RunError(
             f"{source.label_for(name)}: it tells the tool to be turned {np.degrees(off):.0f}° from where it is"
