@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 
 from pumafuse.identification.batch import Batch
 from pumafuse.identification.trials import Trial
-from pumafuse.model.unit_response import unit_response
+from pumafuse.model.plants import unit_response
 
 STEPS = (0.008, -0.004, 0.002, 0.012)
 LENGTHS = (60, 41, 73, 25)

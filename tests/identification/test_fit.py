@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pumafuse import FirstOrder, SecondOrder
 from pumafuse.identification.fit import StepFit, fit_steps, flags
 from pumafuse.identification.trials import StepTrials, Trial
-from pumafuse.model.unit_response import unit_response
+from pumafuse.model.plants import unit_response
 from pumafuse.tuning.arms import Limits, Measured, NoiseModel, Recording
 from pumafuse.tuning.plain import plain_arm
 

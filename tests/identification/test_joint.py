@@ -14,7 +14,7 @@ from pumafuse.identification.fit import fit_steps
 from pumafuse.identification.joint import JointFit, fit_together
 from pumafuse.identification.paper import onset
 from pumafuse.identification.trials import Trial
-from pumafuse.model.unit_response import unit_response
+from pumafuse.model.plants import unit_response
 
 TIMES = np.arange(60) * 0.00563  # s, the paper's oscilloscope
 FIRST, SWINGING, DAMPED = (0.04, 0.0), (2 * 0.864 / 53.9, 53.9**-2), (0.06, 4e-4)

@@ -11,7 +11,7 @@ import pumafuse as pf
 from pumafuse.identification.fit import StepFit, fit_steps
 from pumafuse.identification.paper import fit_as_published, onset
 from pumafuse.identification.trials import Trial
-from pumafuse.model.unit_response import unit_response
+from pumafuse.model.plants import unit_response
 
 TIMES = np.arange(60) * 0.00563  # s
 SWINGING = (2 * 0.864 / 53.9, 53.9**-2)

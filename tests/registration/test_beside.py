@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pumafuse.registration.beside import later
+from pumafuse.registration.latencies import later
 from pumafuse.registration.motion import Motion
 
 

@@ -12,9 +12,8 @@ import pumafuse as pf
 from draws import OneDraw
 from pumafuse.simulation import reverting
 from pumafuse.simulation.motion import Motion, simulate_axis
-from pumafuse.simulation.sensing import measure
 from pumafuse.simulation.true_arm import TrueAxis
-from pumafuse.simulation.true_sensor import TrueSensor
+from pumafuse.simulation.true_sensor import TrueSensor, measure
 
 Floats = NDArray[np.float64]
 SD = 0.7

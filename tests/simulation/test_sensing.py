@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from pumafuse.logs.run import Source
 from pumafuse.simulation.motion import grid
-from pumafuse.simulation.sensing import measure, valid_times
-from pumafuse.simulation.true_sensor import Bursts, Outliers, TrueSensor
+from pumafuse.simulation.true_sensor import Bursts, Outliers, TrueSensor, measure, valid_times
 
 Floats = NDArray[np.float64]
 ROWS = 20_000

@@ -6,7 +6,6 @@ from functools import partial
 from pathlib import Path
 
 from ..simulation import simulate as simulation
-from ..simulation.campaign import TRIALS
 from ..simulation.scenario import Scenario
 from .many import report_failures, run_jobs
 from .screen import say
@@ -39,5 +38,5 @@ def _simulate(scenario: Scenario, seed: int, folder: Path, force: bool) -> tuple
     simulated = simulation.simulate(scenario, seed)
     simulation.write(simulated, folder, force)
     rows = sum(len(source.stamp) for source in simulated.run.sensors.values())
-    trials = simulated.trials.get(TRIALS, ())
+    trials = simulated.trials.get(simulation.TRIALS, ())
     return len(simulated.run.command.stamp), rows, len(trials)

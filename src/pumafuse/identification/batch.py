@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
-from ..model.unit_response import unit_response
+from ..model.plants import unit_response
 from .trials import Trial
 
 Order = Literal[1, 2]

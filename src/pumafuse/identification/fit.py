@@ -18,8 +18,7 @@ import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
-from ..model.plants import PLANTS, FirstOrder, SecondOrder
-from ..model.unit_response import unit_response
+from ..model.plants import PLANTS, FirstOrder, SecondOrder, unit_response
 from ..toml import Interval
 from ..tuning.arms import Arm, Limits, Measured, Recording
 from .batch import Batch, Order, sensitivity

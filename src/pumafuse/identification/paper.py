@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import FloatArray
-from ..model.unit_response import unit_response
+from ..model.plants import unit_response
 from .batch import sensitivity
 from .fit import Shape, StepFit, inverse, reached
 from .trials import Trial

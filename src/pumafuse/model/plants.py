@@ -14,13 +14,13 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray
 from ..toml import MOST, Interval, Positive
-from .unit_response import unit_response
 
 if TYPE_CHECKING:
     import control
 
 Delay = Annotated[float, msgspec.Meta(ge=0, le=1e4)]  # s
 Frequency = Annotated[float, msgspec.Meta(ge=1e-6, le=MOST)]  # rad/s; of a lower one the lag would overflow
+_TOGETHER = 0.3  # (T₁ − T₂)/(T₁ + T₂) of two poles below which their exponentials cancel
 
 
 class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid_unknown_fields=True):
@@ -101,8 +101,49 @@ class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_u
         return 2.0 * self.damping / self.natural_frequency
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
-        """Equations 6 and 9, and ζ = 1 between them; see :func:`.unit_response.unit_response`."""
+        """Equations 6 and 9, and ζ = 1 between them; see :func:`unit_response`."""
         return unit_response(np.asarray(time, dtype=np.float64), self.lag, self.natural_frequency**-2)
 
 
 PLANTS: TypeAlias = FirstOrder | SecondOrder
+
+
+def unit_response(time: FloatArray | float, q: FloatArray | float, p: FloatArray | float) -> FloatArray:
+    """Unit step response c(t) of 1/(p s² + q s + 1), 0 before t = 0; all three broadcast, p ≥ 0 and q > 0.
+
+    Equations 4, 6 and 9, joined at ζ = 1, where 6 and 9 divide by √|ζ² − 1| and lose all digits.
+    """
+    half, p = 0.5 * np.asarray(q), np.asarray(p)
+    square = half * half - p
+    root = np.sqrt(np.abs(square))
+    over_damped, apart = square >= 0.0, root > _TOGETHER * half
+    forms = (over_damped & apart, _apart), (over_damped & ~apart, _together), (~over_damped, _swinging)
+    needed = [(plants, form) for plants, form in forms if plants.any()]
+    time, half, root, p, *masks = np.broadcast_arrays(time, half, root, p, *(plants for plants, _ in needed))
+    found, begun = np.zeros(time.shape), time > 0.0
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # where T₂ or the swing is next to nothing
+        for plants, (_, form) in zip(masks, needed, strict=True):
+            chosen = plants & begun
+            found[chosen] = form(time[chosen], half[chosen], root[chosen], p[chosen])
+    return found
+
+
+def _apart(t: FloatArray, half: FloatArray, root: FloatArray, p: FloatArray) -> FloatArray:
+    """Over-damped: time constants T₁ > T₂ are q/2 ± √(q²/4 − p); T₂ may be 0."""
+    slow = half + root
+    fast = p / slow
+    sooner = np.where(fast > 0.0, fast * np.exp(-t / fast), 0.0)
+    return 1.0 - (slow * np.exp(-t / slow) - sooner) / (2.0 * root)
+
+
+def _together(t: FloatArray, half: FloatArray, root: FloatArray, p: FloatArray) -> FloatArray:
+    """About ζ = 1: e^(−decay) cosh(turn) would overflow, so that the slow pole is taken out of both terms."""
+    turn = root * t / p
+    sinhc = np.where(turn > 0.0, -np.expm1(-2.0 * turn) / (2.0 * turn), 1.0)
+    return 1.0 - np.exp(-t / (half + root)) * (0.5 * (1.0 + np.exp(-2.0 * turn)) + half * t / p * sinhc)
+
+
+def _swinging(t: FloatArray, half: FloatArray, root: FloatArray, p: FloatArray) -> FloatArray:
+    """Under-damped: e^(−decay) and a swing."""
+    decay, turn = half * t / p, root * t / p
+    return 1.0 - np.exp(-decay) * (np.cos(turn) + decay * np.sinc(turn / np.pi))

@@ -1,18 +1,34 @@
-"""How late sensors are, each beside the arm or beside another one."""
+"""How late sensors are, each beside the arm or beside another one that saw the same tool.
+
+Beside another one by what both tell, never as a difference of lags: what the arm does not do as commanded is the same
+to both, and so costs nothing. Frames and scales that are slightly wrong leave an affine function of the position, a
+marker that is leaves R m: both are found beside the time.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ..arrays import FloatArray
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..arrays import BoolArray, FloatArray, median
 from ..fusion.config import FusionConfig
 from ..fusion.placing import Placing
 from ..logs.run import Run
-from .beside import later
 from .configured import placed_by
+from .intervals import blocks, inverse
 from .motion import Answer, Motion, Plant
 from .register import Quantity, Registration
+from .solve import MEDIAN, curvature, weights
 from .sources import measured, motion_of
+from .start import despiked
+
+_SPEED = 0.05  # s, over which a velocity is taken
+_ROUNDS = 10  # of the weights and of the time
+_FEWEST = 60  # rows
+_UNKNOWN = 0.05  # s, of half an interval
+_ROUNDING = 1e-12  # m
 
 
 def latencies_of(
@@ -83,3 +99,65 @@ def _sum(one: Quantity, by: float, *unsure: Quantity) -> Quantity:
     """A number moved by another one, which is as unsure as some others are together."""
     value, half = one.value + by, sum(each.half for each in (one, *unsure))
     return Quantity(value, (value - half, value + half))
+
+
+def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) -> Quantity | None:
+    """By how much the stamps of one sensor's rows are later than those of another's [s], with its 95 % interval.
+
+    Args:
+        first: What one sensor tells in the base's frame of the point that the other one sees, and, where it is known,
+            how the tool is turned, one entry a run.
+        other: Where the other one sees that point, likewise.
+        about: By how much, roughly [s].
+
+    Returns:
+        None where they have too little in common, or nothing moves, or it is not known to 50 ms.
+    """
+    pairs = [(_Path(a.valid()), b.valid()) for a, b in zip(first, other, strict=True)]
+    pairs = [(path, b.only(path.holds(b.time - about))) for path, b in pairs]
+    pairs = [(path, b) for path, b in pairs if len(b.time) >= _FEWEST]
+    if not pairs:
+        return None
+    late, weight = about, np.ones(sum(len(b.time) for _, b in pairs))
+    half = np.inf
+    for _ in range(_ROUNDS):
+        parts = [path.beside(b, late) for path, b in pairs]
+        apart, slope = (np.concatenate(part) for part in zip(*parts, strict=True))
+        told = blocks(slope, apart, weight, weight)
+        step = inverse(told.information.sum(axis=0)) @ told.score.sum(axis=0)
+        left = apart - slope @ step
+        half = float(blocks(slope, left, curvature(weight), weight).half_widths(np.eye(len(step))[-1:])[0])
+        late += float(step[-1])
+        far = np.linalg.norm(left, axis=1)
+        weight = weights(far, max(median(far) / MEDIAN, _ROUNDING))
+    return Quantity(late, (late - half, late + half)) if 0.0 < half < _UNKNOWN else None
+
+
+class _Path:
+    """What the first sensor tells of one run, at any instant."""
+
+    def __init__(self, first: Motion) -> None:
+        turned = [] if first.quaternion is None else [Rotation.from_quat(first.quaternion).as_matrix().reshape(-1, 9)]
+        self._time, self._told = first.time, np.hstack([despiked(first.position), *turned])
+
+    def holds(self, time: FloatArray) -> BoolArray:
+        """Whether there are velocities at some instants, also when they are shifted a little."""
+        first, last = (self._time[0], self._time[-1]) if len(self._time) else (np.inf, -np.inf)
+        return (time >= first + 2.0 * _SPEED) & (time <= last - 2.0 * _SPEED)
+
+    def _at(self, time: FloatArray) -> FloatArray:
+        columns: list[FloatArray] = [np.interp(time, self._time, one) for one in self._told.T]
+        return np.column_stack(columns)
+
+    def beside(self, other: Motion, late: float) -> tuple[FloatArray, FloatArray]:
+        """How far the other sensor's rows are off [m], (n, 3), and the slopes of that, (n, 3, k): the last is of time.
+
+        Before it are those of what is affine, and of the marker.
+        """
+        time = other.time - late
+        there, ahead, behind = self._at(time), self._at(time + _SPEED), self._at(time - _SPEED)
+        place, turned = there[:, :3], there[:, 3:].reshape(len(there), 3, -1)
+        affine = np.column_stack([place - place.mean(axis=0), np.ones(len(place))])
+        affine = np.einsum("ij,nk->nijk", np.eye(3), affine).reshape(len(place), 3, -1)
+        speed = (behind - ahead)[:, :3, None] / (2.0 * _SPEED)
+        return other.position - place, np.concatenate([affine, turned, speed], axis=-1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,22 +13,23 @@ import numpy as np
 import pyarrow as pa
 
 from .. import folders, toml
-from ..arrays import FloatArray
+from ..arrays import FloatArray, TimeArray
 from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, PROCESS, FusionConfig, of_axis
 from ..logs import save, tables
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
-from ..units import MM, SCREEN
-from . import campaign, sensing
+from ..units import MM, SCREEN, of_kind
 from .motion import POINTS, Motion, grid, simulate_axis
 from .scenario import Scenario
-from .trajectory import PathFromFile
+from .trajectory import PathFromFile, Steps
+from .true_sensor import measure, valid_times
 
-SCENARIO = "scenario.toml"
-MANIFEST = "run.toml"
+SCENARIO, MANIFEST = "scenario.toml", "run.toml"
+TRIALS, SAMPLES = "trials.csv", "samples.csv"  # of a campaign, as `identify` reads them
 _ALWAYS_WRITTEN = frozenset({SCENARIO, MANIFEST, "fusion.toml", ARM_FILE})
 _PATHS = ("path.csv", "path.csv.gz", "path.parquet")
+_BEFORE = 0.05  # s of rest that a trial's samples begin with
 
 
 @dataclass(frozen=True, repr=False)
@@ -86,9 +87,9 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
     for name, sensor in scenario.sensors.items():
         measured = axes if sensor.axes is None else tuple(axis for axis in axes if axis in sensor.axes)
         if measured:
-            valid = sensing.valid_times(sensor, instants, _stream(seed, "rate", name))
+            valid = valid_times(sensor, instants, _stream(seed, "rate", name))
             true = _logged(scenario, {axis: motions[axis].at(valid) for axis in measured}, in_axes=bool(sensor.axes))
-            source = sensing.measure(sensor, name, valid, true, _stream(seed, "sensor", name))
+            source = measure(sensor, name, valid, true, _stream(seed, "sensor", name))
             sensors[name] = _rounded(source, scales)
     parts = scenario.reference.rows_per_command
     rows = instants[np.rint(np.arange(count * parts) * (POINTS / parts)).astype(np.int64)]
@@ -110,7 +111,44 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
         frame=scenario.frame,
         kinds={axis: kind for axis, kind in scenario.arm.kind_of.items() if axis in start},
     )
-    return Simulated(scenario, seed, run, scenario.config, campaign.cut_trials(scenario, tick, commands, sensors))
+    return Simulated(scenario, seed, run, scenario.config, _step_trials(scenario, tick, commands, sensors))
+
+
+def _step_trials(
+    scenario: Scenario, tick: TimeArray, commands: Mapping[str, FloatArray], sensors: Mapping[str, Source]
+) -> dict[str, pa.Table]:
+    """The tables ``trials.csv`` and ``samples.csv`` of a step campaign, as `identify` reads them; else none.
+
+    Commands [m or rad] were given at each ``tick``, int64 ns, (n,); the scope is among the sensors.
+    """
+    campaign = scenario.trajectory
+    if not isinstance(campaign, Steps):
+        return {}
+    scope, period = sensors[campaign.scope], scenario.arm.update_period
+    valid = scope.stamp / 1e9 - scenario.sensors[campaign.scope].latency
+    pause = campaign.ticks_between(period)
+    trials, samples = list[pa.Table](), list[pa.Table]()
+    for number, at in enumerate(range(pause, len(tick), pause), 1):
+        axis = next(axis for axis, command in commands.items() if command[at] != command[at - 1])
+        step, screen = float(commands[axis][at] - commands[axis][at - 1]), scenario.arm.screen_of(axis)
+        kind = scenario.arm.axes[axis].kind
+        since = valid - tick[at] / 1e9
+        inside = (since >= -_BEFORE) & (since <= campaign.window)
+        trial = {
+            "trial": number,
+            "axis": axis,
+            of_kind("step_mm", kind): round(step * screen.scale, 6),
+            of_kind("speed_m_s", kind): round(abs(step) / period * screen.fast_scale, 6),
+            "direction": "up" if step > 0.0 else "down",
+        }
+        sampled: dict[str, Sequence[int] | FloatArray] = {
+            "trial": [number] * int(inside.sum()),
+            "time_s": np.round(since[inside], 9),
+            of_kind("position_mm", kind): np.round(scope.values[axis][inside] * screen.scale, 6),
+        }
+        trials.append(pa.Table.from_pylist([trial]))
+        samples.append(pa.table(sampled))
+    return {TRIALS: pa.concat_tables(trials), SAMPLES: pa.concat_tables(samples)}
 
 
 def check_writable(folder: Path, force: bool) -> None:
@@ -146,7 +184,7 @@ def _files_of(folder: Path) -> set[str]:
         return set(_ALWAYS_WRITTEN)
     sources = [manifest.get("command"), manifest.get("reference"), *manifest.get("sensors", {}).values()]
     files = {str(source["file"]) for source in sources if source}
-    return {*_ALWAYS_WRITTEN, campaign.TRIALS, campaign.SAMPLES, *_PATHS, *files}
+    return {*_ALWAYS_WRITTEN, TRIALS, SAMPLES, *_PATHS, *files}
 
 
 def _logged(scenario: Scenario, moved: Mapping[str, FloatArray], *, in_axes: bool = False) -> dict[str, FloatArray]:
