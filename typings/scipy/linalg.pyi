@@ -1,6 +1,7 @@
 import numpy as np
 import numpy.typing as npt
 
+def block_diag(*arrs: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]: ...
 def expm(A: npt.ArrayLike) -> npt.NDArray[np.float64]: ...
 def solve_triangular(
     a: npt.NDArray[np.float64], b: npt.NDArray[np.float64], *, lower: bool

@@ -74,16 +74,6 @@ class Batch:
         """Some of the rows, repeated where an index is repeated."""
         return Batch(self.time[rows], self.position[rows], self.weight[rows], self.count[rows])
 
-    @property
-    def span(self) -> FloatArray:
-        """Time of each last sample [s], (R,)."""
-        return self.time.max(axis=1)
-
-    @property
-    def spacing(self) -> FloatArray:
-        """Mean time between samples [s], (R,)."""
-        return (self.span - self.time[:, 0]) / (self.count - 1.0)
-
     def project(self, values: FloatArray) -> FloatArray:
         """Weighted values (R, m) without what a free zero explains."""
         mean = np.sum(np.where(self.weight > 0.0, values, 0.0), axis=1) / self.count
@@ -140,8 +130,9 @@ class Batch:
 
         Rows that share a plant keep delays of their own.
         """
-        most = float(self.span.max())
-        low = np.array([0.0, 1e-3 * float(self.spacing.min()), 0.0])
+        end = self.time.max(axis=1)
+        most, spacing = float(end.max()), (end - self.time[:, 0]) / (self.count - 1.0)
+        low = np.array([0.0, 1e-3 * float(spacing.min()), 0.0])
         high = np.array([most, 20.0 * most, (5.0 * most) ** 2])
         found = self.point(np.clip(start, low, high))
         rows, damping = np.arange(len(start)), np.full(len(start) // size, 1e-3)

@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from importlib.metadata import version
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -181,9 +180,8 @@ def identify(
         if one.trial.axis in axes
     }
     left_out = {trial: why for axis in axes.values() for trial, why in axis.left_out.items()}
-    unknown = None, None
-    own: dict[str, tuple[float | None, float | None]] = {
-        trial.name: (delay, gain)
+    own: dict[str, dict[str, float]] = {
+        trial.name: {"common_delay": delay, "common_gain": gain}
         for one in commons.values()
         for trial, delay, gain in zip(one.trials, one.delay.tolist(), one.gain.tolist(), strict=True)
     }
@@ -191,8 +189,21 @@ def identify(
     factors = anova.factors_of([one.trial for one in used], period, kind)
     performance = anova.performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance, kind)
     fastest = max(one.trial.speed_at(period) for one in used)
-    found = Identification(
-        arm=msgspec.structs.replace(arm, validity=anova.validity(performance, fastest, kind)),
+    provenance = {
+        "made_by": f"pumafuse identify {version('pumafuse')}",
+        "trials": {axis: one.trials for axis, one in axes.items()},
+        "left_out": left_out,
+        "order": {axis: one.choice.why for axis, one in axes.items()},
+        "delay": one_delay,
+        "delay_spread_ms": {axis: round(one.delay_spread * units.MS, 2) for axis, one in axes.items()},
+        "gain": {axis: one.gain_words for axis, one in axes.items()},
+        "validity": {one.factor: one.verdict for one in performance},
+        "samples": "all" if samples is None else samples,
+        "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
+    }
+    validity = anova.validity(performance, fastest, kind)
+    return Identification(
+        arm=_rounded(msgspec.structs.replace(arm, validity=validity, provenance=provenance)),
         method="published" if paper else "fitted",
         samples=samples,
         tolerance=tolerance,
@@ -206,8 +217,7 @@ def identify(
                 onset=one.onset if np.isfinite(one.onset) else None,
                 first=_order_fit(one.first, trial, usual[trial.axis]),
                 second=_order_fit(one.second, trial, usual[trial.axis]),
-                common_delay=own.get(trial.name, unknown)[0],
-                common_gain=own.get(trial.name, unknown)[1],
+                **own.get(trial.name, {"common_delay": None, "common_gain": None}),
                 combined_rms=rms.get(trial.name),
                 left_out=left_out.get(trial.name),
             )
@@ -224,8 +234,6 @@ def identify(
         performance=performance,
         notes=[*trials.notes, *notes],
     )
-    arm = msgspec.structs.replace(found.arm, provenance=_provenance(found))
-    return msgspec.structs.replace(found, arm=_rounded(arm))
 
 
 def _fit_all(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[Fitted]:
@@ -270,23 +278,6 @@ def _arm(
         models = {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in models.items()}
         words = "one delay" + ("" if p is None else f": the axes do not differ (Welch's test, p = {p:.2g})")
     return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=models), words
-
-
-def _provenance(found: Identification) -> dict[str, Any]:
-    """What the arm's file says of where its numbers come from."""
-    axes, published = found.axes, found.method == "published"
-    return {
-        "made_by": f"pumafuse identify {version('pumafuse')}",
-        "trials": {axis: one.trials for axis, one in axes.items()},
-        "left_out": {trial: why for one in axes.values() for trial, why in one.left_out.items()},
-        "order": {axis: one.choice.why for axis, one in axes.items()},
-        "delay": found.one_delay,
-        "delay_spread_ms": {axis: round(one.delay_spread * units.MS, 2) for axis, one in axes.items()},
-        "gain": {axis: one.gain_words for axis, one in axes.items()},
-        "validity": {one.factor: one.verdict for one in found.performance},
-        "samples": "all" if found.samples is None else found.samples,
-        "method": "delay and gain read off each trial (--paper)" if published else "all parameters fitted",
-    }
 
 
 def _rounded(arm: ArmModel) -> ArmModel:

@@ -198,11 +198,10 @@ def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[Ax
             time, value = rows.time[here], rows.value[here, number] - first
             recording = Recording(given, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
             measured = Measured([recording], arm.update_period, [source], arm.axes[axis])
-            notes = [*jumps, *segment.notes] if not found else []
-            one, trace = _verified(measured, run, axis, arm)
             counts = {"used" if word == Outcome.FUSED.word else word: n for word, n in segment.counts[source].items()}
-            commands = dict(segment.command_counts)
-            found.append((msgspec.structs.replace(one, commands=commands, rows=counts, notes=notes), trace))
+            notes = [*jumps, *segment.notes] if not found else []
+            counted = {"commands": dict(segment.command_counts), "rows": counts}
+            found.append(_verified(measured, run, axis, arm, counted, notes))
     return found
 
 
@@ -218,8 +217,10 @@ def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
     return replace(run, sensors={name: sources[name] for name in sensors}, reference=None)
 
 
-def _verified(measured: Measured, run: Run, axis: str, arm: ArmModel) -> tuple[AxisVerification, Trace]:
-    """One axis of a run by one source; which rows were used, and what was wrong with the run, is yet to be told."""
+def _verified(
+    measured: Measured, run: Run, axis: str, arm: ArmModel, counted: Mapping[str, dict[str, int]], notes: list[str]
+) -> tuple[AxisVerification, Trace]:
+    """One axis of a run by one source, of which the rows are ``counted``."""
     model, own = arm.axes[axis], Arm.of(arm.axes[axis], arm.delay_of(axis))
     recovery = own.recovery or RECOVERY
     farthest = abs(measured.recordings[0].start) + np.abs(measured.responses(own)[0]).max()
@@ -253,11 +254,10 @@ def _verified(measured: Measured, run: Run, axis: str, arm: ArmModel) -> tuple[A
         recovery=recovery,
         best_in_class=best,
         outlying=count - len(recording.time),
-        commands={},
-        rows={},
+        **counted,
         holds=as_it_is.fit >= _HOLDS,
         verdict=_verdict(as_it_is, lag, best) + _recovers(as_it_is, recovering, recovery, model.kind),
-        notes=[],
+        notes=notes,
     )
     return verification, trace
 

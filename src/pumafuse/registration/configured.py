@@ -77,9 +77,9 @@ def configuration(
     }
     known = {axis: one for axis, one in config.arm.axes.items() if axis in guessed.arm.axes}
     arm = msgspec.structs.replace(guessed.arm, delay=config.arm.delay, axes={**guessed.arm.axes, **known})
-    start = Start(offset_sd=offsets)
-    guessed = msgspec.structs.replace(guessed, tool=config.tool, robot=config.robot)
-    return msgspec.structs.replace(guessed, arm=arm, sensors=sensors, start=start)
+    return msgspec.structs.replace(
+        guessed, arm=arm, sensors=sensors, start=Start(offset_sd=offsets), tool=config.tool, robot=config.robot
+    )
 
 
 def placed_by(

@@ -44,15 +44,10 @@ class Motion(NamedTuple):
 
 
 class Plant(NamedTuple):
-    """How the arm answers.
+    """How the arm answers."""
 
-    Attributes:
-        delay: Dead time [s], the sensor's latency with it.
-        time_constant: τ of a first-order plant [s].
-    """
-
-    delay: float
-    time_constant: float
+    delay: float  # dead time [s], the sensor's latency with it
+    time_constant: float  # τ of a first-order plant [s]
 
     def changed(self, delay: float, share: float) -> Plant:
         """With a dead time that is longer [s], and a time constant that is longer by a small share."""
@@ -72,14 +67,10 @@ class Poses(NamedTuple):
 
 
 class Answer:
-    """Where the tool is by the commands of several runs whenever a sensor measures: all rows after one another.
-
-    Attributes:
-        turns: Whether the orientation is commanded.
-    """
+    """Where the tool is by the commands of several runs whenever a sensor measures: all rows after one another."""
 
     def __init__(self, command: Sequence[Motion], time: Sequence[FloatArray]) -> None:
-        self.turns = all(one.quaternion is not None for one in command)
+        self.turns = all(one.quaternion is not None for one in command)  # whether the orientation is commanded
         self._time = time
         self._start = [float(one.time[0]) for one in command]
         self._given: list[TimeArray] = [np.round((one.time - one.time[0]) * _NS).astype(np.int64) for one in command]

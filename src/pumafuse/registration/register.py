@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray, median
@@ -157,12 +158,9 @@ def within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
 
 
 def without_gaps(given: FloatArray, sensor: Motion, settling: float) -> Motion:
-    """What a sensor told, but for gaps of the commands: where the tool was told to be then is not known.
+    """What a sensor told, but for gaps of the commands, whose instants are ``given`` [s], (n,).
 
-    Args:
-        given: When commands came [s], (n,).
-        sensor: What it told.
-        settling: For how long [s] after a gap the tool may still move as was told in it.
+    Where the tool was told to be in a gap is not known; it may move as was told for ``settling`` [s] after it.
     """
     interval = np.diff(given)
     usual, lost = median(interval), np.zeros(len(sensor.time), dtype=np.bool_)
@@ -259,7 +257,7 @@ def _begun(
 
 
 def _told_as(command: list[Motion], begin: Callable[..., Fit], spread: float) -> tuple[list[Motion], Fit, list[Found]]:
-    """The commands as their orientations are to be read, and a first fit.
+    """The commands as their orientations are to be read, a first fit, and that they are read otherwise.
 
     Where the path alone does not tell how the sensor is turned, its marker may: then it begins from turns all around.
     """
@@ -291,17 +289,9 @@ def _coarse(
     sign: float = 1.0,
     first: FloatArray = _AS_IT_IS,
 ) -> Fit:
-    """A fit to the positions of a few rows, scale free.
+    """A fit to the positions of a few rows about a ``mean`` [m], scale free.
 
-    Args:
-        command: Of all runs.
-        sensor: Likewise.
-        mean: A point in the middle of what the sensor measures [m].
-        about: How it follows by its speeds.
-        marker: As far as it is known.
-        fix_marker: Whether it stays.
-        sign: −1: the sensor is mirrored.
-        first: By which to turn the rotation that fits the path, to begin elsewhere.
+    A sensor of ``sign`` −1 is mirrored; ``first`` turns the rotation that fits the path, to begin elsewhere.
     """
     plant = _plant(about.lag)
     rows = rows_of(command, sensor, mean, attitude=False)
@@ -341,24 +331,12 @@ def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, own: bool) -> FloatArray:
     """The steps that are allowed, as columns, (17, k).
 
-    Args:
-        rotation: Axes about which the frame may turn, (3, r).
-        marker: Directions in which the marker may move, (3, m).
-        turn: Whether the marker may turn.
-        scale: Whether the scale is free.
-        own: Whether orientations have a plant of their own.
+    The frame turns about axes (3, r), the marker moves in directions (3, m), and orientations have a plant of their
+    ``own``, or that of positions.
     """
-    plants = np.eye(4) if own else np.vstack([np.eye(2), np.eye(2)])
-    blocks = [
-        (ROTATION, rotation), (CENTRE, np.eye(3)), (MARKER, marker), (TURN, np.eye(3) if turn else np.zeros((3, 0))),
-        (SCALE, np.eye(1) if scale else np.zeros((1, 0))), (slice(POSITION.start, ANGLE.stop), plants),
-    ]  # fmt: skip
-    columns = list[FloatArray]()
-    for where, block in blocks:
-        column = np.zeros((SIZE, block.shape[1]))
-        column[where] = block
-        columns.append(column)
-    return np.hstack(columns)
+    plants = np.eye(4) if own else np.tile(np.eye(2), (2, 1))
+    of = rotation, np.eye(3), marker, np.eye(3)[:, : 3 * turn], np.eye(1)[:, : int(scale)], plants
+    return block_diag(*of)  # in the order of the places in a step
 
 
 def _unit_of(fit: Fit, ahead: float, loosely: bool) -> tuple[float, list[Found]]:
@@ -530,13 +508,7 @@ def _vector(of: FloatArray) -> Vector:
     return x, y, z
 
 
-def _told(
-    fit: Fit,
-    begin: _Begin,
-    loose: FloatArray,
-    blind: FloatArray,
-    own: bool,
-) -> Registration:
+def _told(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray, own: bool) -> Registration:
     """The numbers with their intervals."""
     state = fit.state
     values, slopes = _numbers(state, begin.mean)

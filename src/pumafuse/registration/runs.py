@@ -153,7 +153,8 @@ def register(
     found = {name: _registered(whole, name, config, fixed="marker" in fixed) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
     placed |= {name: _without_frame(one) for name, one in placed.items() if one.along_base}
-    placed |= {name: _without_place(placed[name]) for name in along_base if name in placed}
+    for name in placed.keys() & along_base:
+        placed[name] = msgspec.structs.replace(placed[name], frame=None, marker=None)
     said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
     if not placed:
         raise RunError("; ".join(note for mine in said.values() for note in mine))
@@ -262,15 +263,9 @@ def _not_registered(runs: Sequence[Run], name: str, instead: str) -> str:
 
 def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, fixed: bool) -> Registration:
     """The registration of one sensor by the runs that have it."""
-    pairs = [(motion_of(run.command), measured(run.sensors[name])) for run in runs if name in run.sensors]
+    told, sensor = _apart(runs, name)
     marker = None if config is None or name not in config.sensors else config.sensors[name].marker
-    command, sensor = [told for told, _ in pairs], [seen for _, seen in pairs]
-    return registered(command, sensor, marker=marker, fix_marker=fixed)
-
-
-def _without_place(one: Registration) -> Registration:
-    """The same of a sensor that stands where the robot does."""
-    return msgspec.structs.replace(one, frame=None, marker=None)
+    return registered(told({}), sensor, marker=marker, fix_marker=fixed)
 
 
 def _without_frame(one: Registration) -> Registration:
@@ -282,15 +277,14 @@ def _without_frame(one: Registration) -> Registration:
 def _details(one: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:
     """What was found of one sensor."""
     names = [found.finding.value for found in one.findings]
-    if one.position is None:
-        return RegisteredSensor(findings=names, notes=notes)
+    lag = one.position and one.position.lag
     return RegisteredSensor(
         frame=one.frame,
         marker=one.marker,
-        lag=one.position.lag.value,
-        lag_ci95=one.position.lag.ci95,
-        latency=None if latency is None else latency.value,
-        latency_ci95=None if latency is None else latency.ci95,
+        lag=lag and lag.value,
+        lag_ci95=lag and lag.ci95,
+        latency=latency and latency.value,
+        latency_ci95=latency and latency.ci95,
         rms=one.rms,
         angular_rms=one.rms_rotation,
         rows=one.rows,

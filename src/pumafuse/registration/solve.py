@@ -111,13 +111,7 @@ class Fit(NamedTuple):
 
 
 def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
-    """The robust least squares from a start.
-
-    Args:
-        rows: What was measured.
-        state: The start.
-        free: The steps that are allowed, as columns, (17, k).
-    """
+    """The robust least squares from a start; the steps that are allowed are columns, (17, k)."""
     off = residual(rows, state)
     for _ in range(_STEPS):
         noise = off.noise()
@@ -155,23 +149,16 @@ def _better(rows: Rows, state: State, step: FloatArray, cost: float, noise: Floa
 
 
 def _normal(rows: Rows, state: State, off: Off, noise: FloatArray, free: FloatArray, *, expected: bool) -> Blocks:
-    """The information of the free steps and the slope of half the sum, of each block of rows.
-
-    Args:
-        rows: What was measured.
-        state: Where.
-        off: How far rows are off there.
-        noise: Of each block of the residual.
-        free: The steps that are allowed.
-        expected: Whether the information is that of Cauchy's curvature, of which intervals are made, or the larger one
-            of Gauss and Newton, which leads down more safely.
-    """
-    inner = [slope @ free for slope in slopes(rows, state, off.poses)]
-    return tell(inner, off.blocks, noise, expected=expected)
+    """The information of the free steps and the slope of half the sum, of each block of rows."""
+    return tell([one @ free for one in slopes(rows, state, off.poses)], off.blocks, noise, expected=expected)
 
 
 def tell(slope: Sequence[FloatArray], off: Sequence[FloatArray], noise: FloatArray, *, expected: bool) -> Blocks:
-    """What rows tell of a step that are so far off and change so with it, positions and orientations together."""
+    """What rows tell of a step that are so far off and change so with it, positions and orientations together.
+
+    The information is that of Cauchy's curvature where it is the ``expected`` one, of which intervals are made; else
+    the larger one of Gauss and Newton, which leads down more safely.
+    """
     parts = list[Blocks]()
     for inner, one, sd in zip(slope, off, noise.tolist(), strict=True):
         weight = weights(_length(one), sd)
