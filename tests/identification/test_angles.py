@@ -8,14 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
 import pumafuse as pf
 from pumafuse.identification.anova import performances, validity
 from pumafuse.identification.trials import StepTrials, TrialsError
-from pumafuse.units import Kind, from_si, of_kind
+from pumafuse.units import Kind, of_kind
 from pumafuse.views import report
 from refusals import one_line
 
@@ -106,14 +105,6 @@ def test_json_has_the_same_numbers_under_the_names_of_its_kind(found: dict[str, 
         assert means[0] == pytest.approx(means[1], rel=1e-7)
         assert "mm" not in other["verdict"]
     assert "deg, second" in angle["axes"]["elbow"]["choice"]["why"]
-
-
-def test_json_of_lengths_is_as_the_names_in_the_code_say(found: dict[str, pf.Identification]) -> None:
-    """To the last byte: nothing is renamed, and only units are converted."""
-    tree = from_si(msgspec.to_builtins(found["_mm"], enc_hook=float))
-    tree["arm"]["provenance"] = found["_mm"].arm.provenance
-    encoded = msgspec.json.Encoder(decimal_format="number").encode(tree)
-    assert found["_mm"].to_json() == msgspec.json.format(encoded, indent=2).decode()
 
 
 def test_provenance_is_as_in_the_file(found: dict[str, pf.Identification]) -> None:

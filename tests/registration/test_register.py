@@ -1,6 +1,5 @@
 """Registration: frame, marker and lag of simulated set-ups with known truth, and what it names."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,9 +30,12 @@ def same_branch(vector: np.ndarray, near: tuple[float, ...]) -> np.ndarray:
 
 @pytest.mark.parametrize("orientation", [True, False])
 def test_a_set_up_is_found(orientation: bool) -> None:
-    """Frames and markers anywhere: rotation to 0.05 degrees, marker to 0.3 mm, lag to 0.3 ms, from a bad start on."""
-    for seed in range(3):
-        setup = Setup(seed, orientation=orientation, shared=not orientation)
+    """Frames and markers anywhere: rotation to 0.05 degrees, marker to 0.3 mm, lag to 0.3 ms, from a bad start on.
+
+    From a short time constant on the search of the last one would be stuck among the steps of held commands.
+    """
+    for seed in (0, 1, 2, 51):
+        setup = Setup(seed, orientation=orientation, shared=not orientation, seconds=20.0)
         found = registered(*([one] for one in setup.run()))
         assert found.findings == ()
         assert found.frame is not None and found.marker is not None and found.position is not None
@@ -311,15 +313,6 @@ def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: boo
         assert found.position.lag.value == pytest.approx(setup.lags[0], abs=1e-3)
 
 
-def test_a_short_time_constant_is_not_begun_with() -> None:
-    """A set-up of which the lag was wrong by 0.5 ms, as the search was stuck among the steps of held commands."""
-    setup = Setup(51)
-    found = registered(*([one] for one in setup.run()))
-    assert found.position is not None
-    assert found.position.lag.value == pytest.approx(setup.lags[0], abs=1e-4)
-    assert found.position.time_constant.value == pytest.approx(setup.plants[0][1], abs=1e-3)
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("orientation", [True, False])
 def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None:
@@ -344,15 +337,6 @@ def test_a_marker_that_is_known_stays() -> None:
         assert found.marker is not None and found.frame is not None
         assert found.marker.at == place.at
         np.testing.assert_allclose(found.frame.at, setup.at, atol=3e-3)
-
-
-def test_the_lag_is_that_of_the_arm_and_the_latency_together() -> None:
-    """One sensor tells their sum, to 0.3 ms."""
-    setup = Setup(4)
-    command, sensor = setup.run()
-    found = registered([command], [sensor])
-    assert found.position is not None
-    assert found.position.lag.value == pytest.approx(sum(setup.plants[0]) + setup.latency, abs=3e-4)
 
 
 def test_along_the_one_axis_of_a_tool_the_frame_makes_up_for_the_marker() -> None:
@@ -392,33 +376,6 @@ def test_a_tracker_in_a_frame_of_its_own() -> None:
     np.testing.assert_allclose(found.marker.at, [0.0, -0.064, 0.0], atol=1e-4)
     assert found.marker.at_ci95[2] == (-np.inf, np.inf)
     assert found.position.lag.value == pytest.approx(0.070, abs=3e-4)
-
-
-POSES = Path(__file__).parents[3] / "shared" / "data" / "pose-virtual"
-
-
-@pytest.mark.parametrize("name", ["inspect1", "wander1"])
-@pytest.mark.parametrize("sensor", ["mocap", "tracker"])
-def test_an_arm_whose_own_kinematics_are_wrong(name: str, sensor: str) -> None:
-    """A physical simulation, the arm 0.5 mm and 0.2 degrees off: rotation to 0.35 degrees, marker to 2.5 mm."""
-    if not POSES.exists():
-        pytest.skip("the recordings of pose-virtual are no part of the project")
-    run = POSES / name
-    true = json.loads((run / "truth.json").read_text(encoding="utf-8"))["sensors"][sensor]
-    motions = [motion(run / f"{one}.csv.gz") for one in ("commands", sensor)]
-    found = registered([motions[0]], [motions[1]])
-    assert found.findings == ()
-    assert found.frame is not None and found.marker is not None
-    assert degrees(found.frame, Rotation.from_rotvec(true["base_from_sensor_rotvec_deg"], degrees=True)) < 0.35
-    np.testing.assert_allclose(np.array(found.marker.at) * 1e3, true["marker_mm"], atol=2.5)
-
-
-def motion(path: Path) -> Motion:
-    table = np.genfromtxt(path, delimiter=",", names=True)
-    names = table.dtype.names or ()
-    position = np.stack([table[one] for one in ("x_mm", "y_mm", "z_mm")], axis=-1) / 1e3
-    turned = np.stack([table[one] for one in ("qx", "qy", "qz", "qw")], axis=-1) if "qw" in names else None
-    return Motion(table["time_s"], position, turned)
 
 
 def rests_and_moves(period: float, late: float) -> tuple[Motion, Motion]:

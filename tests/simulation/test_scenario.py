@@ -179,14 +179,6 @@ def test_a_filter_table_changes_only_what_it_names(
     assert (changed.sensors, changed.process, changed.start) == (plain.sensors, plain.process, plain.start)
 
 
-def test_a_path_with_a_hole_is_refused(tmp_path: Path) -> None:
-    """Named with the scenario, when that is loaded."""
-    (tmp_path / "path.csv").write_text("time_s,radial_mm\n0,0\n1,5\n2,50,9\n3,5\n")
-    path = '[trajectory]\nkind = "path"\nfile = "path.csv"\naxes = ["radial"]\n'
-    with pytest.raises(pf.ConfigError, match=r"scenario\.toml: .*1 line left out"):
-        load(tmp_path, HEAD + ARM + path + SENSOR)
-
-
 @pytest.mark.parametrize("axis", ["file", "start"])
 def test_an_axis_that_run_toml_could_not_tell_is_refused(axis: str, tmp_path: Path) -> None:
     """Before anything is simulated."""

@@ -198,37 +198,6 @@ def test_random_chains(tmp_path_factory: pytest.TempPathFactory, chain: list[Giv
         np.testing.assert_allclose(jacobian[:, 3:, joint], turn.as_rotvec() / 2e-5, rtol=1e-7, atol=1e-7)
 
 
-def test_pinocchio_agrees(tmp_path: Path) -> None:
-    """Pose and Jacobian of the PUMA and of random chains without mimic are those of pinocchio, where it is at hand."""
-    pinocchio = pytest.importorskip("pinocchio")
-    random = np.random.default_rng(3)
-    types = ["revolute", "prismatic", "fixed", "revolute"]
-    arms = [(PUMA, "tool0", Chain.load(PUMA, "base_link", "tool0"))]
-    for number in range(30):
-        chain = [
-            Given(str(random.choice(types)), *map(tuple, random.uniform(-2.0, 2.0, (3, 3)).tolist())) for _ in range(7)
-        ]
-        path = tmp_path / f"{number}.urdf"
-        path.write_text(written(chain).replace("</joint>", '<limit effort="1" velocity="1"/></joint>'))
-        arms.append((path, "l7", Chain.load(path, "l0", "l7")))
-    for path, tip, arm in arms:
-        model = pinocchio.buildModelFromUrdf(str(path))
-        data, frame = model.createData(), model.getFrameId(tip)
-        columns = [model.joints[model.getJointId(name)].idx_v for name in arm.joints]
-        q = configurations(arm, 20)
-        position, quaternion = arm.pose(q)
-        jacobian = arm.jacobian(q)
-        for row in range(20):
-            state = pinocchio.neutral(model)
-            state[[model.joints[model.getJointId(name)].idx_q for name in arm.joints]] = q[row]
-            pinocchio.framesForwardKinematics(model, data, state)
-            np.testing.assert_allclose(position[row], data.oMf[frame].translation, atol=20.0 * EXACT)
-            oriented = Rotation.from_quat(quaternion[row]).as_matrix()
-            np.testing.assert_allclose(oriented, data.oMf[frame].rotation, atol=EXACT)
-            world = pinocchio.computeFrameJacobian(model, data, state, frame, pinocchio.LOCAL_WORLD_ALIGNED)
-            np.testing.assert_allclose(jacobian[row], world[:, columns], atol=20.0 * EXACT)
-
-
 SMALL = {  # name: links and joints, the tip, the joints that must be known, their values, its position and its turn
     "defaults: no origin, about x, a mimic does the same": (
         f'<joint name="j" type="revolute">{ENDS}</joint><joint name="k" type="revolute"><parent link="l1"/>'
