@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize_scalar
+from scipy.optimize import least_squares, minimize_scalar
 
 from pumafuse import SecondOrder
 from pumafuse.identification.combine import CombinedAxis, Fitted, combine
-from pumafuse.identification.fit import fit_steps
+from pumafuse.identification.fit import StepFit, fit_steps
 from pumafuse.identification.joint import JointFit, fit_together
 from pumafuse.identification.paper import onset
 from pumafuse.identification.trials import Trial
@@ -19,21 +19,28 @@ from pumafuse.model.plants import unit_response
 TIMES = np.arange(60) * 0.00563  # s, the paper's oscilloscope
 FIRST, SWINGING, DAMPED = (0.04, 0.0), (2 * 0.864 / 53.9, 53.9**-2), (0.06, 4e-4)
 PLANTS = [(1, FIRST), (2, SWINGING), (2, DAMPED)]
+KINKS = 1e-6  # of the sum of squares: it has a kink wherever a delay passes a sample
 STEPS = np.array([0.002, 0.004, 0.008, 0.016, -0.002, -0.004, -0.008, -0.016])
 
 
 def campaign(
-    plant: tuple[float, float], noise: float | Sequence[float] = 0.0, seed: int = 0, jitter: float = 0.003, n: int = 8
+    plant: tuple[float, float],
+    noise: float = 0.0,
+    seed: int = 0,
+    jitter: float = 0.003,
+    n: int = 8,
+    times: Sequence[np.ndarray] = (TIMES,),
+    late: Sequence[float] = (0.06,),
 ) -> tuple[list[Trial], np.ndarray, np.ndarray]:
     """Trials with the delays [s] and gains that they were made of; noise is a share of the step."""
     rng = np.random.default_rng(seed)
-    delays, gains = 0.06 + jitter * rng.standard_normal(n), 1.0 + 0.03 * rng.standard_normal(n)
+    delays, gains = np.resize(late, n) + jitter * rng.standard_normal(n), 1.0 + 0.03 * rng.standard_normal(n)
     trials = []
-    for place, share in enumerate(np.broadcast_to(noise, n)):
-        step = float(STEPS[place % len(STEPS)])
-        position = 0.0003 * place + gains[place] * step * unit_response(TIMES - delays[place], *plant)
-        position = position + share * abs(step) * rng.standard_normal(len(TIMES))
-        trials.append(Trial(str(place), "radial", step, abs(step) / 0.028, {}, TIMES, position))
+    for place in range(n):
+        step, time = float(STEPS[place % len(STEPS)]), times[place % len(times)]
+        position = 0.0003 * place + gains[place] * step * unit_response(time - delays[place], *plant)
+        position = position + noise * abs(step) * rng.standard_normal(len(time))
+        trials.append(Trial(str(place), "radial", step, abs(step) / 0.028, {}, time, position))
     return trials, delays, gains
 
 
@@ -48,17 +55,23 @@ def combined(trials: Sequence[Trial]) -> CombinedAxis:
     return found[0]
 
 
+def linear(trial: Trial, delay: float, plant: tuple[float, float]) -> tuple[float, float]:
+    """Height and zero of one trial under a delay and a plant, by plain regression."""
+    design = np.column_stack((unit_response(trial.time - delay, *plant), np.ones(len(trial.time))))
+    height, zero = np.linalg.lstsq(design, trial.position, rcond=None)[0].tolist()
+    return height, zero
+
+
 def least(trial: Trial, plant: tuple[float, float], near: float) -> tuple[float, float]:
     """Delay and gain of one trial under a given plant: a one-dimensional search over plain regressions."""
 
-    def solved(delay: float) -> tuple[float, float]:
-        design = np.column_stack((unit_response(trial.time - delay, *plant), np.ones(len(trial.time))))
-        x = np.linalg.lstsq(design, trial.position, rcond=None)[0]
-        return float(np.sum((1e6 * (trial.position - design @ x)) ** 2)), float(x[0])
+    def squares(delay: float) -> float:
+        height, zero = linear(trial, delay, plant)
+        left = trial.position - zero - height * unit_response(trial.time - delay, *plant)
+        return float(np.sum((1e6 * left) ** 2))
 
-    delay = minimize_scalar(lambda d: solved(d)[0], bounds=(near - 3e-4, near + 3e-4), method="bounded",
-                            options={"xatol": 1e-11}).x  # fmt: skip
-    return float(delay), solved(delay)[1] / trial.step
+    delay = minimize_scalar(squares, bounds=(near - 3e-4, near + 3e-4), method="bounded", options={"xatol": 1e-11}).x
+    return float(delay), linear(trial, delay, plant)[0] / trial.step
 
 
 # ---- the fit --------------------------------------------------------------------------------------------------------
@@ -85,6 +98,47 @@ def test_large_steps_do_not_dominate() -> None:
     assert other.q == pytest.approx(one.q, rel=1e-6)
     np.testing.assert_allclose(other.delay, one.delay, rtol=1e-6)
     np.testing.assert_allclose(other.influence, one.influence, rtol=0.0, atol=1e-5 * np.abs(one.influence).max())
+
+
+def unlike() -> list[np.ndarray]:
+    """Times of trials that differ in all: length, spacing, jittering stamps, samples before the command."""
+    rng, shapes = np.random.default_rng(1), ((0.00563, 60), (0.008, 41), (0.004, 73), (0.011, 25))
+    return [dt * (np.arange(n) - 3 * place + 0.3 * rng.random(n)) for place, (dt, n) in enumerate(shapes)]
+
+
+@pytest.mark.parametrize(
+    "late", [(0.0604, 0.0551, 0.0687, 0.0313), (0.0, 0.0551, 0.0, 0.0313)], ids=["late", "at once"]
+)
+@pytest.mark.parametrize(("order", "plant"), PLANTS)
+def test_the_least_squares_are_those_of_the_dense_problem(
+    order: int, plant: tuple[float, float], late: Sequence[float]
+) -> None:
+    """Bounded least squares over q, p, and delay, height and zero of each trial starts there and finds nothing better.
+
+    Delays of 0 are at their bound. The first trial begins with its command: there a delay of 0 acts like a gain.
+    """
+    for seed in (0, 5, 10, 38):
+        trials, _, _ = campaign(plant, 0.05, seed, jitter=0.0, n=4, times=unlike(), late=late)
+        own = [pair[order - 1] for pair in fit_steps(trials)]
+        found = fit_together(trials, own, order)
+        assert found.delay.min() >= 0.0
+
+        def residuals(x: np.ndarray, trials: list[Trial] = trials, own: list[StepFit] = own) -> np.ndarray:
+            q, p, each = x[0], x[1] if order == 2 else 0.0, x[order:].reshape(-1, 3)
+            models = [zero + high * unit_response(one.time - delay, q, p)
+                      for one, (delay, high, zero) in zip(trials, each, strict=True)]  # fmt: skip
+            return np.concatenate([(t.position - z) / fit.rms for t, z, fit in zip(trials, models, own, strict=True)])
+
+        each = [
+            (delay, *linear(one, delay, (found.q, found.p))) for one, delay in zip(trials, found.delay, strict=True)
+        ]
+        x = np.array([*(found.q, found.p)[:order], *np.ravel(each)])
+        low = np.concatenate(([1e-6, 0.0][:order], np.tile([0.0, -np.inf, -np.inf], 4)))
+        best = least_squares(
+            residuals, np.maximum(x, low + 1e-9), bounds=(low, np.inf), x_scale=np.abs(x) + 1e-6, max_nfev=40
+        )
+        assert found.cost == pytest.approx(np.sum(residuals(x) ** 2), rel=1e-9)
+        assert found.cost < 2.0 * best.cost * (1.0 + KINKS)
 
 
 # ---- errors ---------------------------------------------------------------------------------------------------------
