@@ -109,7 +109,7 @@ def placed(found: Registration) -> tuple[np.ndarray, np.ndarray]:
 
 def test_several_runs_are_registered_together() -> None:
     """Two runs in different parts of the clock are one set-up: each alone is as right, both together surer."""
-    setup = Setup(5)
+    setup = Setup(5, seconds=20.0)
     runs = [setup.run(), setup.run()]
     later = [one._replace(time=one.time + 1000.0) for one in runs[1]]
     both = registered([runs[0][0], later[0]], [runs[0][1], later[1]])
@@ -122,7 +122,7 @@ def test_several_runs_are_registered_together() -> None:
 
 def test_the_base_may_stand_anywhere() -> None:
     """A world that is turned and moved as a whole turns and moves the frame, and nothing else."""
-    setup = Setup(7)
+    setup = Setup(7, seconds=15.0)
     command, sensor = setup.run()
     turn, move = Rotation.from_rotvec([0.3, -1.1, 0.8]), np.array([1.0, -2.0, 0.5])
     assert command.quaternion is not None
@@ -329,7 +329,7 @@ def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None
 
 def test_a_marker_that_is_known_stays() -> None:
     """Fixed it is as given; beside a tool that does not turn as well, and the frame's place is right then."""
-    setup = Setup(2, axes=STILL)
+    setup = Setup(2, axes=STILL, seconds=20.0)
     command, sensor = setup.run()
     place = Placement(at=tuple(setup.marker.tolist()))
     for fix in (True, False):
