@@ -36,13 +36,9 @@ class Blocks(NamedTuple):
 
 
 def blocks(slope: FloatArray, off: FloatArray, told: FloatArray, weight: FloatArray) -> Blocks:
-    """What blocks of rows tell.
+    """What blocks of rows tell that are ``off`` by so much, (n, 3), and change so with a step, (n, 3, k).
 
-    Args:
-        slope: How the rows change with a step, (n, 3, k).
-        off: How far rows are off, (n, 3).
-        told: Weight of rows for the information, (n,).
-        weight: For the score, (n,).
+    They are weighted for the information as is ``told``, for the score by their ``weight``, (n,) each.
     """
     first = np.linspace(0.0, len(off), _BLOCKS, endpoint=False).astype(np.int64)
     cuts = [slice(*ends) for ends in pairwise([*first.tolist(), len(off)])]

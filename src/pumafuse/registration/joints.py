@@ -42,17 +42,10 @@ class _Step(NamedTuple):
 def joint_lags(
     told: Told, joints: Sequence[str], sensor: Sequence[Motion], register: Callable[[Sequence[Motion]], Registration]
 ) -> dict[str, Quantity]:
-    """By how much each joint answers later than the first [s], with 95 % intervals.
+    """By how much each joint answers later than the first [s]; nothing where all answer alike, as far as is told.
 
-    Args:
-        told: Gives the commands.
-        joints: Their names.
-        sensor: What the sensor told in its own frame, one entry a run.
-        register: Registers it beside commands.
-
-    Returns:
-        Nothing where the joints answer alike as far as the sensor tells. A joint of which the motion does not tell is
-        as late as the others are on average, and its interval infinite.
+    ``told`` gives the commands, beside which ``register`` registers what the sensor told in its own frame, one entry a
+    run. A joint of which the motion does not tell is as late as the others are on average, its interval infinite.
     """
     later, steps = dict.fromkeys(joints, 0.0), list[_Step]()
     for _ in range(_ROUNDS + 1):

@@ -18,10 +18,9 @@ from ..fusion.placing import Placing
 from ..logs.run import Run
 from .configured import placed_by
 from .intervals import blocks, inverse
-from .motion import Answer, Motion, Plant
+from .motion import Answer, Motion, Plant, measured, motion_of
 from .register import Quantity, Registration
 from .solve import MEDIAN, curvature, weights
-from .sources import measured, motion_of
 from .start import despiked
 
 _SPEED = 0.05  # s, over which a velocity is taken
@@ -102,16 +101,10 @@ def _sum(one: Quantity, by: float, *unsure: Quantity) -> Quantity:
 
 
 def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) -> Quantity | None:
-    """By how much the stamps of one sensor's rows are later than those of another's [s], with its 95 % interval.
+    """By how much the stamps of one sensor's rows are later than those of another's [s], ``about`` so much.
 
-    Args:
-        first: What one sensor tells in the base's frame of the point that the other one sees, and, where it is known,
-            how the tool is turned, one entry a run.
-        other: Where the other one sees that point, likewise.
-        about: By how much, roughly [s].
-
-    Returns:
-        None where they have too little in common, or nothing moves, or it is not known to 50 ms.
+    The first one tells in the base's frame of the point that the other one sees there, and, where it is known, how the
+    tool is turned; one entry a run. None where both have too little in common, or it is not known to 50 ms.
     """
     pairs = [(_Path(a.valid()), b.valid()) for a, b in zip(first, other, strict=True)]
     pairs = [(path, b.only(path.holds(b.time - about))) for path, b in pairs]

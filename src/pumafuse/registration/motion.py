@@ -14,10 +14,15 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..filter.response import response
+from ..logs.frames import CARTESIAN
+from ..logs.run import Source
+from ..logs.screening import lost
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
+from ..units import seconds
 
 _NS = 1e9  # in a second
+_FARTHEST = 1e6  # m: what is farther is a sentinel, no position
 _PERIOD = 1.0  # s: the response does not depend on the update period
 _STEP = 1e-5  # s, by which dead times and time constants are varied for slopes
 
@@ -41,6 +46,20 @@ class Motion(NamedTuple):
         """Some rows."""
         turned = None if self.quaternion is None else self.quaternion[rows]
         return Motion(self.time[rows], self.position[rows], turned)
+
+
+def motion_of(source: Source) -> Motion:
+    """What a source with x, y and z tells."""
+    position = np.column_stack([source.values[axis] for axis in CARTESIAN])
+    return Motion(seconds(source.stamp), position, source.orientation)
+
+
+def measured(source: Source) -> Motion:
+    """What a sensor tells, without what is no news: values that it repeats, and zeros, as it writes them when lost."""
+    motion = motion_of(source)
+    far = ~(np.abs(motion.position) < _FARTHEST).all(axis=1)
+    again = (np.diff(motion.position, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+    return motion._replace(position=np.where((far | again | lost(motion.position))[:, None], np.nan, motion.position))
 
 
 class Plant(NamedTuple):

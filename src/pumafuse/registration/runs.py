@@ -24,9 +24,8 @@ from ..toml import Interval
 from .configured import DIGITS, arm_of, as_late, configuration, lag_in_space, placed_by, with_joints
 from .joints import Later, Told, joint_lags
 from .latencies import exactly, latencies_of
-from .motion import Motion
+from .motion import Motion, measured, motion_of
 from .register import Quantity, Registered, Registration, is_here, registered
-from .sources import complete, incomplete, measured, motion_of, without
 
 FIXED = ("marker", "latency")  # what can be left as it is
 _AS_CONFIGURED, _ALONG_BASE = "stays as configured", "is taken to measure along the base's axes"
@@ -139,17 +138,17 @@ def register(
     aside = {name for run in every for name in own_frames(run)} & set(left) if left and config is None else set[str]()
     instead = _AS_CONFIGURED if config else _ALONG_BASE
     notes = [_not_registered(every, name, _LEFT_OUT if name in aside else instead) for name in left]
-    every = [without(run, aside | (incomplete(run) & set(names))) for run in every]
+    every = [_without(run, aside | (_incomplete(run) & set(names))) for run in every]
     if config is not None and any(run.command.joints is None for run in every):
         notes += config.arm.joint_doubts()
-    joints = _joints([complete(run) for run in every], names) if config is None else config.arm.joints
+    joints = _joints([_complete(run) for run in every], names) if config is None else config.arm.joints
     config = config and with_joints(config, {})  # they are heeded in the commands from here on
     later = {name: joint.later for name, joint in joints.items()}
     for run in every:
         if missing := missing_commands(run.command):
             notes.append(f"run '{run.name}': {missing}: what sensors saw in a gap is not used")
     every = [replace(run, command=run.command.delayed(later)) for run in every]
-    whole = [complete(run) for run in every]
+    whole = [_complete(run) for run in every]
     found = {name: _registered(whole, name, config, fixed="marker" in fixed) for name in names}
     placed = {name: one for name, one in found.items() if one.frame is not None}
     placed |= {name: _without_frame(one) for name, one in placed.items() if one.along_base}
@@ -175,6 +174,21 @@ def register(
     named = [run.name for run in every]
     summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=named, sensors=details, joints=joints)
     return Registrations(with_joints(config, joints), summary)
+
+
+def _complete(run: Run) -> Run:
+    """A run with the sensors that give x, y and z."""
+    return _without(run, _incomplete(run))
+
+
+def _incomplete(run: Run) -> set[str]:
+    """The sensors of a run that do not give x, y and z."""
+    return {name for name, one in run.sensors.items() if not set(CARTESIAN) <= one.values.keys()}
+
+
+def _without(run: Run, names: Collection[str]) -> Run:
+    """A run without some sensors."""
+    return replace(run, sensors={name: one for name, one in run.sensors.items() if name not in names})
 
 
 def _as_registered(run: Run, found: Mapping[str, Registration], kept: Collection[str] | None) -> Run:
@@ -220,13 +234,7 @@ def _apart(runs: Sequence[Run], name: str) -> tuple[Told, list[Motion]]:
 
 
 def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | None) -> list[str]:
-    """The sensors to register.
-
-    Raises:
-        RunError: There is none, or no commands in x, y and z.
-        UnknownNameError: The one that is asked for is in no run, or not configured.
-        ConfigError: The arm has no axes x, y, z.
-    """
+    """The sensors to register; an error where there is none, or commands or the arm have no x, y and z."""
     for run in runs:
         if not set(CARTESIAN) <= run.command.values.keys():
             raise RunError(f"{run.command.label}: a sensor is registered beside commands in x, y and z; there are only"
@@ -236,7 +244,7 @@ def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | Non
     known = _known(runs, config)
     if sensor is not None and sensor not in known:
         raise UnknownNameError("--sensor", "sensor", sensor, known)
-    names = [name for name in ([sensor] if sensor else known) if any(name in complete(run).sensors for run in runs)]
+    names = [name for name in ([sensor] if sensor else known) if any(name in _complete(run).sensors for run in runs)]
     if not names:
         lacking = "; ".join(_lacking(runs, name) for name in ([sensor] if sensor else known))
         raise RunError(f"no sensor gives x, y and z, by which it could be registered: {lacking or 'there is none'}")

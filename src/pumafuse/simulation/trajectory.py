@@ -17,7 +17,6 @@ from ..units import ending, seconds
 _MOST_TICKS = 200_000  # 93 minutes at 28 ms; a gigabyte of work
 
 Offsets: TypeAlias = dict[str, FloatArray]
-Names: TypeAlias = Annotated[list[str], msgspec.Meta(min_length=1)]
 Count: TypeAlias = Annotated[int, msgspec.Meta(gt=0, le=10_000)]
 
 
@@ -32,7 +31,7 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", fo
 class OnAxes(Trajectory, frozen=True, kw_only=True):
     """Base of the trajectories that name their axes in a list."""
 
-    axes: Names  # the axes that move
+    axes: Annotated[list[str], msgspec.Meta(min_length=1)]  # the axes that move
 
     @property
     def moving(self) -> tuple[str, ...]:
