@@ -27,6 +27,10 @@ class Blocks(NamedTuple):
     information: FloatArray  # of the numbers of a step, (b, k, k)
     score: FloatArray  # the slope of half the sum of squares, (b, k): all together 0
 
+    def step(self) -> FloatArray:
+        """Gauss and Newton's step, (k,); what rows do not tell does not move."""
+        return -inverse(self.information.sum(axis=0)) @ self.score.sum(axis=0)
+
     def half_widths(self, numbers: FloatArray) -> FloatArray:
         """Half the 95 % interval of numbers that change so with a step, (q, k) → (q,)."""
         whole, count = self.information.sum(axis=0), len(self.score)

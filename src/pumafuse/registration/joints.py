@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray
-from .intervals import inverse
 from .motion import Motion, Plant
 from .register import Quantity, Registration, rows_of, thinned, within
 from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, residual, slopes, tell
@@ -62,8 +61,7 @@ def joint_lags(
         return {}
     late = np.where(known, late, late[known].mean())
     late, half = late - late.min(), np.where(known, half, np.inf)
-    told_late = zip(joints, late.tolist(), half.tolist(), strict=True)
-    return {name: Quantity(by, (by - wide, by + wide)) for name, by, wide in told_late}
+    return dict(zip(joints, map(Quantity.around, late.tolist(), half.tolist()), strict=True))
 
 
 def _step(told: Told, later: Later, sensor: Sequence[Motion], found: Registration) -> _Step:
@@ -86,10 +84,9 @@ def _step(told: Told, later: Later, sensor: Sequence[Motion], found: Registratio
         for one, by in zip(slopes(rows, state, off.poses), by_joint, strict=True)
     ]
     before = tell(slope, off.blocks, off.noise(), expected=False)
-    step = -inverse(before.information.sum(axis=0)) @ before.score.sum(axis=0)
-    after = tell(
-        slope, [one + by @ step for one, by in zip(off.blocks, slope, strict=True)], off.noise(), expected=True
-    )
+    step = before.step()
+    left = [one + by @ step for one, by in zip(off.blocks, slope, strict=True)]
+    after = tell(slope, left, off.noise(), expected=True)
     own = slice(-len(later), None)
     return _Step(step[own], after.half_widths(np.eye(len(step))[own]), off.noise())
 

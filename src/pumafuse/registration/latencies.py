@@ -17,7 +17,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.placing import Placing
 from ..logs.run import Run
 from .configured import placed_by
-from .intervals import blocks, inverse
+from .intervals import blocks
 from .motion import Answer, Motion, Plant, measured, motion_of
 from .register import Quantity, Registration
 from .solve import MEDIAN, curvature, weights
@@ -44,14 +44,14 @@ def latencies_of(
     if not lags:
         return {}
     best = min(lags, key=lambda name: (found[name].rms_rotation is None, lags[name].half))
-    beside, placed = {best: exactly(0.0)}, placed_by(config, found, {})
+    beside, placed = {best: Quantity.around(0.0)}, placed_by(config, found, {})
     for name in (one for one in lags if one != best):
         both = [run for run in runs if {name, best} <= run.sensors.keys()]
         points = [_of_point(run, best, found[best], placed, name) for run in both]
         told = later(points, [_in_base(run, name, placed) for run in both], lags[name].value - lags[best].value)
         beside[name] = told or _sum(lags[name], -lags[best].value)
     if lag is None:
-        first, known = min(beside, key=lambda name: beside[name].value), exactly(0.0)
+        first, known = min(beside, key=lambda name: beside[name].value), Quantity.around(0.0)
     else:
         first = min(lags, key=lambda name: lags[name].half)
         known = _sum(lags[first], -lag)
@@ -89,15 +89,9 @@ def _commanded(run: Run, time: FloatArray, found: Registration) -> FloatArray | 
     return Answer([command], [time]).quaternions(plant)
 
 
-def exactly(value: float) -> Quantity:
-    """A number that is taken, not found."""
-    return Quantity(value, (value, value))
-
-
 def _sum(one: Quantity, by: float, *unsure: Quantity) -> Quantity:
     """A number moved by another one, which is as unsure as some others are together."""
-    value, half = one.value + by, sum(each.half for each in (one, *unsure))
-    return Quantity(value, (value - half, value + half))
+    return Quantity.around(one.value + by, sum(each.half for each in (one, *unsure)))
 
 
 def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) -> Quantity | None:
@@ -116,14 +110,13 @@ def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) 
     for _ in range(_ROUNDS):
         parts = [path.beside(b, late) for path, b in pairs]
         apart, slope = (np.concatenate(part) for part in zip(*parts, strict=True))
-        told = blocks(slope, apart, weight, weight)
-        step = inverse(told.information.sum(axis=0)) @ told.score.sum(axis=0)
+        step = -blocks(slope, apart, weight, weight).step()
         left = apart - slope @ step
         half = float(blocks(slope, left, curvature(weight), weight).half_widths(np.eye(len(step))[-1:])[0])
         late += float(step[-1])
         far = np.linalg.norm(left, axis=1)
         weight = weights(far, max(median(far) / MEDIAN, _ROUNDING))
-    return Quantity(late, (late - half, late + half)) if 0.0 < half < _UNKNOWN else None
+    return Quantity.around(late, half) if 0.0 < half < _UNKNOWN else None
 
 
 class _Path:

@@ -64,6 +64,11 @@ class Quantity(NamedTuple):
     value: float
     ci95: Interval
 
+    @classmethod
+    def around(cls, value: float, half: float = 0.0) -> Quantity:
+        """A number with half its interval; without one it is taken, not found."""
+        return cls(value, (value - half, value + half))
+
     @property
     def half(self) -> float:
         """Half the interval."""
@@ -520,7 +525,7 @@ def _told(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray, own: bo
     half[(np.abs(slopes @ lost) > _TILT).any(axis=1)] = np.inf
     if not begin.attitude:
         half[9:12] = np.inf
-    told = [Quantity(one, (one - by, one + by)) for one, by in zip(values.tolist(), half.tolist(), strict=True)]
+    told = list(map(Quantity.around, values.tolist(), half.tolist()))
     position, rotation = (Response(lag=a, delay=b, time_constant=c) for a, b, c in (told[12:15], told[15:18]))
     noise = fit.off.rms()
     turned = values[3:6] - loose @ (loose.T @ values[3:6])

@@ -23,7 +23,7 @@ from ..model.arm import Joint
 from ..toml import Interval
 from .configured import DIGITS, arm_of, as_late, configuration, lag_in_space, placed_by, with_joints
 from .joints import Later, Told, joint_lags
-from .latencies import exactly, latencies_of
+from .latencies import latencies_of
 from .motion import Motion, measured, motion_of
 from .register import Quantity, Registered, Registration, is_here, registered
 
@@ -160,13 +160,14 @@ def register(
     begun = arm_of(every, placed) if config is None else with_tool(config, every[0])
     if "latency" in fixed:
         begun = as_late(begun, placed)
-        latencies = {name: exactly(begun.sensors[name].latency) for name in placed if not placed[name].read_otherwise}
+        kept = [name for name, one in placed.items() if not one.read_otherwise]
+        latencies = {name: Quantity.around(begun.sensors[name].latency) for name in kept}
     else:
         latencies = latencies_of(whole, placed, begun, None if config is None else lag_in_space(config.arm))
     details = {name: _details(one, latencies.get(name), said[name]) for name, one in found.items()}
     if config is None:
-        kept = placed.keys() if sensor else None
-        config = configuration([_as_registered(run, placed, kept) for run in every], placed, latencies, begun)
+        alone = placed.keys() if sensor else None
+        config = configuration([_as_registered(run, placed, alone) for run in every], placed, latencies, begun)
     else:
         config = placed_by(begun, placed, latencies)
     for note in (*(note for mine in said.values() for note in mine), *notes):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray, median
 from ..space.rotations import crossed
-from .intervals import Blocks, blocks, inverse
+from .intervals import Blocks, blocks
 from .motion import Answer, Plant, Poses
 
 ROTATION, CENTRE, MARKER, TURN, SCALE, POSITION, ANGLE = (
@@ -115,9 +115,9 @@ def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
     off = residual(rows, state)
     for _ in range(_STEPS):
         noise = off.noise()
-        information, score = (one.sum(axis=0) for one in _normal(rows, state, off, noise, free, expected=False))
-        step = -inverse(information) @ score
-        if -(score @ step) < _ENOUGH * len(rows.centred):
+        told = _normal(rows, state, off, noise, free, expected=False)
+        step = told.step()
+        if -(told.score.sum(axis=0) @ step) < _ENOUGH * len(rows.centred):
             break
         better = _better(rows, state, free @ step, off.cost(noise), noise)
         if better is None:
