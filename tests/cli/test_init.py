@@ -119,7 +119,7 @@ def test_a_result_with_a_run_toml_stays_unless_it_is_made_anew(tmp_path: Path) -
 def exit_code_here(folder: Path) -> int:
     """How `fuse` of the example ends in this process, where not by itself."""
     with pytest.raises(typer.Exit) as ended:
-        from_log.run(EXAMPLES / "my-run", folder, None, None, "filtered", False, False, "compiled", False, (None, 15.0))
+        from_log.run(EXAMPLES / "my-run", folder, None, None, "filtered", [], "compiled", False, (None, 15.0))
     return ended.value.exit_code
 
 

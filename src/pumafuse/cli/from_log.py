@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +50,7 @@ def run(
     sensors: Sequence[str] | None,
     rate: float | None,
     mode: Mode,
-    rrd: bool,
-    figures: bool,
+    extras: Sequence[str],
     engine: Engine,
     force: bool,
     part: tuple[float | None, float | None],
@@ -90,16 +88,12 @@ def run(
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)
     est = replace(est, fitted=True)
     results.check_fused(est.counts, est.config)
-    extras = partial(draw, est=est, recorded=recorded, rrd=rrd, figures=figures)
-    summary = results.write(est, output, force, extras, texts["run.toml"])
+    summary = results.write(est, output, force, lambda new: draw(new, est, recorded, extras), texts["run.toml"])
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
     strays = _off_the_path(found, summary)
-    for line in [
-        *strays,
-        *otherwise_than_at_first(found, fitted.details.lags, fitted.config.arm),
-        *_told_by_one(summary),
-    ]:
+    slow = otherwise_than_at_first(found, fitted.details.lags, fitted.config.arm)
+    for line in [*strays, *slow, *_told_by_one(summary)]:
         say(line)
     for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
         say(taken(name, 0.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from importlib.resources import as_file, files
 from itertools import chain, count
@@ -35,8 +35,7 @@ def run(
     sensors: Sequence[str] | None = None,
     rate: float | None = None,
     mode: Mode = "filtered",
-    rrd: bool = False,
-    figures: bool = False,
+    extras: Sequence[str] = (),
     engine: Engine = "compiled",
     force: bool = False,
     part: tuple[float | None, float | None] = (None, None),
@@ -49,9 +48,8 @@ def run(
     given = FusionConfig.load(config)
     given.sensor_names(sensors)  # before any run is read
     warn(given.arm.doubts())
-    extras = [name for name, wanted in {"fused.rrd": rrd, "fused.png": figures}.items() if wanted]
     making = results.Making(given, sensors, rate, mode, engine, part, extras)
-    job = partial(_fuse, making, rrd, figures, force)
+    job = partial(_fuse, making, force)
     if len(runs) == 1:
         summary = making.made(output, runs[0]) if resume else None
         where = "written to" if summary is None else "there already:"
@@ -83,7 +81,7 @@ def demo(output: Path, force: bool) -> None:
     with as_file(files("pumafuse") / "data") as data:
         scan, config = data / "scan1", data / "fusion.toml"
         # without the laser tracker it shows best what a camera and a model do together
-        run([scan], config, output, sensors=["vision"], rate=200.0, rrd=True, figures=True, force=force)
+        run([scan], config, output, sensors=["vision"], rate=200.0, extras=["fused.rrd", "fused.png"], force=force)
     say(
         f"\nWhat to open next:\n"
         f"  {output / 'fused.png'}   the run: command, measurements, estimate with its band\n"
@@ -98,23 +96,15 @@ def demo(output: Path, force: bool) -> None:
 
 
 def _fuse(
-    how: results.Making,
-    rrd: bool,
-    figures: bool,
-    force: bool,
-    path: Path,
-    folder: Path,
-    progress: Callable[[float], None] | None = None,
+    how: results.Making, force: bool, path: Path, folder: Path, progress: Callable[[float], None] | None = None
 ) -> Summary:
-    """Fuse a part of a run and write its result folder, with ``fused.rrd`` and figures if wanted.
-
-    A long run goes through piece by piece, where nothing, such as an option, needs it in memory.
-    """
+    """Fuse a run into its result folder: piece by piece a long one, where nothing, such as an option, forbids that."""
     results.check_writable(folder, force)
     stamps, rows, config = stamps_of(path), rows_of(path), how.config
     if rows > SHORT:
         options = {"--smooth": how.mode == "smoothed", "--as-live": how.mode == "as-live"}
-        options |= {"--engine filterpy": how.engine != "compiled", "--rrd": rrd, "--figures": figures}
+        options |= {"--engine filterpy": how.engine != "compiled"}
+        options |= {"--rrd": "fused.rrd" in how.extras, "--figures": "fused.png" in how.extras}
         needed = next((option for option, wanted in options.items() if wanted), None) or needs_whole(path, config)
         if needed is None:
             long = partial(fuse_to, path, folder, config, force=force, progress=progress)
@@ -131,18 +121,18 @@ def _fuse(
 
     def more(new: Path) -> None:
         results.note_log(new, stamps)
-        draw(new, est, recorded, rrd, figures)
+        draw(new, est, recorded, how.extras)
 
     return results.write(est, folder, force, more)
 
 
-def draw(folder: Path, est: Estimates, recorded: Run, rrd: bool, figures: bool) -> None:
-    """Write ``fused.rrd`` and figures, if wanted."""
-    if rrd:
+def draw(folder: Path, est: Estimates, recorded: Run, extras: Collection[str]) -> None:
+    """Write ``fused.rrd``, and with ``fused.png`` the other figures, if they are among the ``extras``."""
+    if "fused.rrd" in extras:
         from ..views.rerun import recording_of
 
         (folder / "fused.rrd").write_bytes(recording_of(est, recorded))
-    if figures:
+    if "fused.png" in extras:
         from ..views.figures import error_figure, fused_figure, path_figure, validation_figure
 
         drawn = {

@@ -36,7 +36,7 @@ def run(
 
         if period_ms is not None or samples is not None or paper or tolerance is not None:
             raise ConfigError("--period, --samples, --paper and --tolerance are for step trials, not for recorded runs")
-        latency.identify(paths, output, sensor, report, json, force)
+        latency.run(paths, sensor, report, json, force, arm=output)
         return
     if len(paths) > 1 or sensor is not None:
         raise ConfigError(f"{trials[0]}: has step trials: give this folder alone, and no --sensor")

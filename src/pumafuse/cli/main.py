@@ -115,19 +115,19 @@ def fuse(
     if engine == "filterpy" and (smooth or as_live):
         raise BadParameter("--engine filterpy gives filtered estimates only: without --smooth and --as-live")
     _check_positive(rate=rate)
-    _check_interval(since, until)
     mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
-    part = since, until
+    extras = [name for name, wanted in {"fused.rrd": rrd, "fused.png": figures}.items() if wanted]
+    part = _part(since, until)
     if config is None:
         from . import from_log
 
         if len(runs) > 1 or resume:
             raise BadParameter("is needed for several runs, and to --resume", param_hint="--config")
-        from_log.run(runs[0], output, _names(sensors), rate, mode, rrd, figures, engine, force, part)
+        from_log.run(runs[0], output, _names(sensors), rate, mode, extras, engine, force, part)
         return
     from . import fuse as command
 
-    command.run(runs, config, output, _names(sensors), rate, mode, rrd, figures, engine, force, part, resume)
+    command.run(runs, config, output, _names(sensors), rate, mode, extras, engine, force, part, resume)
 
 
 @app.command()
@@ -148,10 +148,9 @@ def register(
     force: Force = False,
 ) -> None:
     """Find where a sensor stands, what it sees on the tool, and how late it is, from any motion."""
-    _check_interval(since, until)
     from . import register as command
 
-    command.run(runs, config, sensor, _names(fix) or (), output, json, force, (since, until))
+    command.run(runs, config, sensor, _names(fix) or (), output, json, force, _part(since, until))
 
 
 @app.command()
@@ -246,8 +245,7 @@ def latency(
     """
     from . import latency as command
 
-    _check_interval(since, until)
-    command.run(runs, sensor, report, json, force, (since, until))
+    command.run(runs, sensor, report, json, force, _part(since, until))
 
 
 @app.command()
@@ -305,8 +303,7 @@ def tune(
     from . import tune as command
 
     kinds, fixed = _names(fit, "--fit") or [], _names(",".join(fix) if fix else None, "--fix") or []
-    _check_interval(since, until)
-    prior, part = not no_sd_prior, (since, until)
+    prior, part = not no_sd_prior, _part(since, until)
     command.run(runs, config, output, kinds, fixed, share, trust, validate, prior, report, json, force, part)
 
 
@@ -465,12 +462,13 @@ def _level(text: str) -> tuple[str, float]:
         raise BadParameter(f"expected AXIS=VALUE, not '{text}'", param_hint="--start") from None
 
 
-def _check_interval(since: float | None, until: float | None) -> None:
-    """Refuse ``--from`` and ``--to`` that are no interval after the first command."""
+def _part(since: float | None, until: float | None) -> tuple[float | None, float | None]:
+    """The part from ``--from`` to ``--to``, which must be an interval after the first command."""
     if since is not None and not 0.0 <= since < float("inf"):
         raise BadParameter(f"must be a number of seconds after the first command, not {since}", param_hint="--from")
     if until is not None and not (since or 0.0) < until < float("inf"):
         raise BadParameter(f"must be a number of seconds after --from, not {until}", param_hint="--to")
+    return since, until
 
 
 def _check_positive(**options: float | None) -> None:
