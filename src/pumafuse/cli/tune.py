@@ -9,7 +9,6 @@ from typing import Literal
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from .. import folders
 from ..errors import ConfigError
@@ -17,12 +16,12 @@ from ..fusion.config import ARM_FILE, ROBOT_FILE, FusionConfig
 from ..logs.run import Run
 from ..tuning.arms import BENDS
 from ..tuning.parameters import kinds_of
-from ..tuning.summary import Fitted, TuningSummary
+from ..tuning.summary import TuningSummary
 from ..tuning.tune import Progress, tune
 from ..units import SCREEN
 from ..views import formatting
 from .screen import say
-from .tables import interval, number, print_tables, table
+from .tables import interval, print_tables, table
 
 SUMMARY = "tuning.json"
 PAGE = "report.html"
@@ -103,14 +102,17 @@ def fitting() -> Generator[Progress]:
 
 def show_lags(summary: TuningSummary, period: float) -> None:
     """Print the lags, and play, fastest speeds and sags where there are any; period [s]."""
-    bends = [_row(one) for one in summary.parameters if any(f".{bend}" in one.key for bend in (*BENDS, "sag"))]
-    print_tables([table(_HEADINGS, [*_lags(summary), *bends])])
+    shown = ("lag of ", *(f".{bend}" for bend in (*BENDS, "sag")))
+    rows = [row[:-1] for row in formatting.fitted(summary) if any(part in row[0] for part in shown)]
+    print_tables([table(_HEADINGS, rows)])
     say(formatting.lag(period))
 
 
 def _show(summary: TuningSummary, period: float) -> None:
     """Print the summary on stdout; period [s]."""
-    print_tables([_parameters(summary)])
+    parameters = table([*_HEADINGS, ""], formatting.fitted(summary))
+    parameters.columns[0].no_wrap = True
+    print_tables([parameters])
     if summary.lags:
         say(formatting.lag(period))
     lines = [*formatting.chosen(summary.orders), *summary.not_identifiable]
@@ -124,52 +126,15 @@ def _show(summary: TuningSummary, period: float) -> None:
     for line in lines:
         say(line)
     likelihood = [
-        [axis, str(one.components), number(one.before, ".1f"), number(one.after, ".1f")]
-        for axis, one in summary.likelihood.items()
+        [axis, str(one.components), f"{one.before:.1f}", f"{one.after:.1f}"] for axis, one in summary.likelihood.items()
     ]
     print_tables([table(["fitted on", "measurements", "log-likelihood before", "after"], likelihood)])
-    if summary.validation:
-        print_tables([_validation(summary)])
+    validation = [
+        [one.run, one.axis, *of_sensor[:1], one.rmse, one.coverage, *of_sensor[1:]]
+        for one in map(formatting.validated, summary.validation or ())
+        for of_sensor in zip(one.sensors, one.nis, one.correlation, strict=True)
+    ]
+    headings = ["validated on", "axis", "sensor", "RMSE", "coverage", "NIS", "correlation at lag 1"]
+    print_tables([table(headings, validation)])
     for check in summary.validation or ():
         say(f"{check.run}, {check.axis}: {check.verdict}")
-
-
-def _parameters(summary: TuningSummary) -> Table:
-    """The lags and the parameters with their intervals."""
-    rows = [[*_row(one), one.notes] for one in summary.parameters]
-    made = table([*_HEADINGS, ""], [*([*row, ""] for row in _lags(summary)), *rows])
-    made.columns[0].no_wrap = True
-    return made
-
-
-def _row(one: Fitted) -> list[str]:
-    return [one.key, number(one.before, ".4g"), number(one.value, ".4g"), _limits(one.ci95)]
-
-
-def _lags(summary: TuningSummary) -> list[list[str]]:
-    return [
-        [f"lag of {axis}, ms", f"{one.before_ms:.4g}", f"{one.lag_ms:.4g}", _limits(one.lag_ms_ci95)]
-        for axis, one in summary.lags.items()
-    ]
-
-
-def _limits(ci95: tuple[float | None, float | None]) -> str:
-    low, high = ("…" if end is None else f"{end:.4g}" for end in ci95)
-    return "" if ci95 == (None, None) else f"{low} to {high}"
-
-
-def _validation(summary: TuningSummary) -> Table:
-    """Before and after, on what was validated on: a row for each axis and sensor."""
-    rows: list[list[str]] = []
-    for one in summary.validation or ():
-        since = f" from {one.since_s:.1f} s" if one.since_s else ""
-        pair = (one.before, one.after)
-        rmse = formatting.change_of_positions([state.rmse for state in pair], one.kind)
-        coverage = formatting.change([state.coverage for state in pair], ".3f")
-        for name in one.before.sensors:
-            sensors = [state.sensors.get(name) for state in pair]
-            nis = formatting.change([sensor and sensor.nis for sensor in sensors], ".2f")
-            correlation = formatting.change([sensor and sensor.correlation for sensor in sensors], "+.2f")
-            rows.append([one.run + since, one.axis, name, rmse, coverage, nis, correlation])
-    numbers = ("RMSE", "coverage", "NIS", "correlation at lag 1")
-    return table(["validated on", "axis", "sensor", *numbers], rows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from ..units import MS, SCREEN, Kind
 
 if TYPE_CHECKING:
     from ..tuning.identifiability import Correlation
+    from ..tuning.summary import TuningSummary
+    from ..tuning.validation import Check
 
 
 def with_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:
@@ -59,6 +61,30 @@ def chosen(orders: Mapping[str, str]) -> list[str]:
     return [head, *(f"{axis}: {why}" for axis, why in orders.items())] if orders else []
 
 
+def limits(ci95: tuple[float | None, float | None], computed: bool = True) -> str:
+    """The ends of an interval, … where nothing limits it; a dash where it was not computed."""
+    low, high = ("…" if end is None else f"{end:.4g}" for end in ci95)
+    return f"{low} to {high}" if computed or ci95 != (None, None) else "–"
+
+
+def fitted(summary: TuningSummary) -> list[list[str]]:
+    """Rows of the lags and the parameters: name, before, fitted, 95 % interval, and what to know of it."""
+    lags = [
+        [f"lag of {axis}, ms", f"{one.before_ms:.4g}", f"{one.lag_ms:.4g}", limits(one.lag_ms_ci95), ""]
+        for axis, one in summary.lags.items()
+    ]
+    return lags + [
+        [
+            one.key,
+            "–" if one.before is None else f"{one.before:.4g}",
+            f"{one.value:.4g}",
+            limits(one.ci95, not summary.interrupted),
+            one.notes,
+        ]
+        for one in summary.parameters
+    ]
+
+
 def p_value(value: float | None) -> str:
     """A p-value with three decimals; a dash without one."""
     return "–" if value is None else "< 0.001" if value < 1e-3 else f"{value:.3f}"
@@ -94,6 +120,40 @@ def change_of_positions(values: Sequence[float | None], kind: Kind) -> str:
     screen = SCREEN[kind]
     shown = change([None if value is None else value * screen.scale for value in values], ".3f")
     return shown if None in values else f"{shown} {screen.unit}"
+
+
+class Validated(NamedTuple):
+    """One axis of one run before and after a tuning, as text; of its sensors in a list each."""
+
+    run: str
+    axis: str
+    sensors: list[str]
+    nis: list[str]
+    correlation: list[str]
+    rejected: str
+    rmse: str
+    coverage: str
+
+
+def validated(check: Check) -> Validated:
+    """The numbers of a validation, joined by arrows."""
+    states = (check.before, check.after)
+    names = list(dict.fromkeys(name for state in states for name in state.sensors))
+
+    def changes(number: str, form: str) -> list[str]:
+        pairs = ([getattr(state.sensors.get(name), number, None) for state in states] for name in names)
+        return [change(pair, form) for pair in pairs]
+
+    return Validated(
+        run=f"{check.run} from {check.since_s:.1f} s" if check.since_s else check.run,
+        axis=check.axis,
+        sensors=names,
+        nis=changes("nis", ".2f"),
+        correlation=changes("correlation", "+z.2f"),
+        rejected=change([state.rejected for state in states], "d"),
+        rmse=change_of_positions([state.rmse for state in states], check.kind),
+        coverage=change([state.coverage for state in states], ".3f"),
+    )
 
 
 def together(pair: Correlation) -> str:

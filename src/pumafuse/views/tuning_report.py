@@ -18,7 +18,7 @@ from ..logs.run import Run
 from ..tuning.intervals import Profile
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning
-from ..tuning.validation import Check, fused
+from ..tuning.validation import fused
 from . import colours, formatting
 from .canvas import drawing, render
 from .figures import correlations, innovations
@@ -41,7 +41,8 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
     pairs = [(sensor, axis) for axis in after.axes for sensor in after.measurements.sensors]
     tests = {pair: (consistency(before, *pair), consistency(after, *pair)) for pair in pairs}
     tests = {pair: both for pair, both in tests.items() if any(both)}
-    known = [one for one in summary.parameters if one.before is not None]
+    intervals = found.conf_int()
+    known = [(one.before, *intervals[one.key]) for one in summary.parameters if one.before is not None]
     validated = [one.axis for one in summary.validation or ()]
     content = {
         "title": f"Tuning: {', '.join(summary.runs)}",
@@ -49,20 +50,21 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         "axes": [_axis(summary, axis) for axis in dict.fromkeys([*summary.lags, *validated])],
         "predicted": any(one.after.rmse is None for one in summary.validation or ()),
         "tuning": summary,
-        "notes": _notes(summary),
-        "lags": [
-            {"key": f"lag of {axis}, ms", "numbers": _numbers(one.before_ms, one.lag_ms, one.lag_ms_ci95), "notes": ""}
-            for axis, one in summary.lags.items()
+        "notes": [
+            *summary.notes,
+            *summary.not_identifiable,
+            *map(formatting.together, summary.correlations),
+            *formatting.chosen(summary.orders),
         ],
         "lag_words": formatting.lag(found.config.arm.update_period),
-        "parameters": [_parameter(one, summary.interrupted) for one in summary.parameters],
+        "fitted": formatting.fitted(summary),
         "known": len(known),
-        "outside": sum(not _contains(one.ci95, one.before) for one in known),
+        "outside": sum(not low <= value <= high for value, low, high in known),
         "zero": sum(one.value == 0.0 for one in summary.parameters),
         "open": not summary.interrupted and any(None in one.ci95 for one in summary.parameters),
         "two_maxima": [one.key for one in found.profiles if one.bimodal],
         "profiles": profile_figure(found.profiles, fitted) if found.profiles else None,
-        "validation": [_check(one) for one in summary.validation or ()],
+        "validation": [(formatting.validated(one), one) for one in summary.validation or ()],
         "innovations": [
             (innovation_figure(before, after, *pair, both), _sentence(*pair, both)) for pair, both in tests.items()
         ],
@@ -92,79 +94,28 @@ def _answer(summary: TuningSummary) -> str:
     return f"{found}. The error bars hold on {holding} of {len(checks)}."
 
 
-def _short(check: Check) -> str:
-    """What became of an axis, in a few words."""
-    return check.change if check.holds or check.change != "better" else "better, but its error bars do not hold"
-
-
 def _axis(summary: TuningSummary, axis: str) -> Mapping[str, Any]:
     """An axis's error and lag before and after, and what the validation says."""
     check = next((one for one in summary.validation or () if one.axis == axis), None)
-    lag = summary.lags.get(axis)
-    error, verdict = "–", "not validated"
+    error, verdict, late = "–", "not validated", "–"
     if check is not None:
-        pair, verdict = (check.before, check.after), _short(check)
-        names = [name for name, one in check.after.sensors.items() if one.skill is not None]
+        pair = (check.before, check.after)
+        verdict = check.change
+        if verdict == "better" and not check.holds:
+            verdict = "better, but its error bars do not hold"
         if check.after.rmse is not None:
             error = formatting.change_of_positions([one.rmse for one in pair], check.kind)
-        elif names:
-            skills = [[getattr(one.sensors.get(name), "skill", None) for one in pair] for name in names]
-            error = "; ".join(
-                f"{name} {formatting.change(both, '.2f')}" for name, both in zip(names, skills, strict=True)
-            )
-    late = "–"
-    if lag is not None:
-        before, after, interval = _numbers(lag.before_ms, lag.lag_ms, lag.lag_ms_ci95)
-        late = f"{before} → {after} ({interval})"
+        else:
+            skills = {
+                name: [getattr(one.sensors.get(name), "skill", None) for one in pair]
+                for name, one in check.after.sensors.items()
+                if one.skill is not None
+            }
+            error = "; ".join(f"{name} {formatting.change(both, '.2f')}" for name, both in skills.items()) or "–"
+    if lag := summary.lags.get(axis):
+        late = f"{lag.before_ms:.4g} → {lag.lag_ms:.4g} ({formatting.limits(lag.lag_ms_ci95)})"
     doubtful = check is not None and (check.worse or not check.holds)
     return {"axis": axis, "numbers": [error, late], "verdict": verdict, "doubtful": doubtful}
-
-
-def _notes(summary: TuningSummary) -> list[str]:
-    together = [formatting.together(pair) for pair in summary.correlations]
-    return [*summary.notes, *summary.not_identifiable, *together, *formatting.chosen(summary.orders)]
-
-
-def _parameter(one: Fitted, interrupted: bool) -> Mapping[str, Any]:
-    numbers = _numbers(one.before, one.value, one.ci95, interrupted)
-    return {"key": one.key, "numbers": numbers, "notes": one.notes}
-
-
-def _numbers(
-    before: float | None, value: float, ci95: tuple[float | None, float | None], interrupted: bool = True
-) -> list[str]:
-    """A number before and after with its interval, as cells; an interval that was not computed is a dash."""
-    low, high = ("…" if end is None else f"{end:.4g}" for end in ci95)
-    interval = "–" if interrupted and ci95 == (None, None) else f"{low} to {high}"
-    return ["–" if before is None else f"{before:.4g}", f"{value:.4g}", interval]
-
-
-def _check(one: Check) -> Mapping[str, Any]:
-    states = (one.before, one.after)
-    names = list(dict.fromkeys(name for state in states for name in state.sensors))
-
-    def changes(of: str, form: str) -> list[str]:
-        """A number of each sensor."""
-        pairs = ([getattr(state.sensors.get(name), of, None) for state in states] for name in names)
-        return [formatting.change(pair, form) for pair in pairs]
-
-    return {
-        "run": f"{one.run} from\u00a0{one.since_s:.1f}\u00a0s" if one.since_s else one.run,
-        "axis": one.axis,
-        "sensors": [names, changes("nis", ".2f"), changes("correlation", "+z.2f")],
-        "numbers": [
-            formatting.change([state.rejected for state in states], "d"),
-            formatting.change_of_positions([state.rmse for state in states], one.kind),
-            formatting.change([state.coverage for state in states], ".3f"),
-        ],
-        "verdict": one.verdict,
-        "worse": one.worse,
-    }
-
-
-def _contains(interval: tuple[float | None, float | None], value: float | None) -> bool:
-    low, high = interval
-    return value is None or ((low is None or low <= value) and (high is None or value <= high))
 
 
 def _sentence(sensor: str, axis: str, tests: _Pair) -> str:
