@@ -16,7 +16,7 @@ from ..identification.trials import StepTrials
 from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
 from ..model.plants import FirstOrder
-from ..tuning.latency import AxisLag, Latency, LatencySummary, SensorLag
+from ..tuning.latency import AxisLag, Latency, LatencySummary
 from ..tuning.parameters import rounded
 from ..units import KINDS, MS, SCREEN, Kind, Screen
 from . import formatting, step_figures
@@ -30,6 +30,7 @@ _TEXT = frozenset({"axis", "coefficient", "factor", "level: mean ± sd (trials)"
 }  # fmt: skip
 _PLANT = "a time constant of {} ms", "a natural frequency of {} rad/s with damping {}"
 _SPEED: dict[Kind, str] = {"length": "m/s", "angle": "rad/s"}  # the s of a gain line: slopes are per that in arm.toml
+_DEFAULTS = {"latency_sd_ms": 0.0, "scale": 1.0}  # of a sensor
 T = TypeVar("T")
 
 
@@ -57,10 +58,10 @@ def models(found: Identification) -> TextTable:
         delays, plant = one.delays, one.model.plant
         described = formatting.plant(plant).replace(", ", "\n")
         if isinstance(plant, FirstOrder):
-            own = formatting.milliseconds(one.time_constant_mean), formatting.milliseconds(one.time_constant_robust)
-            described += f"\ntrials' mean {own[0]},\nrobust {own[1]} ms"
+            mean, robust = map(formatting.milliseconds, (one.time_constant_mean, one.time_constant_robust))
+            described += f"\ntrials' mean {mean},\nrobust {robust} ms"
         gain = formatting.gain(one.model.gain).replace(" + ", "\n+ ")
-        times = [formatting.milliseconds(delay) for delay in (delays.lag, delays.fitted, delays.onset)]
+        times = map(formatting.milliseconds, (delays.lag, delays.fitted, delays.onset))
         rows.append([axis, str(one.trials), *times, described, gain, f"{_rms(found, axis) * screen.scale:.3f}"])
     line = f"K at speed s [{_SPEED[found.kind]}]"
     headings = ("axis", "trials", "lag, ms", "Td, ms", "onset, ms", "plant", line, f"RMS, {screen.unit}")
@@ -160,14 +161,11 @@ def answers(found: LatencySummary) -> list[str]:
     """How late each axis and each sensor is, whether that changes, and what the motion was too poor for."""
     lines = [f"{axis} is {formatting.between(one.lag, one.lag_ci95, MS)} ms late." for axis, one in found.axes.items()]
     for name, one in found.sensors.items():
-        sign = -1.0 if one.latency < 0.0 else 1.0
+        sign, word = (-1.0, "earlier") if one.latency < 0.0 else (1.0, "later")
         low, high = sorted(sign * end for end in one.latency_ci95)
         late = formatting.between(abs(one.latency), (low, high), MS)
-        word = "later" if one.latency >= 0.0 else "earlier"
-        same = one.latency_ci95[0] < 0.0 < one.latency_ci95[1]
-        lines.append(
-            f"{name} is {late} ms {word} than {found.sensor}{': as late, as far as can be told' if same else ''}."
-        )
+        same = ": as late, as far as can be told" if low < 0.0 < high else ""
+        lines.append(f"{name} is {late} ms {word} than {found.sensor}{same}.")
     lines.append(
         "An axis is late behind the held command, at constant velocity; behind the commanded path it is"
         f" {0.5 * found.update_period * MS:.3g} ms more. The stamps of {found.sensor} are taken to be right: by as much"
@@ -207,16 +205,10 @@ def lags(found: LatencySummary) -> TextTable:
     def time(value: float, interval: tuple[float, float], shared: bool = False) -> str:
         return formatting.between(value, interval, MS).replace(" (", f"{' *' if shared else ''}\n(", 1)
 
-    rows = [
-        [
-            axis,
-            time(one.lag, one.lag_ci95),
-            time(one.delay, one.delay_ci95, one.shared_delay),
-            _plant_of(one),
-            _gain_of(one),
-        ]
-        for axis, one in found.axes.items()
-    ]
+    rows = list[list[str]]()
+    for axis, one in found.axes.items():
+        delay = time(one.delay, one.delay_ci95, one.shared_delay)
+        rows.append([axis, time(one.lag, one.lag_ci95), delay, _plant_of(one), _gain_of(one)])
     rows += [[name, time(one.latency, one.latency_ci95), "", "", ""] for name, one in found.sensors.items()]
     return TextTable(("axis,\nsensor", "late, ms", "dead time, ms", "plant", "gain"), rows)
 
@@ -243,37 +235,29 @@ def _gain_of(one: AxisLag) -> str:
 
 
 def settings(found: Latency) -> str:
-    """The lines for ``fusion.toml`` and ``arm.toml``."""
-    lines = [
-        toml.text({"sensors": {name: {key: rounded(value) for key, value in _fitted_keys(one).items()}}})
-        for name, one in found.details.sensors.items()
-    ]
+    """The lines for ``fusion.toml`` and ``arm.toml``; of a sensor what differs from the defaults."""
+    lines = list[str]()
+    for name, one in found.details.sensors.items():
+        numbers = {"latency_ms": one.latency, "latency_sd_ms": one.latency_sd or 0.0, "scale": one.scale}
+        kept = {key: rounded(value) for key, value in numbers.items() if value != _DEFAULTS.get(key)}
+        lines.append(toml.text({"sensors": {name: kept}}))
     return "\n".join([*lines, found.config.arm.to_toml()])
-
-
-def _fitted_keys(one: SensorLag) -> dict[str, float]:
-    """What differs from a sensor's defaults."""
-    more = {"latency_sd_ms": one.latency_sd} if one.latency_sd else {}
-    return {"latency_ms": one.latency, **more, **({"scale": one.scale} if one.scale != 1.0 else {})}
 
 
 def elsewhere(found: LatencySummary) -> list[str]:
     """What to write for other programs, in their units."""
     latest = max(one.lag for one in found.axes.values()) + 0.5 * found.update_period
-    steps, plants, dead = list[str](), list[str](), list[str]()
-    for axis, one in found.axes.items():
-        low, high = math.floor(one.delay_ci95[0] / _PHYSICS), math.ceil(one.delay_ci95[1] / _PHYSICS)
-        steps.append(f"{axis} {max(low, 0)} to {high}")
-        plants.append(f"{axis} {max(one.lag - one.delay, 0.0):.4f}")
-        dead.append(f"{axis} {one.delay:.4f}")
+    ends = {axis: [end / _PHYSICS for end in one.delay_ci95] for axis, one in found.axes.items()}
+    steps = ", ".join(f"{axis} {max(math.floor(low), 0)} to {math.ceil(high)}" for axis, (low, high) in ends.items())
+    plants = ", ".join(f"{axis} {max(one.lag - one.delay, 0.0):.4f}" for axis, one in found.axes.items())
+    dead = ", ".join(f"{axis} {one.delay:.4f}" for axis, one in found.axes.items())
     every = f"{_PHYSICS * MS:g} ms"
-    lines = [
+    return [
         f"MoveIt Servo, max_expected_latency [s]: {latest:.3f}, of the axis that is latest",
-        f"Isaac Lab, DelayedPDActuatorCfg(min_delay, max_delay) [physics steps of {every}]: {', '.join(steps)}",
+        f"Isaac Lab, DelayedPDActuatorCfg(min_delay, max_delay) [physics steps of {every}]: {steps}",
         f"mjlab, delay_min_lag and delay_max_lag of an actuator [physics steps of {every}]: the same",
-        f'MuJoCo, dynprm of dyntype="filterexact" [s]: {", ".join(plants)}; actuator_delay [s]: {", ".join(dead)}',
-    ]
-    return lines + [
+        f'MuJoCo, dynprm of dyntype="filterexact" [s]: {plants}; actuator_delay [s]: {dead}',
+    ] + [
         f"LeRobot, {name}: a frame shows what was {one.latency:.3f} s before its stamp; shift its delta_timestamps by"
         " that, in multiples of 1/fps"
         for name, one in found.sensors.items()
