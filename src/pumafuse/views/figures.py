@@ -52,7 +52,7 @@ def fused_figure(est: Estimates) -> Figure:
                 _measurements(axes, est, name)
                 _band(axes, est, name, position)
                 axes.plot(est.time, position * screen.scale, color=colours.ESTIMATE, lw=1.0, label="estimate")
-                _reference(axes, est, name)
+                _reference(axes, est.reference, name, screen.scale)
                 axes.set_ylabel(f"{name} [{screen.unit}]")
                 low, high = float(shown.min()) * screen.scale, float(shown.max()) * screen.scale
                 margin = 0.1 * (high - low) + 0.5
@@ -87,25 +87,22 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
                     if axis in one.axes:
                         position = positions[name][axis] * screen.scale
                         axes.plot(one.time, position, lw=1.0, color=colour[name], label=name)
-                if reference is not None and axis in reference.position:
-                    value = reference.position[axis] * screen.scale
-                    axes.plot(reference.time, value, color=colours.REFERENCE, lw=0.8, ls="--", label="reference")
+                _reference(axes, reference, axis, screen.scale)
                 axes.set_ylabel(f"{axis} [{screen.unit}]")
-            shown: list[FloatArray] = []
+            what, shown = "difference", [np.zeros(1)]
             for name, one in results.items():
                 if axis not in one.axes or (reference is None and one is first):
                     continue
                 if reference is not None and axis in reference.position:
-                    rest = positions[name][axis] - interpolated(one.time, one.segment, reference, axis)
+                    what, apart = "error", interpolated(one.time, one.segment, reference, axis)
                 else:
-                    rest = positions[name][axis] - np.interp(one.time, first.time, first.axes[axis].position)
-                shown.append(rest)
+                    apart = np.interp(one.time, first.time, first.axes[axis].position)
+                shown.append(positions[name][axis] - apart)
                 for axes in (left, left_zoom):
-                    axes.plot(one.time, rest * screen.scale, lw=0.8, color=colour[name])
-            limit = _reach(np.concatenate([np.zeros(1), *shown])) * screen.scale
+                    axes.plot(one.time, shown[-1] * screen.scale, lw=0.8, color=colour[name])
+            limit = _reach(np.concatenate(shown)) * screen.scale
             for axes in (left, left_zoom):
                 axes.set_ylim(-limit, limit)
-                what = "error" if reference is not None and axis in reference.position else "difference"
                 axes.set_ylabel(f"{axis}: {what} [{screen.unit}]")
             for axes in (zoom, left_zoom):
                 axes.set_xlim(start, start + _ZOOM_S)
@@ -238,22 +235,14 @@ def lag_figures(found: Latency) -> Markup:
             scale = found.config.sensors[summary.sensor].scale
             apart = value - scale * moved[np.searchsorted(fine, stamp)]
             value = (value - float(np.median(apart))) / scale
-            begin = _busiest(seconds(given, origin), command, max(_ZOOM_S, 8.0 * one.lag))
-            end = begin + max(_ZOOM_S, 8.0 * one.lag)
-            time = seconds(given, origin)
+            time, seen, length = seconds(given, origin), seconds(stamp, origin), max(_ZOOM_S, 8.0 * one.lag)
+            begin = _busiest(time, command, length)
             motion.step(time, command * screen.scale, where="post", color=colours.COMMAND, lw=1, label="command")
-            motion.plot(
-                seconds(stamp, origin),
-                value * screen.scale,
-                ".",
-                ms=4,
-                color=colour,
-                label=summary.sensor,
-            )
+            motion.plot(seen, value * screen.scale, ".", ms=4, color=colour, label=summary.sensor)
             motion.plot(seconds(fine, origin), moved * screen.scale, color=colours.ESTIMATE, lw=1.2, label="model")
-            shown = command[(time >= begin - 1.0) & (time <= end)] * screen.scale
+            shown = command[(time >= begin - 1.0) & (time <= begin + length)] * screen.scale
             margin = 0.08 * float(np.ptp(shown)) + 1e-3
-            motion.set(xlim=(begin, end), ylim=(float(shown.min()) - margin, float(shown.max()) + margin))
+            motion.set(xlim=(begin, begin + length), ylim=(float(shown.min()) - margin, float(shown.max()) + margin))
             motion.set_title(f"{axis}: {one.lag * MS:.1f} ms late", loc="left")
             motion.set_ylabel(f"{axis} [{screen.unit}]")
             if one.course:
@@ -317,12 +306,8 @@ def _travelled(result: Result) -> FloatArray:
 
 def _fit_height(axes: Axes, start: float, end: float) -> None:
     """Let an axis reach as far as its lines do between two times."""
-    shown = list[FloatArray]()
-    for line in axes.lines:
-        time, value = np.asarray(line.get_xdata(), dtype=np.float64), np.asarray(line.get_ydata(), dtype=np.float64)
-        shown.append(value[(time >= start) & (time <= end)])
-    inside = np.concatenate(shown)
-    inside = inside[np.isfinite(inside)]
+    time, value = np.concatenate([np.asarray(line.get_xydata(), dtype=np.float64) for line in axes.lines]).T
+    inside = value[(time >= start) & (time <= end) & np.isfinite(value)]
     if len(inside):
         margin = 0.1 * float(np.ptp(inside)) + 0.5
         axes.set_ylim(float(inside.min()) - margin, float(inside.max()) + margin)
@@ -344,10 +329,10 @@ def _commands(axes: Axes, est: Estimates, name: str) -> None:
     axes.step(time, value * scale, where="post", color=colours.COMMAND, lw=1, label="command")
 
 
-def _reference(axes: Axes, est: Estimates, name: str) -> None:
-    if est.reference is not None and name in est.reference.position:
-        value = est.reference.position[name] * est.config.arm.screen_of(name).scale
-        axes.plot(est.reference.time, value, color=colours.REFERENCE, lw=0.8, ls="--", label="reference")
+def _reference(axes: Axes, reference: ReferenceTrack | None, name: str, scale: float) -> None:
+    if reference is not None and name in reference.position:
+        value = reference.position[name] * scale
+        axes.plot(reference.time, value, color=colours.REFERENCE, lw=0.8, ls="--", label="reference")
 
 
 def _band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
@@ -391,6 +376,5 @@ def _dots(axes: Axes, est: Estimates, sensor: str, measured: Measurements, scale
     axes.plot(time[~rejected], value[~rejected], ".", ms=2.5, color=colour, label=sensor)
     if itself.any():
         axes.plot(time[itself], value[itself], "x", ms=4, color=colours.REJECTED, label=f"{sensor}, rejected")
-    if (rejected & ~itself).any():
-        others = rejected & ~itself
+    if (others := rejected & ~itself).any():
         axes.plot(time[others], value[others], "x", ms=3, color=colour, alpha=0.5, label=f"{sensor}, with its row")

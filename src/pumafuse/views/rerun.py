@@ -12,7 +12,7 @@ shows both as one. Its entities are below ``pumafuse/``, on the recording's time
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
 
@@ -185,61 +185,37 @@ def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:
         for name, axis in est.axes.items()
     }
     legend = _free_corner(est, start, end, spans)
-    positions, innovations, residuals = (list[rrb.TimeSeriesView]() for _ in range(3))
+    positions, innovations, residuals = (dict[str, rrb.View]() for _ in range(3))
     for name, span in spans.items():
         unit, limit = est.config.arm.screen_of(name).unit, _residual_span(est, name)
         corner = legend[1] if name == legend[0] else None
-        positions.append(_plot(f"/{name}", f"{name} [{unit}]", (start, end), span, corner))
-        if name not in _measured(est):
-            continue
-        title = f"{name}: innovation / its standard deviation, ±2"
-        innovations.append(_plot(f"/innovation/{name}", title, whole, (-5.0, 5.0)))
-        title = f"{name}: measurement − estimate [{unit}]"
-        residuals.append(_plot(f"/residual/{name}", title, whole, (-limit, limit)))
-    layout: rrb.Container = rrb.Grid(*positions, grid_columns=1 if len(positions) < _TWO_COLUMNS else 2)
+        positions[name] = _plot(f"/{name}", f"{name} [{unit}]", (start, end), span, corner)
+        if name in _measured(est):
+            title = f"{name}: innovation / its standard deviation, ±2"
+            innovations[name] = _plot(f"/innovation/{name}", title, whole, (-5.0, 5.0))
+            title = f"{name}: measurement − estimate [{unit}]"
+            residuals[name] = _plot(f"/residual/{name}", title, whole, (-limit, limit))
+    of_sensors = {"innovations": innovations, "residuals": residuals} if innovations else {}
+    aside = list[tuple[rrb.View | rrb.Container, float]]()  # with their shares of the height
     if est.turns:
-        return rrb.Blueprint(
-            _of_turning(views(est, run), est, positions, innovations, residuals, whole), collapse_panels=True
-        )
-    right, shares = list[rrb.View | rrb.Container](), list[float]()
-    if est.cartesian is not None or in_space(est.config.arm):
-        right.append(rrb.Spatial3DView(origin="/path", name="path [mm]"))
-        shares.append(3.0)
-    if innovations:
-        tabs = rrb.Tabs(rrb.Vertical(*innovations, name="innovations"), rrb.Vertical(*residuals, name="residuals"))
-        right += [tabs, _outcome_view(whole)]
-        shares += [4.0, 0.6 + 0.4 * len(est.measurements.sensors)]
-    if right:
-        layout = rrb.Horizontal(layout, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2])
+        aside += zip(views(est, run), (5.0, 3.0), strict=False)
+    elif est.cartesian is not None or in_space(est.config.arm):
+        aside.append((rrb.Spatial3DView(origin="/path", name="path [mm]"), 3.0))
+    if of_sensors and not est.turns:
+        tabs = (rrb.Vertical(*plots.values(), name=name) for name, plots in of_sensors.items())
+        aside.append((rrb.Tabs(*tabs), 4.0))
+    if of_sensors:
+        time = rrb.TimeAxis(view_range=_range(whole))
+        outcomes = rrb.StateTimelineView(origin="/outcome", name="outcomes", time_view=time)
+        aside.append((outcomes, 0.6 + 0.4 * len(est.measurements.sensors)))
+    column = rrb.Vertical(*(view for view, _ in aside), row_shares=[share for _, share in aside])
+    if est.turns:
+        every = {"positions": positions} | of_sensors
+        tabs = (by_kind(plots, est.config.arm.kind_of, name) for name, plots in every.items())
+        return rrb.Blueprint(rrb.Horizontal(column, rrb.Tabs(*tabs), column_shares=[1, 1]), collapse_panels=True)
+    grid = rrb.Grid(*positions.values(), grid_columns=1 if len(positions) < _TWO_COLUMNS else 2)
+    layout = rrb.Horizontal(grid, column, column_shares=[3, 2]) if aside else grid
     return rrb.Blueprint(layout, collapse_panels=True)
-
-
-def _of_turning(
-    scene: Sequence[rrb.View],
-    est: Estimates,
-    positions: Sequence[rrb.View],
-    innovations: Sequence[rrb.View],
-    residuals: Sequence[rrb.View],
-    whole: tuple[float, float],
-) -> rrb.Container:
-    """The scene and outcomes on the left; on the right tabs of axes, those of rotations beside those of positions."""
-    measured = [axis for axis in est.axes if axis in _measured(est)]
-
-    def tab(plots: Sequence[rrb.View], axes: Iterable[str], name: str) -> rrb.Container:
-        return by_kind(dict(zip(axes, plots, strict=True)), est.config.arm.kind_of, name)
-
-    left, tabs = list[rrb.View | rrb.Container](scene), [tab(positions, est.axes, "positions")]
-    shares = [5.0, 3.0][: len(left)]
-    if innovations:
-        tabs += [tab(innovations, measured, "innovations"), tab(residuals, measured, "residuals")]
-        left.append(_outcome_view(whole))
-        shares.append(0.6 + 0.4 * len(est.measurements.sensors))
-    return rrb.Horizontal(rrb.Vertical(*left, row_shares=shares), rrb.Tabs(*tabs), column_shares=[1, 1])
-
-
-def _outcome_view(whole: tuple[float, float]) -> rrb.StateTimelineView:
-    time = rrb.TimeAxis(view_range=_range(whole))
-    return rrb.StateTimelineView(origin="/outcome", name="outcomes", time_view=time)
 
 
 def _plot(
