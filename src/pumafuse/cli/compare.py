@@ -122,7 +122,7 @@ def verdict(compared: Sequence[Compared]) -> tuple[str | None, str]:
     by_error = _shared([_errors(one.scores) for one in compared])
     if by_error is not None:
         return _least(compared, by_error, "its error against the reference (RMSE, mean over the axes) is")
-    if len({str((_components(one.result), _gates(one.result))) for one in compared}) == 1:
+    if all(_measured(one.result) == _measured(compared[0].result) for one in compared):
         likelihood = [sum(axis.log_likelihood for axis in one.axes.values()) for one in every]
         order = sorted(range(len(compared)), key=lambda number: -likelihood[number])
         best, second = (compared[number].name for number in order[:2])
@@ -155,19 +155,14 @@ def _shared(each: Sequence[Mapping[str, float]]) -> list[float] | None:
     return [sum(one[key] for key in keys) / len(keys) for one in each] if keys else None
 
 
-def _components(result: Result) -> dict[str, int]:
-    """How many components of which sensor on which axis were fused or rejected."""
+def _measured(result: Result) -> dict[tuple[str, str], tuple[int, float | None]]:
+    """By axis and sensor how many components were fused or rejected, and by which gate."""
+    gates = {name: one.gate for name, one in result.config.sensors.items()}
     return {
-        f"{axis}, {name}": sum(one.outcomes.get(word, 0) for word in ("fused", "rejected", "reacquired"))
+        (axis, name): (sum(one.outcomes.get(word, 0) for word in ("fused", "rejected", "reacquired")), gates.get(name))
         for axis, part in result.summary.axes.items()
         for name, one in part.sensors.items()
     }
-
-
-def _gates(result: Result) -> dict[str, float]:
-    """The gates of the sensors that have components."""
-    names = {name for part in result.summary.axes.values() for name in part.sensors}
-    return {name: one.gate for name, one in result.config.sensors.items() if name in names}
 
 
 def _errors(scores: Mapping[str, ScoreSummary]) -> dict[str, float]:

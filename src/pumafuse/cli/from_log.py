@@ -112,17 +112,13 @@ def run(
 def _without(found: Survey, lost: LostError) -> Survey:
     """What was found, without axes on which a sensor follows nothing; raises the error if nothing else follows."""
     bad = {(name, axis) for name in lost.fault.sensors for axis in lost.fault.axes}
-    there = {(name, axis) for name, one in found.run.sensors.items() for axis in one.values}
-    kept = {name: [axis for mine, axis in there - bad if mine == name] for name in found.run.sensors}
+    there = {name: one.values for name, one in found.run.sensors.items()}
+    kept = {name: {axis: of[axis] for axis in of if (name, axis) not in bad} for name, of in there.items()}
     related = {key: one for key, one in found.relations.items() if key not in bad}
     follows = any(abs(one.correlation) >= FOLLOWS for (name, _), one in related.items() if name in kept)
-    if lost.fault.cause != "nothing" or not follows or bad.isdisjoint(there):
+    if lost.fault.cause != "nothing" or not follows or all(len(kept[name]) == len(there[name]) for name in there):
         raise lost
-    sensors = {
-        name: replace(one, values={axis: value for axis, value in one.values.items() if axis in kept[name]})
-        for name, one in found.run.sensors.items()
-        if kept[name]
-    }
+    sensors = {name: replace(found.run.sensors[name], values=values) for name, values in kept.items() if values}
     return replace(found, run=replace(found.run, sensors=sensors), relations=related)
 
 
