@@ -62,18 +62,16 @@ ANGLES = ("_rad", "_mrad", "_deg")
 TIMES = ("_s", "_ms", "_us", "_ns")
 OF_KIND: dict[Kind, tuple[str, ...]] = {"length": LENGTHS, "angle": ANGLES}
 SPEEDS: dict[Kind, tuple[str, ...]] = {"length": ("_m_s", "_mm_s"), "angle": ("_deg_s", "_rad_s")}  # first: on screens
-_EXPONENTS = {  # power of ten to SI -> endings of names
-    0: ("_m", "_s", "_m_s", "_rad_s", "_s_m", "_rad", "_s_rad", "_deg_rtHz_per_deg_s", "_deg_rts_per_deg_s"),
-    -3: ("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mm_rtHz_per_m_s", "_mm_rts_per_m_s", "_mrad"),
-    -6: ("_um", "_us"),
-    -9: ("_ns",),
-}
 _UNNAMED = {"cm": 0.01, "inch": 0.0254}  # lengths that no name may end in, and that people write all the same
 _SAME = 1.2  # tolerance of a factor between two units
-_DEGREES = ("_deg", "_deg_s", "_deg_rtHz", "_deg_rts")
-_UNITS: dict[str, int | None] = {  # of names; None: degrees
-    **{ending: exponent for exponent, endings in _EXPONENTS.items() for ending in endings},
-    **dict.fromkeys(_DEGREES, None),
+_UNITS: dict[str, int | None] = {  # endings of names -> power of ten to SI; None: degrees
+    **dict.fromkeys(("_m", "_s", "_m_s", "_s_m", "_rad", "_rad_s", "_s_rad"), 0),
+    **dict.fromkeys(("_deg_rtHz_per_deg_s", "_deg_rts_per_deg_s"), 0),
+    **dict.fromkeys(("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mrad"), -3),
+    **dict.fromkeys(("_mm_rtHz_per_m_s", "_mm_rts_per_m_s"), -3),
+    **dict.fromkeys(("_um", "_us"), -6),
+    "_ns": -9,
+    **dict.fromkeys(("_deg", "_deg_s", "_deg_rtHz", "_deg_rts"), None),
 }
 _AS_ANGLE = {  # endings that carry the kind of an axis
     "_mm_rtHz_per_m_s": "_deg_rtHz_per_deg_s",
@@ -142,7 +140,7 @@ def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def from_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """The inverse of :func:`to_si`: SI numbers in the units of their names."""
-    return _converted(tree, "", "", _in_unit)
+    return _converted(tree, "", "", lambda value, unit, _: in_unit(value, unit) if unit else float(value))
 
 
 def mistaken(factor: float, endings: Iterable[str]) -> list[tuple[str, str]]:
@@ -264,7 +262,3 @@ def _si(value: float | Decimal, unit: str, path: str) -> float:
     if not math.isfinite(number) and not path.endswith(INTERVAL):
         raise ConfigError(f"{path}: {str(value)[:24]} is not a finite number")
     return number
-
-
-def _in_unit(value: float, unit: str, _: str) -> float | Decimal:
-    return in_unit(value, unit) if unit else float(value)

@@ -33,6 +33,10 @@ ROS_ARGS = "--ros-args"  # what is behind it is for ROS, not for typer
 
 Runs = Annotated[list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")]
 Config = Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")]
+FoundConfig = Annotated[
+    Path | None,
+    Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors; default: found in the log."),
+]
 Rate = Annotated[float | None, Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")]
 From = Annotated[
     float | None, Option("--from", metavar="S", help="Begin S seconds after the first command; earlier commands count.")
@@ -85,10 +89,7 @@ def fuse(
         list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables; without -c one log.")
     ],
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")],
-    config: Annotated[
-        Path | None,
-        Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors; default: found in the log."),
-    ] = None,
+    config: FoundConfig = None,
     sensors: Annotated[str | None, Option(metavar="A,B", help="Which sensors to use; default: all configured.")] = None,
     rate: Rate = None,
     smooth: Annotated[bool, Option("--smooth", help="Use later measurements too; gives no velocity.")] = False,
@@ -133,10 +134,7 @@ def fuse(
 @app.command()
 def register(
     runs: Runs,
-    config: Annotated[
-        Path | None,
-        Option("--config", "-c", metavar="FUSION.TOML", help="Arm and sensors; default: found in the runs."),
-    ] = None,
+    config: FoundConfig = None,
     sensor: Annotated[str | None, Option(metavar="NAME", help="Which one; default: each that gives x, y, z.")] = None,
     fix: Annotated[str | None, Option(metavar="marker,latency", help="What stays as configured.")] = None,
     output: Annotated[
@@ -418,15 +416,11 @@ def _unexpected(error: Exception) -> str:
     import traceback
     from importlib.metadata import version
 
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    given = [next((one for one in frame.f_locals.values() if isinstance(one, Path)), None) for frame in frames]
-    read = next((f", reading {path}" for path in reversed(given) if path is not None and path.exists()), "")
-    package = Path(__file__).parents[1]
-    where = [
-        f"{Path(one.filename).relative_to(package)}:{one.lineno}"
-        for one in traceback.extract_tb(error.__traceback__)
-        if Path(one.filename).is_relative_to(package)
-    ]
+    frames, package = list(traceback.walk_tb(error.__traceback__)), Path(__file__).parents[1]
+    paths = [one for frame, _ in frames for one in frame.f_locals.values() if isinstance(one, Path) and one.exists()]
+    read = f", reading {paths[-1]}" if paths else ""
+    files = [(Path(frame.f_code.co_filename), line) for frame, line in frames]
+    where = [f"{file.relative_to(package)}:{line}" for file, line in files if file.is_relative_to(package)]
     return printable(
         f"{shlex.join(sys.argv[1:])}: unexpected {type(error).__name__}: {error}{read}. This is a fault of pumafuse:"
         f" please report it with this line and the log, or a part that shows it ({version('pumafuse')};"

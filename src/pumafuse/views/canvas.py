@@ -1,17 +1,15 @@
-"""HTML pages from templates, and matplotlib's canvas in the style of all pictures."""
+"""HTML pages from templates, and matplotlib's figures in the style of all pictures."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 
@@ -21,23 +19,17 @@ def render(template: str, content: Mapping[str, Any]) -> str:
     return pages.get_template(template).render(content)
 
 
-@dataclass
-class Canvas:
-    """A figure and its axes, row by row."""
+def legend(figure: Figure) -> None:
+    """Say below all axes what the lines of the first are: inside they would cover data."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
 
-    figure: Figure
-    axes: list[Axes]
 
-    def legend(self, number: int) -> None:
-        """Say below all axes what the lines of one are: inside they would cover data."""
-        handles, labels = self.axes[number].get_legend_handles_labels()
-        self.figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
-
-    def svg(self) -> Markup:
-        """The picture as text for a page."""
-        text = io.StringIO()
-        self.figure.savefig(text, format="svg", metadata={"Date": None})
-        return Markup(text.getvalue()[text.getvalue().index("<svg") :])
+def svg(figure: Figure) -> Markup:
+    """A picture as text for a page."""
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None})
+    return Markup(text.getvalue()[text.getvalue().index("<svg") :])
 
 
 @contextmanager
@@ -50,8 +42,8 @@ def drawing(
     ratios: Sequence[float] | None = None,
     sharex: Literal["none", "col"] = "none",
     projection: Literal["3d"] | None = None,
-) -> Generator[Canvas]:
-    """A canvas of ``rows`` by ``columns`` axes; what is drawn and saved in the block is in our style."""
+) -> Generator[Figure]:
+    """A figure of ``rows`` by ``columns`` axes, row by row; what is drawn and saved in the block is in our style."""
     with matplotlib.rc_context(
         {
             "font.size": 9,
@@ -64,5 +56,5 @@ def drawing(
     ):
         subplot = {} if projection is None else {"projection": projection}
         figure = Figure(figsize=(width or 3.6 * columns, height * rows), layout="constrained")
-        grid = figure.subplots(rows, columns, squeeze=False, sharex=sharex, width_ratios=ratios, subplot_kw=subplot)
-        yield Canvas(figure, grid.ravel().tolist())
+        figure.subplots(rows, columns, sharex=sharex, width_ratios=ratios, subplot_kw=subplot)
+        yield figure

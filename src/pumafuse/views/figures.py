@@ -25,7 +25,7 @@ from ..logs.run import Run
 from ..tuning.latency import Latency
 from ..units import MS, SCREEN, seconds
 from . import colours
-from .canvas import Canvas, drawing
+from .canvas import drawing, legend, svg
 
 _ZOOM_S = 2.0  # length of the detail in which the band and single measurements can be seen
 _NEARLY_ALL, _LEAST = 0.99, 1e-9  # of what is drawn; m or rad
@@ -43,9 +43,9 @@ def fused_figure(est: Estimates) -> Figure:
     """
     start, end = est.busiest(_ZOOM_S)
     zoomed = (est.time >= start) & (est.time <= end)
-    with _figure(est, 2 * len(est.axes), [_TIME, _TIME], [1.0, 1.0]) as canvas:
+    with _figure(est, 2 * len(est.axes), [_TIME, _TIME], [1.0, 1.0]) as figure:
         for number, name in enumerate(est.axes):
-            whole, zoom, left, left_zoom = canvas.axes[4 * number : 4 * number + 4]
+            whole, zoom, left, left_zoom = figure.axes[4 * number : 4 * number + 4]
             position, screen = est[name].position, est.config.arm.screen_of(name)
             for axes, shown in ((whole, position), (zoom, position[zoomed])):
                 _commands(axes, est, name)
@@ -65,8 +65,8 @@ def fused_figure(est: Estimates) -> Figure:
             if est.since is not None or est.until is not None:
                 for axes in (whole, left):
                     axes.set_xlim(est.time[0], max(est.time[-1], est.time[0] + 1e-3))
-        canvas.legend(0)
-    return canvas.figure
+        legend(figure)
+    return figure
 
 
 def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack | None, why: str) -> Figure:
@@ -78,10 +78,10 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
     start = _busiest(first.time, _travelled(first), _ZOOM_S)
     colour = dict(zip(results, colours.several(len(results)), strict=True))
     positions = {name: one.positions(first.config) for name, one in results.items()}
-    with drawing(2, 2 * len(first.axes), width=13.0, height=2.4, sharex="col") as canvas:
+    with drawing(2, 2 * len(first.axes), width=13.0, height=2.4, sharex="col") as figure:
         for number, axis in enumerate(first.axes):
             screen = first.config.arm.screen_of(axis)
-            whole, zoom, left, left_zoom = canvas.axes[4 * number : 4 * number + 4]
+            whole, zoom, left, left_zoom = figure.axes[4 * number : 4 * number + 4]
             for axes in (whole, zoom):
                 for name, one in results.items():
                     if axis in one.axes:
@@ -107,11 +107,11 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
             for axes in (zoom, left_zoom):
                 axes.set_xlim(start, start + _ZOOM_S)
             _fit_height(zoom, start, start + _ZOOM_S)
-        for axes in canvas.axes[-2:]:
+        for axes in figure.axes[-2:]:
             axes.set_xlabel(_TIME)
-        canvas.legend(0)
-        canvas.figure.suptitle(why)
-    return canvas.figure
+        legend(figure)
+        figure.suptitle(why)
+    return figure
 
 
 def path_figure(est: Estimates, run: Run) -> Figure | None:
@@ -120,8 +120,8 @@ def path_figure(est: Estimates, run: Run) -> Figure | None:
     estimated, command = est.cartesian or own, run.command.values
     if not all(name in estimated for name in CARTESIAN):
         return None
-    with drawing(1, width=8.0, height=7.0, projection="3d") as canvas:
-        (axes,) = canvas.axes
+    with drawing(1, width=8.0, height=7.0, projection="3d") as figure:
+        (axes,) = figure.axes
         lines = {"command": (command, colours.COMMAND, 1.0), "estimate": (estimated, colours.ESTIMATE, 1.2)}
         for label, (values, colour, width) in lines.items():
             if all(name in values for name in CARTESIAN):
@@ -135,8 +135,8 @@ def path_figure(est: Estimates, run: Run) -> Figure | None:
             axis.set_label_text(f"{name} [{SCREEN['length'].unit}]")
             axis.labelpad = 12.0
         axes.legend(loc="upper left", frameon=False)
-        canvas.figure.suptitle(f"{est.run}: path, {est.mode}, arm {est.config.arm.name}")
-    return canvas.figure
+        figure.suptitle(f"{est.run}: path, {est.mode}, arm {est.config.arm.name}")
+    return figure
 
 
 def error_figure(est: Estimates) -> Figure | None:
@@ -160,8 +160,8 @@ def error_figure(est: Estimates) -> Figure | None:
     found = {name: one for name, one in scores.items() if one is not None}
     if not found:
         return None
-    with _figure(est, len(found), [_TIME], [1.0]) as canvas:
-        for axes, (name, one) in zip(canvas.axes, found.items(), strict=True):
+    with _figure(est, len(found), [_TIME], [1.0]) as figure:
+        for axes, (name, one) in zip(figure.axes, found.items(), strict=True):
             screen = est.config.arm.screen_of(name)
             error = est[name].position - interpolated(est.time, est.segment, est.reference, name)
             for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
@@ -179,8 +179,8 @@ def error_figure(est: Estimates) -> Figure | None:
             axes.set_ylabel(f"error [{screen.unit}]")
             limit = _reach(np.concatenate([error, Z95 * est[name].position_sd])) * screen.scale
             axes.set_ylim(-limit, limit)
-        canvas.legend(0)
-    return canvas.figure
+        legend(figure)
+    return figure
 
 
 def validation_figure(est: Estimates) -> Figure | None:
@@ -200,9 +200,9 @@ def validation_figure(est: Estimates) -> Figure | None:
         return None
     at = np.linspace(-4.5, 4.5, 91)
     labels = ["time [s]", "innovation / sd", "lag [measurements]"]
-    with _figure(est, len(rows), labels, [3.0, 1.0, 1.0]) as canvas:
+    with _figure(est, len(rows), labels, [3.0, 1.0, 1.0]) as figure:
         for number, (sensor, axis, found) in enumerate(rows):
-            series, histogram, correlation = canvas.axes[3 * number : 3 * number + 3]
+            series, histogram, correlation = figure.axes[3 * number : 3 * number + 3]
             normalised = innovations(series, est, sensor, axis, by_sensor[sensor])
             series.set_title(f"{axis}, {sensor}. {sentence(found)}", loc="left")
             series.set_ylabel("innovation / sd")
@@ -212,7 +212,7 @@ def validation_figure(est: Estimates) -> Figure | None:
             histogram.set_ylabel("density")
             correlations(correlation, [found], [by_sensor[sensor]])
             correlation.set_ylabel("autocorrelation")
-    return canvas.figure
+    return figure
 
 
 def lag_figures(found: Latency) -> Markup:
@@ -225,8 +225,8 @@ def lag_figures(found: Latency) -> Markup:
     axes = [axis for axis in summary.axes if axis in source.values and axis in run.axes]
     of_reference = summary.sensor == "reference"
     colour = colours.REFERENCE if of_reference else colours.sensor_colours([summary.sensor])[summary.sensor]
-    with drawing(2, len(axes), width=12.0, height=2.6, ratios=[3.0, 1.4]) as canvas:
-        for axis, motion, course in zip(axes, canvas.axes[::2], canvas.axes[1::2], strict=True):
+    with drawing(2, len(axes), width=12.0, height=2.6, ratios=[3.0, 1.4]) as figure:
+        for axis, motion, course in zip(axes, figure.axes[::2], figure.axes[1::2], strict=True):
             screen, one = SCREEN[run.kinds.get(axis, "length")], summary.axes[axis]
             given, command = known_rows(run.command.stamp, run.command.values[axis])
             stamp, value = known_rows(source.stamp, source.values[axis])
@@ -250,10 +250,10 @@ def lag_figures(found: Latency) -> Markup:
                 course.errorbar(t, (one.lag + shift) * MS, Z95 * sd * MS, fmt="o", ms=3, color=colours.ESTIMATE, lw=1)
                 course.axhspan(*(end * MS for end in one.lag_ci95), color=colours.ESTIMATE, alpha=0.2, lw=0)
             course.set_ylabel("lag [ms]")
-        for column in canvas.axes[-2:]:
+        for column in figure.axes[-2:]:
             column.set_xlabel(_TIME)
-        canvas.axes[0].legend(loc="best", ncols=3, frameon=False)
-        return canvas.svg()
+        figure.axes[0].legend(loc="best", ncols=3, frameon=False)
+        return svg(figure)
 
 
 def _busiest(time: FloatArray, value: FloatArray, length: float) -> float:
@@ -287,15 +287,15 @@ def correlations(axes: Axes, tests: Sequence[Consistency | None], by_test: Seque
 
 
 @contextmanager
-def _figure(est: Estimates, rows: int, labels: Sequence[str], ratios: Sequence[float]) -> Generator[Canvas]:
-    """A canvas with a column for each label below, and above it what is drawn."""
-    with drawing(len(labels), rows, width=13.0, height=2.4 + 0.8 / rows, ratios=ratios, sharex="col") as canvas:
-        yield canvas
-        for axes, label in zip(canvas.axes[-len(labels) :], labels, strict=True):
+def _figure(est: Estimates, rows: int, labels: Sequence[str], ratios: Sequence[float]) -> Generator[Figure]:
+    """A figure with a column for each label below, and above it what is drawn."""
+    with drawing(len(labels), rows, width=13.0, height=2.4 + 0.8 / rows, ratios=ratios, sharex="col") as figure:
+        yield figure
+        for axes, label in zip(figure.axes[-len(labels) :], labels, strict=True):
             axes.set_xlabel(label)
         used = [name for name in est.measurements.sensors if name in est.config.sensors]
         sensors = ", ".join(used) or "commands only"
-        canvas.figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
+        figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
 
 
 def _travelled(result: Result) -> FloatArray:

@@ -15,7 +15,7 @@ from ..identification.trials import StepTrials, Trial
 from ..identification.verify import AxisVerification, Trace
 from ..units import MM, MS, SCREEN
 from . import colours
-from .canvas import drawing
+from .canvas import drawing, svg
 
 _SECONDS = 1.2  # of a white-noise run that is shown in detail
 _GRID = 40  # points each way of a contour plot
@@ -147,8 +147,8 @@ def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
 def verification(verified: AxisVerification, trace: Trace) -> str:
     """Measured and modelled position, without means: the first second in detail (the paper's Figs. 8 and 9)."""
     screen = SCREEN[verified.kind]
-    with drawing(1, width=9.0) as canvas:
-        axes = canvas.axes[0]
+    with drawing(1, width=9.0) as figure:
+        axes = figure.axes[0]
         shown = trace.time <= trace.time[0] + _SECONDS
         time, scale = trace.time[shown], screen.scale
         axes.plot(time, trace.measured[shown] * scale, color=colours.REFERENCE, lw=1.0, label="measured")
@@ -157,7 +157,7 @@ def verification(verified: AxisVerification, trace: Trace) -> str:
         axes.set_xlabel("time since the first command [s]")
         axes.set_ylabel(f"position without its mean [{screen.unit}]")
         axes.legend(frameon=False, ncols=2, loc="upper right")
-        return canvas.svg()
+        return svg(figure)
 
 
 def _panels(names: Iterable[str], draw: Callable[[Axes, str], None], ylabel: str, xlabel: str = "") -> str:
@@ -165,13 +165,13 @@ def _panels(names: Iterable[str], draw: Callable[[Axes, str], None], ylabel: str
     every = list(names)
     if not every:
         return ""
-    with drawing(len(every)) as canvas:
-        for axes, name in zip(canvas.axes, every, strict=True):
+    with drawing(len(every)) as figure:
+        for axes, name in zip(figure.axes, every, strict=True):
             draw(axes, name)
             axes.set_title(name if xlabel else "", loc="left")
             axes.set_xlabel(xlabel or name)
-        canvas.axes[0].set_ylabel(ylabel)
-        return canvas.svg()
+        figure.axes[0].set_ylabel(ylabel)
+        return svg(figure)
 
 
 def _valley(axes: Axes, one: TrialResult, trial: Trial) -> None:

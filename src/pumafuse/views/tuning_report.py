@@ -20,7 +20,7 @@ from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning
 from ..tuning.validation import fused
 from . import colours, formatting
-from .canvas import drawing, render
+from .canvas import drawing, render, svg
 from .figures import correlations, innovations
 
 _Pair: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after
@@ -130,21 +130,21 @@ def _sentence(sensor: str, axis: str, tests: _Pair) -> str:
 def profile_figure(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> Markup:
     """Draw the log-likelihood along each parameter, with its 95 % interval and its value before, as SVG text."""
     rows = -(-len(found) // _COLUMNS)
-    with drawing(_COLUMNS, rows, width=_WIDTH, height=1.95) as canvas:
-        for axes, one in zip(canvas.axes, found, strict=False):
+    with drawing(_COLUMNS, rows, width=_WIDTH, height=1.95) as figure:
+        for axes, one in zip(figure.axes, found, strict=False):
             _profile(axes, one, fitted[one.key])
-        for axes in canvas.axes[len(found) :]:
+        for axes in figure.axes[len(found) :]:
             axes.set_visible(False)
-        for axes in canvas.axes[::_COLUMNS]:
+        for axes in figure.axes[::_COLUMNS]:
             axes.set_ylabel("log-likelihood")
-        return canvas.svg()
+        return svg(figure)
 
 
 def innovation_figure(before: Estimates, after: Estimates, sensor: str, axis: str, tests: _Pair) -> Markup:
     """Draw a sensor's normalised innovations on an axis before and after, with autocorrelations, as SVG text."""
     pair = (colours.COMMAND, colours.sensor_colours(after.measurements.sensors)[sensor])
-    with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0)) as canvas:
-        *series, correlation = canvas.axes
+    with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0)) as figure:
+        *series, correlation = figure.axes
         for axes, when, est, colour in zip(series, ("before", "after"), (before, after), pair, strict=True):
             innovations(axes, est, sensor, axis, colour)
             axes.set_title(f"{when}: {axis}, {sensor}", loc="left")
@@ -157,7 +157,7 @@ def innovation_figure(before: Estimates, after: Estimates, sensor: str, axis: st
         correlations(correlation, tests, pair)
         correlation.set_title("autocorrelation", loc="left")
         correlation.set_xlabel("lag [measurements]")
-        return canvas.svg()
+        return svg(figure)
 
 
 def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
