@@ -12,7 +12,7 @@ import pytest
 
 import pumafuse as pf
 from executable import DATA, FUSION, SCAN, names, pumafuse, refused
-from pumafuse.cli.fuse import _folders
+from pumafuse.cli.fuse import folders_of
 
 AXES = ("tangential", "radial", "vertical")
 FUSE_SCAN = ("fuse", SCAN, "-c", FUSION, "--rate", 200)
@@ -250,5 +250,5 @@ def test_folders_of_runs_that_share_a_name_do_not_meet(tmp_path: Path) -> None:
     runs = [tmp_path / name for name in ("scan_2", "a/scan", "b/scan", "scan_0.5mm", "scan_0.8mm")]
     for run in runs:
         run.mkdir(parents=True)
-    places = _folders([*runs, tmp_path / "one.csv.gz"], tmp_path)
+    places = folders_of([*runs, tmp_path / "one.csv.gz"], tmp_path)
     assert [folder.name for folder in places] == ["scan_2", "scan", "scan_3", "scan_0.5mm", "scan_0.8mm", "one"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from ..fusion import results
 from ..fusion.estimates import write_tum
 from ..fusion.results import Result
 from ..fusion.score import OrientationScore, ReferenceTrack
-from ..fusion.summary import ScoreSummary
+from ..fusion.summary import ScoreSummary, SensorSummary
 from ..logs.frames import CARTESIAN
 from ..units import KINDS, SCREEN, Kind
 from .screen import say, say_json
@@ -60,12 +60,12 @@ class Difference(toml.Reported, frozen=True, kw_only=True):
 
 def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | None = None, draw: bool = False) -> None:
     """Compare result folders; write their trajectories and references into the folder ``tum``."""
-    if tum is not None:
-        _write_trajectories(given, reference, tum, quiet=json)
     compared = list[Compared]()
     for folder in given:
         result = results.read(folder)
-        track = _reference(result, reference)
+        track = result.reference
+        if reference is not None:
+            track = results.read_reference(reference, result.summary.origin_ns, result.config)
         scores = {} if track is None else result.scores(track)
         if track is not None and not scores:
             raise RunError(
@@ -75,6 +75,10 @@ def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | N
         first = compared[0].result if compared else result
         turned = None if track is None else result.orientation_score(track)
         compared.append(Compared(str(folder), result, track, scores, turned, _differences(first, result)))
+    if tum is not None:
+        _write_trajectories(compared, tum)
+        if not json:
+            say(f"trajectories written to {tum}")
     best, why = verdict(compared)
     if draw:
         _draw(compared, why)
@@ -202,36 +206,29 @@ def _draw(compared: Sequence[Compared], why: str) -> None:
     say(f"drawn in {FIGURE}", err=True)
 
 
-def _reference(result: Result, path: Path | None) -> ReferenceTrack | None:
-    """The reference to score a result against, its own or that of a file."""
-    return result.reference if path is None else results.read_reference(path, result.summary.origin_ns, result.config)
-
-
-def _write_trajectories(given: Sequence[Path], reference: Path | None, output: Path, quiet: bool) -> None:
+def _write_trajectories(compared: Sequence[Compared], output: Path) -> None:
     """Write ``<folder>.tum`` for each result, and ``<folder>.reference.tum`` where it has a reference in x, y, z."""
     folders.check_writable(output, False, [], lambda _: False)
-    names = [folder.resolve().name for folder in given]
+    names = [Path(one.name).resolve().name for one in compared]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise FolderError(f"{output}: two results are called '{twice}', and so would be their files; rename a folder")
     with folders.replacing(output) as new:
-        for folder, name in zip(given, names, strict=True):
-            result = results.read(folder)
-            of = result.config, result.summary.origin_ns
-            write_tum(result.track, *of, str(folder), new / f"{name}.tum")
-            track = _reference(result, reference)
+        for one, name in zip(compared, names, strict=True):
+            track, of = one.track, (one.result.config, one.result.summary.origin_ns)
+            write_tum(one.result.track, *of, one.name, new / f"{name}.tum")
             if track is not None and (track.cartesian or set(CARTESIAN) <= set(track.position)):
-                write_tum(track, *of, f"{folder}: the reference", new / f"{name}.reference.tum")
-    if not quiet:
-        say(f"trajectories written to {output}")
+                write_tum(track, *of, f"{one.name}: the reference", new / f"{name}.reference.tum")
 
 
 def _reported(one: Compared) -> dict[str, Any]:
     """A result as JSON, in the units of its axes."""
     summary, of = one.result.summary, one.result.summary.axes
-    skill = {
-        axis: {name: each.skill and toml.reported(each.skill, part.kind) for name, each in part.sensors.items()}
-        for axis, part in of.items()
-    }
+
+    def by_sensor(number: Callable[[SensorSummary, Kind], object]) -> dict[str, dict[str, object]]:
+        return {
+            axis: {name: number(each, part.kind) for name, each in part.sensors.items()} for axis, part in of.items()
+        }
+
     return {
         "folder": one.name,
         "run": summary.run,
@@ -239,11 +236,9 @@ def _reported(one: Compared) -> dict[str, Any]:
         "axes": {axis: toml.reported(each, of[axis].kind) for axis, each in one.scores.items()},
         "orientation": one.orientation and toml.reported(one.orientation),
         "log_likelihood": {axis: part.log_likelihood for axis, part in of.items()},
-        "nis": {axis: {name: each.nis_mean for name, each in part.sensors.items()} for axis, part in of.items()},
-        "rejected": {
-            axis: {name: share_rejected(each) for name, each in part.sensors.items()} for axis, part in of.items()
-        },
-        "skill": skill,
+        "nis": by_sensor(lambda each, _: each.nis_mean),
+        "rejected": by_sensor(lambda each, _: share_rejected(each)),
+        "skill": by_sensor(lambda each, kind: each.skill and toml.reported(each.skill, kind)),
         "difference": {axis: toml.reported(each, of[axis].kind) for axis, each in one.differences.items()},
         "commands": summary.commands,
         "rows": summary.rows,

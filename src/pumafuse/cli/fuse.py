@@ -59,7 +59,7 @@ def run(
         show(summary)
         say(f"{where} {output}")
         return
-    places = dict(zip(map(str, runs), _folders(runs, output), strict=True))
+    places = dict(zip(map(str, runs), folders_of(runs, output), strict=True))
     there = {path: summary for path, place in places.items() if resume and (summary := making.made(place, Path(path)))}
     jobs = {path: partial(job, Path(path), place) for path, place in places.items() if path not in there}
     done, failed = run_jobs("fusing", jobs, places.values())
@@ -162,7 +162,7 @@ def show(summary: Summary) -> None:
         say(line)
 
 
-def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
+def folders_of(runs: Sequence[Path], output: Path) -> list[Path]:
     """A folder for each run, named after its path; equal names get a number."""
     found = dict[str, None]()
     for path in map(Path.resolve, runs):
