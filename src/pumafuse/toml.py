@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
@@ -147,8 +147,11 @@ def reported(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
 
 def as_lengths(tree: Any, kind: Any = None) -> Any:
     """Tables with the key names for lengths, which are those of structs; names of fields of ``kind`` stay."""
+    if not isinstance(tree, Mapping):
+        return tree
     own = {field.encode_name for field in msgspec.structs.fields(kind)} if isinstance(kind, type) else ()
-    return _renamed(tree, lambda name: name if name in own else as_length(name))
+    named = cast(Mapping[str, Any], tree).items()
+    return {key if key in own else as_length(key): as_lengths(value, kind) for key, value in named}
 
 
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
@@ -174,13 +177,6 @@ def _of_kind(value: Any, axis: Kind) -> Any:
     if isinstance(value, list | tuple):
         return [_of_kind(item, axis) for item in cast(Sequence[Any], value)]
     return value
-
-
-def _renamed(tree: Any, name: Callable[[str], str]) -> Any:
-    """A tree of tables with every key renamed."""
-    if not isinstance(tree, Mapping):
-        return tree
-    return {name(key): _renamed(value, name) for key, value in cast(Mapping[str, Any], tree).items()}
 
 
 def _tagged(kind: Any) -> dict[str, type[msgspec.Struct]]:

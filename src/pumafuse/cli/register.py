@@ -96,16 +96,14 @@ def taken(name: str, latency: float) -> str:
 
 def _places(what: str, found: Registered) -> list[list[str]]:
     """Rows of a place and an orientation."""
-    rows: list[list[str]] = []
-    for key, values, limits, scale in (
-        ("at_mm", found.at, found.at_ci95, MM),
-        ("rotation_vector_deg", found.rotation, found.rotation_ci95, DEG),
-    ):
-        if key == "rotation_vector_deg" and what == "marker" and not any(values):
-            continue
-        for axis, value, interval in zip("xyz", values, limits, strict=True):
-            rows.append([f"{what}.{key}, {axis}", f"{value * scale:.3f}", _limits(interval, scale, ".3f")])
-    return rows
+    parts = [("at_mm", found.at, found.at_ci95, MM)]
+    if what == "frame" or any(found.rotation):
+        parts.append(("rotation_vector_deg", found.rotation, found.rotation_ci95, DEG))
+    return [
+        [f"{what}.{key}, {axis}", f"{value * scale:.3f}", _limits(interval, scale, ".3f")]
+        for key, values, limits, scale in parts
+        for axis, value, interval in zip("xyz", values, limits, strict=True)
+    ]
 
 
 def _limits(interval: Interval | None, scale: float, form: str) -> str:

@@ -25,9 +25,10 @@ from .figures import lag_figures
 
 PAGE = "report.html"
 _PHYSICS = 0.005  # s: a usual step of simulators
-_TEXT = frozenset({"axis", "coefficient", "factor", "level: mean ± sd (trials)", "verdict", "outlying trials"}) | {
-    "plant", "trial", "flags", "run", "source", "axis,\nsensor",
-}  # fmt: skip
+_TEXT = {  # headings of columns that are no numbers
+    *("axis", "axis,\nsensor", "coefficient", "factor", "flags", "level: mean ± sd (trials)", "outlying trials"),
+    *("plant", "run", "source", "trial", "verdict"),
+}
 _PLANT = "a time constant of {} ms", "a natural frequency of {} rad/s with damping {}"
 _SPEED: dict[Kind, str] = {"length": "m/s", "angle": "rad/s"}  # the s of a gain line: slopes are per that in arm.toml
 _DEFAULTS = {"latency_sd_ms": 0.0, "scale": 1.0}  # of a sensor

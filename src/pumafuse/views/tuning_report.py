@@ -45,7 +45,6 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
     known = [(one.before, *intervals[one.key]) for one in summary.parameters if one.before is not None]
     validated = [one.axis for one in summary.validation or ()]
     content = {
-        "title": f"Tuning: {', '.join(summary.runs)}",
         "answer": _answer(summary),
         "axes": [_axis(summary, axis) for axis in dict.fromkeys([*summary.lags, *validated])],
         "predicted": any(one.after.rmse is None for one in summary.validation or ()),
@@ -58,7 +57,8 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         ],
         "lag_words": formatting.lag(found.config.arm.update_period),
         "fitted": formatting.fitted(summary),
-        "known": len(known),
+        "config": found.config,
+        "known": known,
         "outside": sum(not low <= value <= high for value, low, high in known),
         "zero": sum(one.value == 0.0 for one in summary.parameters),
         "open": not summary.interrupted and any(None in one.ci95 for one in summary.parameters),
@@ -74,8 +74,6 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
             for some in zip(*tests.values(), strict=True)
         ],
         "white_p": _WHITE,
-        "fusion": found.config.to_toml(),
-        "arm": found.config.arm.to_toml(),
     }
     return render("tuning.html", content)
 
