@@ -251,17 +251,18 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
     assert names(out) == {"a"} and names(out / "a") == {"x"}
 
 
+def simulating(out: Path) -> subprocess.Popen[str]:
+    """300 runs that are being simulated, as from a terminal of their own."""
+    words = [str(EXECUTABLE), "simulate", str(SCENARIOS / "step-campaign.toml"), "-o", str(out), "--runs", "300"]
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
 @pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are listed there")
 @pytest.mark.parametrize("later", [0.0, 0.05, 0.1, 0.2, 0.4])
 def test_workers_that_only_start_end_without_a_word(later: float, tmp_path: Path) -> None:
     """Ctrl-C reaches them, too, while they import; and it is not lost while they are started."""
-    words = [str(EXECUTABLE), "simulate", str(SCENARIOS / "step-campaign.toml"), "-o", str(tmp_path), "--runs", "300"]
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what ignores it hands that on
-    process = subprocess.Popen(
-        [*words, "--force"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    signal.signal(signal.SIGINT, before)
+    process = simulating(tmp_path)
     children, give_up = Path(f"/proc/{process.pid}/task/{process.pid}/children"), time.monotonic() + 100.0
     while time.monotonic() < give_up and not children.read_text().split():
         time.sleep(0.001)
@@ -282,10 +283,7 @@ def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(
     Ctrl-C reaches every process of a terminal, a signal only one.
     """
     out = tmp_path / "out"
-    words = [str(EXECUTABLE), "simulate", str(SCENARIOS / "step-campaign.toml"), "-o", str(out), "--runs", "300"]
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what ignores it hands that on
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    signal.signal(signal.SIGINT, before)
+    process = simulating(out)
     give_up = time.monotonic() + 100.0
     while time.monotonic() < give_up and len([path for path in out.glob("*") if not path.name.startswith(".")]) < 3:
         time.sleep(0.01)

@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -124,22 +125,18 @@ def test_a_wrong_option_is_refused(
 def interrupted(words: list[str], until: str) -> tuple[int, str, str]:
     """Run in a terminal, interrupt once ``until`` is on its screen: exit code, stdout and the terminal's text."""
     ours, theirs = pty.openpty()
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what ignores it hands that on
     process = subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=theirs, text=True, env=os.environ | {"COLUMNS": "200", "TERM": "xterm"}
     )
-    signal.signal(signal.SIGINT, before)
     os.close(theirs)
     shown, give_up = "", time.monotonic() + 100.0
     while until not in shown and time.monotonic() < give_up:
         shown += os.read(ours, 4096).decode(errors="replace")
     os.kill(process.pid, signal.SIGINT)
-    with open(ours, "rb", buffering=0) as screen:  # noqa: PTH123 - a file descriptor
-        try:
-            while part := screen.read(4096):
-                shown += part.decode(errors="replace")
-        except OSError:
-            pass  # the terminal's other side is closed
+    # that the terminal's other side is closed is an error
+    with open(ours, "rb", buffering=0) as screen, suppress(OSError):  # noqa: PTH123 - a file descriptor
+        while part := screen.read(4096):
+            shown += part.decode(errors="replace")
     output, _ = process.communicate(timeout=100)
     return process.returncode, output, shown
 
