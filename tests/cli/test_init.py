@@ -16,6 +16,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
 import pytest
 import typer
 
@@ -59,9 +61,8 @@ def test_one_command_finds_play_and_says_it(tmp_path: Path) -> None:
     made = pf.simulate(pf.Scenario.load(EXAMPLES.parent / "scenarios" / "tool-with-play.toml")).run
     (tmp_path / "log").mkdir()
     for name, source in (("robot", made.command), ("camera", made.sensors["camera"])):
-        rows = zip((source.stamp * 1e-9).tolist(), np.degrees(source.values["wrist"]).tolist(), strict=True)
-        lines = [f"{t:.6f},{value:.6f}" for t, value in rows]
-        (tmp_path / "log" / f"{name}.csv").write_text("\n".join(["time_s,wrist_deg", *lines]) + "\n")
+        columns = {"time_s": source.stamp * 1e-9, "wrist_deg": np.degrees(source.values["wrist"])}
+        pacsv.write_csv(pa.table(columns), tmp_path / "log" / f"{name}.csv")
     out = pumafuse("fuse", tmp_path / "log", "-o", tmp_path / "fused").stdout
     (play,) = [line.split() for line in out.splitlines() if line.split()[:1] == ["axes.wrist.play_deg"]]
     assert float(play[2]) == pytest.approx(3.4, rel=0.1)
@@ -94,11 +95,9 @@ def test_every_command_says_how_a_table_of_other_names_is_described(tmp_path: Pa
     """And that works, word for word."""
     time = 0.02 * np.arange(500)
     target = 30.0 * np.sin(2.0 * np.pi * 0.4 * time) * np.sin(0.9 * time)
-    noise = np.random.default_rng(5).normal(0.0, 0.1, 492)
-    rows = zip(time[8:].tolist(), target[8:].tolist(), (target[:-8] + noise).tolist(), strict=True)
-    table = ["stamp_s,target_deg,actual_deg", *(",".join(f"{one:.6f}" for one in row) for row in rows)]
+    actual = target[:-8] + np.random.default_rng(5).normal(0.0, 0.1, 492)
     log = tmp_path / "mine's.csv"
-    log.write_text("\n".join(table) + "\n")
+    pacsv.write_csv(pa.table({"stamp_s": time[8:], "target_deg": target[8:], "actual_deg": actual}), log)
     said = refused("latency", log)
     (advice,) = re.findall("`pumafuse (.*?)`", said)
     pumafuse(*shlex.split(advice), "-o", tmp_path / "mine")
@@ -160,8 +159,8 @@ def test_one_command_says_where_no_arm_was_found(tmp_path: Path) -> None:
     """An encoder that is at each command in the same row; with commands that are gone on from, as is advised, it is."""
     rng, time = np.random.default_rng(1), 0.1 * np.arange(300)
     command = np.sin(0.2 * time) + rng.normal(0.0, 0.055, 300)
-    table = np.column_stack([time, command, command + rng.normal(0.0, 0.02, 300)])
-    np.savetxt(tmp_path / "log.csv", table, "%.6f", ",", header="t_s,told_rad,seen_rad", comments="")
+    columns = {"t_s": time, "told_rad": command, "seen_rad": command + rng.normal(0.0, 0.02, 300)}
+    pacsv.write_csv(pa.table(columns), tmp_path / "log.csv")
     described = """
         [command]
         file = "../log.csv"
@@ -221,8 +220,7 @@ def test_one_command_says_what_one_sensor_alone_does_not_show(
     led = response(plant, 0.028, 0.06, given, u, 0.0, valid)
     seen = led + np.random.default_rng(0).normal(0.0, 2e-4, len(s))
     for name, time, value in (("commands", t, u), ("tracker", s, fault(seen, s) if fault else seen)):
-        rows = "\n".join(f"{a:.6f},{1e3 * b:.6f}" for a, b in zip(time.tolist(), value.tolist(), strict=True))
-        (tmp_path / f"{name}.csv").write_text(f"t_s,x_mm\n{rows}\n")
+        pacsv.write_csv(pa.table({"t_s": time, "x_mm": 1e3 * value}), tmp_path / f"{name}.csv")
     said = pumafuse("fuse", tmp_path, "-o", tmp_path / "out").stdout
     assert ("tracker alone measures x: what strays there is taken for the arm" in said) is (fault is not None)
     told = json.loads((tmp_path / "out" / "summary.json").read_text())["axes"]["x"]["sensors"]["tracker"]
@@ -314,20 +312,15 @@ def test_a_table_without_stamps_is_read_at_a_rate(tmp_path: Path) -> None:
         pumafuse("init", tmp_path / "mill.csv", "--rate", rate, "--force", code=2)
 
 
-def undecided(folder: Path, header: str) -> tuple[Path, np.ndarray]:
+def undecided(folder: Path, *names: str) -> tuple[Path, np.ndarray]:
     """A log of an arm that settles with 60 ms, and a sine, in columns that are called as asked."""
     rng, t = np.random.default_rng(4), np.arange(0.0, 30.0, 0.028)
     told = np.cumsum(rng.normal(0.0, 3.0, len(t)) * (rng.random(len(t)) < 0.1))
-    seen = response_of(told, 0.028, 0.06) + rng.normal(0.0, 0.1, len(t))
-    rows = [f"{a:.3f},{b:.3f},{c:.3f},{d:.2f}" for a, b, c, d in zip(t, told, seen, np.sin(t), strict=True)]
-    (folder / "log.csv").write_text("\n".join([header, *rows, ""]))
+    left, at = math.exp(-0.028 / 0.06), 0.0
+    seen = np.array([at := left * at + (1.0 - left) * before for before in np.append(0.0, told[:-1])])
+    columns = {"t": t, **dict(zip(names, (told, seen + rng.normal(0.0, 0.1, len(t)), np.sin(t)), strict=True))}
+    pacsv.write_csv(pa.table({name: value.round(3) for name, value in columns.items()}), folder / "log.csv")
     return folder / "log.csv", t
-
-
-def response_of(told: np.ndarray, period: float, tau: float) -> np.ndarray:
-    """A held command through a first-order lag: the exact recursion."""
-    left, at = math.exp(-period / tau), 0.0
-    return np.array([at := left * at + (1.0 - left) * before for before in np.append(0.0, told[:-1])])
 
 
 def without_marks(text: str, table: str, *lines: str) -> str:
@@ -342,7 +335,7 @@ def without_marks(text: str, table: str, *lines: str) -> str:
 
 def test_a_table_that_does_not_say_who_is_who_is_written_down_and_sorted(tmp_path: Path) -> None:
     """What is refused is fused when the advice is followed: two lines are taken, and axes are called the same."""
-    log, _ = undecided(tmp_path, "t,north,south,up")
+    log, _ = undecided(tmp_path, "north", "south", "up")
     line = refused("fuse", log, "-o", tmp_path / "fused")
     assert "which numbers are the commands" in line and line.endswith(f"`pumafuse init {log}` writes one to sort")
     made = tmp_path / "made"
@@ -361,15 +354,14 @@ def test_a_table_that_does_not_say_who_is_who_is_written_down_and_sorted(tmp_pat
 
 def test_tables_that_do_not_say_who_is_who_are_written_down_each(tmp_path: Path) -> None:
     """Commands that are known stay so; else each table is a source, in comments."""
-    log, t = undecided(tmp_path, "t,north_cmd,torque,current")
+    log, t = undecided(tmp_path, "north_cmd", "torque", "current")
     refused("init", log, "-o", tmp_path / "commands")
     text = (tmp_path / "commands" / "run.toml").read_text()
     assert re.search(r'\n\[command\].*\nfile = "../log.csv"\n', text) and '\nnorth = { column = "north_cmd"' in text
     folder = tmp_path / "two"
     folder.mkdir()
     for name, wave in ("fish", np.sin(t)), ("bird", np.cos(0.37 * t * t)):
-        rows = [f"{a:.3f},{b:.4f}" for a, b in zip(t, wave, strict=True)]
-        (folder / f"{name}.csv").write_text("\n".join(["t,place", *rows, ""]))
+        pacsv.write_csv(pa.table({"t": t, "place": wave}), folder / f"{name}.csv")
     refused("init", folder, "-o", tmp_path / "made")
     text = (tmp_path / "made" / "run.toml").read_text()
     assert "# [sensors.fish]" in text and "# [sensors.bird]" in text and "\n[" not in text

@@ -7,10 +7,11 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
 import pytest
 
 from executable import EXECUTABLE, pumafuse, refused
@@ -31,11 +32,6 @@ def edit(path: Path, *changes: tuple[str, str]) -> None:
         assert old in text
         text = text.replace(old, new)
     path.write_text(text, encoding="utf-8")
-
-
-def write(path: Path, columns: Mapping[str, FloatArray]) -> None:
-    table, names = np.column_stack(list(columns.values())), ",".join(columns)
-    np.savetxt(path, table, fmt="%.5f", delimiter=",", header=names, comments="")
 
 
 def fuse(log: Path) -> tuple[object, ...]:
@@ -97,7 +93,7 @@ def test_what_reading_notices_is_said_once(tmp_path: Path) -> None:
     columns = {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured}
     order = np.arange(len(time))
     order[[300, 301]] = 301, 300
-    write(tmp_path / "elbow.csv", {name: value[order] for name, value in columns.items()})
+    pacsv.write_csv(pa.table({name: value[order] for name, value in columns.items()}), tmp_path / "elbow.csv")
     done = pumafuse("fuse", tmp_path / "elbow.csv", "-o", tmp_path / "fused")
     lines = done.stderr.splitlines()
     assert any("steps back" in line for line in lines)
@@ -110,7 +106,8 @@ def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path
     """Fuse and latency refuse it in one line; with the shift_s that this names its lag is the guess."""
     time = np.arange(0.0, 30.0, 0.02)
     measured = swings(time + early) + np.random.default_rng(4).normal(0.0, 0.02, len(time))
-    write(tmp_path / "wrist.csv", {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured})
+    columns = {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured}
+    pacsv.write_csv(pa.table(columns), tmp_path / "wrist.csv")
     line = refused("fuse", tmp_path / "wrist.csv", "-o", tmp_path / "fused")
     assert "moves before its commands" in line and "shift_s" in line and line.endswith("writes one")
     folder = tmp_path / "folder"
@@ -138,7 +135,7 @@ def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(descr
         columns |= {f"goal_{axis}_deg": swings(slower * time)}
         columns |= {f"encoder_{axis}_deg": swings(slower * (time - late)) + rng.normal(0.0, 0.02, len(time))}
     log = tmp_path / "two.csv"
-    write(log, columns)
+    pacsv.write_csv(pa.table(columns), log)
     if described:
         log = tmp_path / "run.toml"
         sources = [
@@ -167,7 +164,7 @@ def test_an_axis_that_follows_nothing_does_not_refuse_the_others(others: bool, t
             late = np.interp(time, np.arange(0.0, 16.0, 0.4), 0.3 * np.std(late) * rng.normal(size=40))
         columns |= {f"goal_{axis}_deg": swings(slower * time)}
         columns |= {f"gyro_{axis}_deg": late + rng.normal(0.0, 0.02, len(time))}
-    write(tmp_path / "arm.csv", columns)
+    pacsv.write_csv(pa.table(columns), tmp_path / "arm.csv")
     for table, name in (("command", "goal"), ("sensors.gyro", "gyro")):
         axes = "\n".join(f'{one[5:-4]} = "{name}{one[4:]}"' for one in columns if one.startswith("goal"))
         lines[table] = f'[{table}]\nfile = "arm.csv"\ntime = "t_s"\n{axes}\n'

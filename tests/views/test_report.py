@@ -11,7 +11,6 @@ import pytest
 
 import pumafuse as pf
 from outline import outline
-from pumafuse.folders import FolderError
 from pumafuse.identification.trials import Trial
 from pumafuse.tuning.latency import AxisLag, LatencySummary, SensorLag
 from pumafuse.views import report
@@ -92,18 +91,6 @@ def test_a_verification_has_its_table_and_a_figure_for_each_run(tmp_path: Path) 
     assert "Root mean square error" in found.headings
     assert len(found.pictures) == 2
     assert text.count("chosen among the run&#39;s 2 levels by RMS") == 2
-
-
-def test_a_report_is_replaced_only_when_asked_and_never_with_what_is_not_ours(tmp_path: Path) -> None:
-    """Without --force nothing is touched; a folder that holds anything else never is."""
-    report.check_writable(tmp_path / "new", False)
-    (tmp_path / "report.html").write_text("earlier")
-    with pytest.raises(FolderError, match="--force replaces it"):
-        report.check_writable(tmp_path, False)
-    report.check_writable(tmp_path, True)
-    (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(FolderError, match=r"holds 'mine\.txt'"):
-        report.check_writable(tmp_path, True)
 
 
 def test_lags_are_said_with_their_sign_and_in_the_units_of_each_program() -> None:
