@@ -86,7 +86,13 @@ def texts(zone: str) -> list[str]:
     return [f"{at:%Y-%m-%dT%H:%M:%S}.{stamp % GIGA:09d}{zone}" for at, stamp in zip(whole, STAMP, strict=True)]
 
 
+def axis(column: str) -> str:
+    """Rows with stamps, and x from a column or a field path in m."""
+    return f'time = "t_ns"\nx = {{ column = "{column}", unit = "m" }}'
+
+
 X_M = 'x = { column = "x", unit = "m" }'
+POSE_X = X_M.replace('"x"', '"pose.position.x"')
 LAYOUTS: dict[str, tuple[str, Callable[[], dict[str, Any]]]] = {
     "flat": ('time = "t_ns"\nx = "x_m"', lambda: {"t_ns": STAMP, "x_m": nullable(X)}),
     "unit beside": (f'time = {{ column = "t", unit = "ns" }}\n{X_M}', lambda: {"t": STAMP, "x": nullable(X)}),
@@ -102,31 +108,28 @@ LAYOUTS: dict[str, tuple[str, Callable[[], dict[str, Any]]]] = {
         lambda: {"sec": split()[0], "nanosec": split()[1], "x": nullable(X)},
     ),
     "two field paths": (
-        'time = ["header.stamp.sec", "header.stamp.nanosec"]\nx = { column = "pose.position.x", unit = "m" }',
+        f'time = ["header.stamp.sec", "header.stamp.nanosec"]\n{POSE_X}',
         lambda: {"header": header(), "pose": pose()},
     ),
-    "ROS 2 header": (
-        'time = "header.stamp"\nx = { column = "pose.position.x", unit = "m" }',
-        lambda: {"header": header(), "pose": pose()},
-    ),
+    "ROS 2 header": (f'time = "header.stamp"\n{POSE_X}', lambda: {"header": header(), "pose": pose()}),
     "lists": (
-        'time = "t_ns"\nx = { column = "state[1]", unit = "m" }',
+        axis("state[1]"),
         lambda: {"t_ns": STAMP, "state": pa.array([[0.0, None if np.isnan(x) else x] for x in X])},
     ),
     "lists, some too short": (
-        'time = "t_ns"\nx = { column = "state[1]", unit = "m" }',
+        axis("state[1]"),
         lambda: {"t_ns": STAMP, "state": pa.array([[] if np.isnan(x) else [0.0, x, 1.0] for x in X])},
     ),
     "lists of fixed size": (
-        'time = "t_ns"\nx = { column = "observation.state[1]", unit = "m" }',
+        axis("observation.state[1]"),
         lambda: {"t_ns": STAMP, "observation.state": fixed(X)},
     ),
     "names with dots and brackets": (
-        'time = "t_ns"\nx = { column = "a.b[1]", unit = "m" }',
+        axis("a.b[1]"),
         lambda: {"t_ns": STAMP, "a.b[1]": nullable(X), "a.b": pa.array([[0.0, 0.0]] * ROWS)},
     ),
     "structs in lists": (
-        'time = "t_ns"\nx = { column = "points[1].position.x", unit = "m" }',
+        axis("points[1].position.x"),
         lambda: {"t_ns": STAMP, "points": pa.array([[{"position": {"x": 9.0}}, point(x)] for x in X])},
     ),
 }
@@ -566,29 +569,25 @@ def test_honest_rows_with_one_stamp_are_not_refused(case: str) -> None:
     assert len(run.sensors["s"].stamp) == len(stamp)
 
 
+def timed(time: str) -> str:
+    return f'time = {time}\nx = "x_m"'
+
+
+RECORDED = '[sensors.s]\nfile = "a.mcap"\ntime = "log_time"\nx = "x_m"'
 REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "unit of time for an axis": (
-        'time = "t_ns"\nx = { column = "x_m", unit = "s" }',
-        ("command.x", "'s'", "m, mm, um, rad"),
-    ),
-    "unit of length for time": (
-        'time = { column = "t", unit = "mm" }\nx = "x_m"',
-        ("command.time", "'mm'", "s, ms, us, ns"),
-    ),
+    "unit of time for an axis": (axis("x_m").replace('"m"', '"s"'), ("command.x", "'s'", "m, mm, um, rad")),
+    "unit of length for time": (timed('{ column = "t", unit = "mm" }'), ("command.time", "'mm'", "s, ms, us, ns")),
     "unit is a number": ('time = "t_ns"\nx = { column = "x_m", unit = 3 }', ("command.x.unit", "str")),
     "no unit": ('time = "t_ns"\nx = "plain"', ("'plain'", "_mm", "unit = 'mm'")),
-    "time without unit": ('time = "plain"\nx = "x_m"', ("'plain'", "_ms", "unit = 's'")),
+    "time without unit": (timed('"plain"'), ("'plain'", "_ms", "unit = 's'")),
     "table without column": ('time = "t_ns"\nx = { unit = "m" }', ("command.x", "column")),
-    "unknown key of a column": (
-        'time = "t_ns"\nx = { column = "x_m", scale = 2 }',
-        ("'command.x.scale'", "column, unit"),
-    ),
+    "unknown key of a column": (axis("x_m").replace("unit", "scale"), ("'command.x.scale'", "column, unit")),
     "empty list": ('time = "t_ns"\nx = []', ("command.x", "column")),
-    "a rate of 0": ('time = { rate_hz = 0 }\nx = "x_m"', ("command.time", "{ rate_hz = 100 }")),
-    "a negative rate": ('time = { rate_hz = -5 }\nx = "x_m"', ("command.time", "rate_hz", ">= 0")),
-    "a rate and a unit": ('time = { column = "t", rate_hz = 5, unit = "s" }\nx = "x_m"', ("command.time", "column")),
-    "a rate of centuries": ('time = { rate_hz = 1e-8 }\nx = "x_m"', ("log.parquet", "beyond the year 2110")),
-    "frames that are words": ('time = { column = "yes", rate_hz = 5 }\nx = "x_m"', ("'yes'", "bool", "not numbers")),
+    "a rate of 0": (timed("{ rate_hz = 0 }"), ("command.time", "{ rate_hz = 100 }")),
+    "a negative rate": (timed("{ rate_hz = -5 }"), ("command.time", "rate_hz", ">= 0")),
+    "a rate and a unit": (timed('{ column = "t", rate_hz = 5, unit = "s" }'), ("command.time", "column")),
+    "a rate of centuries": (timed("{ rate_hz = 1e-8 }"), ("log.parquet", "beyond the year 2110")),
+    "frames that are words": (timed('{ column = "yes", rate_hz = 5 }'), ("'yes'", "bool", "not numbers")),
     "rows of nobody": (
         'time = "t_ns"\nx = { column = "x_m", where = { plain = 1000 } }',
         ("no row has plain = 1000", "0 to 499"),
@@ -598,8 +597,8 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("unknown column 'joint'",),
     ),
     "rows by nothing": ('time = "t_ns"\nx = { column = "x_m", where = {} }', ("command.x.where", "expected")),
-    "empty time": ('time = ""\nx = "x_m"', ("command.time", "column")),
-    "one time in a list": ('time = ["t_ns"]\nx = "x_m"', ("command.time", "['sec', 'nanosec']")),
+    "empty time": (timed('""'), ("command.time", "column")),
+    "one time in a list": (timed('["t_ns"]'), ("command.time", "['sec', 'nanosec']")),
     "where is a text": ('where = "group"\n' + AXIS, ("command.where", "episode_index = 3")),
     "where is a list": ("where = { group = [1, 2] }\n" + AXIS, ("command.where", "number", "quoted")),
     "where is a date": ("where = { group = 2024-01-01 }\n" + AXIS, ("command.where", "number")),
@@ -607,57 +606,27 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "entity of a table": ('entity = "/servo"\n' + AXIS, ("log.parquet", "no entity", ".rrd", "'where'")),
     "topic is a number": ("topic = 3\n" + AXIS, ("command.topic", "str")),
     "field of a number": ('time = "t_ns"\nx = "x_m.y_m"', ("'x_m.y_m'", "no field 'y_m'", "double")),
-    "element of a number": (
-        'time = "t_ns"\nx = { column = "x_m[0]", unit = "m" }',
-        ("'x_m[0]'", "no element '0'", "double"),
-    ),
-    "a whole struct": (
-        'time = "t_ns"\nx = { column = "pose", unit = "m" }',
-        ("'pose'", "structs of position", "not numbers"),
-    ),
-    "a whole list": ('time = "t_ns"\nx = { column = "list", unit = "m" }', ("'list'", "lists", "[0]", "not numbers")),
-    "field that is not there": (
-        'time = "t_ns"\nx = { column = "pose.positoin.x", unit = "m" }',
-        ("'pose.positoin.x'", "did you mean 'position'"),
-    ),
-    "element too far": (
-        'time = "t_ns"\nx = { column = "list[2]", unit = "m" }',
-        ("'list[2]'", "no row has", "at most 2 elements"),
-    ),
-    "element far too far": (
-        f'time = "t_ns"\nx = {{ column = "list[{9**99}]", unit = "m" }}',
-        ("no row has", "at most 2"),
-    ),
-    "negative element": ('time = "t_ns"\nx = { column = "list[-1]", unit = "m" }', ("'-1'", "0, 1, 2")),
-    "element without names": ('time = "t_ns"\nx = { column = "list[elbow]", unit = "m" }', ("'elbow'", "'name'")),
-    "unknown name of an element": (
-        'time = "t_ns"\nx = { column = "joints.position[ellbow]", unit = "m" }',
-        ("'ellbow'", "elbow"),
-    ),
-    "bracket without end": ('time = "t_ns"\nx = { column = "list[0", unit = "m" }', ("'list[0'", "without ']'")),
-    "bracket and more": (
-        'time = "t_ns"\nx = { column = "list[0]x", unit = "m" }',
-        ("'list[0]x'", "missing before 'x'"),
-    ),
-    "only dots": ('time = "t_ns"\nx = { column = "...", unit = "m" }', ("'...'", "t_ns")),
-    "a deep path": (
-        f'time = "t_ns"\nx = {{ column = "pose{".position" * 1200}", unit = "m" }}',
-        ("unknown field", "accepted: x, y"),
-    ),
-    "a path of brackets": (
-        f'time = "t_ns"\nx = {{ column = "list{"[0]" * 1200}", unit = "m" }}',
-        ("no element '0'", "double"),
-    ),
-    "an endless name": (f'time = "t_ns"\nx = {{ column = "{"x" * 10_000}", unit = "m" }}', ("unknown column", "…")),
-    "booleans": ('time = "t_ns"\nx = { column = "yes", unit = "m" }', ("'yes'", "bool", "not numbers")),
-    "time is booleans": ('time = { column = "yes", unit = "s" }\nx = "x_m"', ("'yes'", "bool")),
-    "time is a struct without stamps": ('time = "pose.position"\nx = "x_m"', ("'pose.position'", "structs of x, y")),
-    "nanoseconds beyond a second": ('time = ["plain", "t_ns"]\nx = "x_m"', ("'t_ns'", "row 1", "999999999")),
-    "seconds with decimals": ('time = ["half", "plain"]\nx = "x_m"', ("'half'", "whole")),
-    "a recording": (
-        'time = "t_ns"\nx = "x_m"\n[sensors.s]\nfile = "a.mcap"\ntime = "log_time"\nx = "x_m"',
-        ("a.mcap",),
-    ),
+    "element of a number": (axis("x_m[0]"), ("'x_m[0]'", "no element '0'", "double")),
+    "a whole struct": (axis("pose"), ("'pose'", "structs of position", "not numbers")),
+    "a whole list": (axis("list"), ("'list'", "lists", "[0]", "not numbers")),
+    "field that is not there": (axis("pose.positoin.x"), ("'pose.positoin.x'", "did you mean 'position'")),
+    "element too far": (axis("list[2]"), ("'list[2]'", "no row has", "at most 2 elements")),
+    "element far too far": (axis(f"list[{9**99}]"), ("no row has", "at most 2")),
+    "negative element": (axis("list[-1]"), ("'-1'", "0, 1, 2")),
+    "element without names": (axis("list[elbow]"), ("'elbow'", "'name'")),
+    "unknown name of an element": (axis("joints.position[ellbow]"), ("'ellbow'", "elbow")),
+    "bracket without end": (axis("list[0"), ("'list[0'", "without ']'")),
+    "bracket and more": (axis("list[0]x"), ("'list[0]x'", "missing before 'x'")),
+    "only dots": (axis("..."), ("'...'", "t_ns")),
+    "a deep path": (axis("pose" + ".position" * 1200), ("unknown field", "accepted: x, y")),
+    "a path of brackets": (axis("list" + "[0]" * 1200), ("no element '0'", "double")),
+    "an endless name": (axis("x" * 10_000), ("unknown column", "…")),
+    "booleans": (axis("yes"), ("'yes'", "bool", "not numbers")),
+    "time is booleans": (timed('{ column = "yes", unit = "s" }'), ("'yes'", "bool")),
+    "time is a struct without stamps": (timed('"pose.position"'), ("'pose.position'", "structs of x, y")),
+    "nanoseconds beyond a second": (timed('["plain", "t_ns"]'), ("'t_ns'", "row 1", "999999999")),
+    "seconds with decimals": (timed('["half", "plain"]'), ("'half'", "whole")),
+    "a recording": (f"{AXIS}\n{RECORDED}", ("a.mcap",)),
 }
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from ..arrays import NO_STAMP, IntArray, TimeArray, median
 from ..errors import RunError
 from ..units import TIMES, mistaken
-from .run import REFERENCE, Run, Source, note_rows
+from .run import REFERENCE, TOLERATED_STEP_BACK_NS, Run, Source, note_rows
 from .screening import without_stray_values
 from .set_back import going_on
 
-TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 _OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
 _MOST_LOST = 2.5  # times the update period, from which more than half of the commands are missing
 _NEW_CLOCK = 3  # so many rows in a row with another time: the clock was set anew; fewer are stray
@@ -60,12 +59,11 @@ def stray_offsets(stamp: TimeArray) -> IntArray:
     that is not stray itself, the row after them, and 1 s for "far":
 
     - each is far ahead of both, or far behind the one before; and the row after is not far behind the one before;
-    - at the beginning of the log, where no row is before: each is far ahead of the row after;
-    - at its end, where no row is after: each is far behind the row before.
+    - at the beginning of the log: each is far ahead of the row after, and of three rows at least;
+    - at its end: each is far behind the row before, and three rows at least are before.
 
-    At the beginning and the end the other side must have at least three rows. One row is tried before two. Three in a
-    row or more are never stray: there the clock was set anew. A row that is ahead and never contradicted is a pause.
-    Rows without a stamp are skipped.
+    One row is tried before two. Three in a row or more are never stray: there the clock was set anew. A row that is
+    ahead and never contradicted is a pause. Rows without a stamp are skipped.
     """
     found = np.zeros(len(stamp), dtype=np.int64)
     stamped = np.flatnonzero(stamp != NO_STAMP) if NO_STAMP in stamp else slice(None)
@@ -113,10 +111,9 @@ def without_strays(run: Run) -> Run:
 
     Clocks that were set back by up to 1 s go on before that (:func:`.set_back.going_on`).
 
-    Their rows stay and count as rows without a stamp: commands are not used, measurements are invalid, and all other
-    rows are processed as if these were absent. Rows of sensors and of the reference that are far behind keep their
-    stamps, since they disturb no other: they become too late. This is done once, because what is left of nonsense
-    stamps may look stray again.
+    Their rows stay, without a stamp: commands are not used, measurements are invalid. Rows of sensors and of the
+    reference that are far behind keep their stamps, since they disturb no other: they become too late. This is done
+    once, because what is left of nonsense stamps may look stray again.
     """
     if run.without_strays:
         return run
@@ -208,10 +205,9 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
         found.append(f"{label}: {senders}")
     elif (other := other_interval(first, period)) is not None:
         sentence, kind = other
-        if kind == "unit":
-            raise RunError(f"{label}: {sentence} {_CORRECT}, or update_period_ms in arm.toml")
-        if kind == "lost":
-            raise RunError(f"{label}: {sentence} Log every command, or correct update_period_ms in arm.toml")
+        if kind != "other":
+            advice = _CORRECT if kind == "unit" else "Log every command"
+            raise RunError(f"{label}: {sentence} {advice}, or correct update_period_ms in arm.toml")
         found.append(f"{label}: {sentence}")
     if senders is None and (missing := missing_commands(run.command)) is not None:
         found.append(f"{label}: {missing}: the model holds the one before; log every command")
@@ -240,8 +236,7 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit"
     intervals = every[every > 0]
     if len(intervals) < _FEW:
         return None
-    quarters = len(intervals) * np.arange(1, 4) // 4  # numpy's quantile takes ten times as long
-    early, usual, late = np.partition(intervals, quarters)[quarters] / 1e9
+    early, usual, late = _quartiles(intervals)
     units, even = mistaken(usual / period, TIMES), late - early <= _EVEN * usual
     if units and even:
         times = f"{usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms = {period * 1e3:g}"
@@ -261,18 +256,23 @@ def two_senders(stamp: TimeArray, period: float) -> str | None:
     intervals = every[every > 0]  # rows may share a stamp
     if len(intervals) < _FEW:
         return None
-    both = intervals[1:] + intervals[:-1]
-    usual = median(both / 1e9)
-    quarters = len(intervals) * np.array([1, 3]) // 4  # numpy's quantile takes ten times as long
-    short, long = (float(one) / 1e9 for one in np.partition(intervals, quarters)[quarters])
+    short, _, long = _quartiles(intervals)
+    both = (intervals[1:] + intervals[:-1]) / 1e9
+    usual = median(both)
     near = np.minimum(np.abs(intervals / 1e9 - short), np.abs(intervals / 1e9 - long)) < _EVEN * usual
-    even = float(np.mean(np.abs(both / 1e9 - usual) < _EVEN * usual)), float(np.mean(near))
-    if min(even) < _ALTERNATE or long - short < _EVEN * usual or not 1.0 / _OTHER_BEAT < usual / period < _OTHER_BEAT:
+    even = min(np.mean(np.abs(both - usual) < _EVEN * usual), np.mean(near))
+    if even < _ALTERNATE or long - short < _EVEN * usual or not 1.0 / _OTHER_BEAT < usual / period < _OTHER_BEAT:
         return None
     return (
         f"commands of two senders: each sends every {usual * 1e3:.4g} ms, one {short * 1e3:.4g} ms after the other:"
         " is one of them too many? The model follows whichever came last"
     )
+
+
+def _quartiles(intervals: IntArray) -> list[float]:
+    """Lower quartile, median and upper quartile [s] of intervals [ns]; numpy's quantile takes ten times as long."""
+    quarters = len(intervals) * np.arange(1, 4) // 4
+    return (np.partition(intervals, quarters)[quarters] / 1e9).tolist()
 
 
 def missing_commands(command: Source, origin: int | None = None) -> str | None:

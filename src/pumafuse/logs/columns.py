@@ -69,18 +69,13 @@ class Table:
 
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
         """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels."""
-        self._plain_column(name)
-        unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
         given, note = self.plain(name)
+        unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
         size = sentinel(given) if self.sentinel_of is None else self.sentinel_of(name)
         values = given if size is None else without(given, size)
         if (gone := np.isnan(values) & ~np.isnan(given)).any():
-            what = (
-                f"{self.path.name}: {counted(int(gone.sum()), 'cell')} of column '{shortened(name)}' with"
-                f" {given[gone][0]:.15g}, ten times as far as all others, first in row {gone.argmax() + 1}: taken as"
-                " missing"
-            )
-            note = what if note is None else f"{note}; {what}"
+            number = f"with {given[gone][0]:.15g}, ten times as far as all others"
+            note = "; ".join(filter(None, (note, self._missing(name, int(gone.sum()), number, int(gone.argmax())))))
         return units.si_of(values, unit), note
 
     def plain(self, name: str) -> tuple[FloatArray, str | None]:
@@ -104,16 +99,13 @@ class Table:
         timestamps are exact, and so are seconds and nanoseconds apart. A date without a time zone is in UTC; a time
         without a date is since its midnight. ``unit`` is that of numbers (``_ms``); empty: what the name ends in.
         """
+        if nanoseconds:
+            return self._of_two(name, nanoseconds)
         column = self.column(name)
         if pa.types.is_struct(column.type):
             fields = {field.name for field in column.type}
-            split = next((pair for pair in SPLIT_STAMPS if fields.issuperset(pair)), None)
-            if split is not None and not nanoseconds:
-                return self.stamps(f"{name}.{split[0]}", f"{name}.{split[1]}")
-        if nanoseconds:
-            return self._of_two(name, nanoseconds)
-        if _is_any(column.type, _CLOCKS):
-            return self._within_reach(name, self._of_clock(name, column)), None
+            if split := next((pair for pair in SPLIT_STAMPS if fields.issuperset(pair)), None):
+                return self._of_two(*(f"{name}.{part}" for part in split))
         if (dated := self._dates(name, column)) is not None:
             return self._within_reach(name, self._of_clock(name, dated[0])), dated[1]
         self._refuse_words(name, self._plain_column(name))
@@ -135,8 +127,7 @@ class Table:
     def is_dated(self, name: str) -> bool:
         """Whether a column has dates, or times of day, and nothing else."""
         with suppress(RunError):  # dates mixed with numbers
-            column = self.column(name)
-            return _is_any(column.type, _CLOCKS) or self._dates(name, column) is not None
+            return self._dates(name, self.column(name)) is not None
         return False
 
     def zoned(self, name: str) -> bool | None:
@@ -190,10 +181,8 @@ class Table:
         self._refuse_beyond(name, ~missing & (np.abs(seconds * 1e9) >= REACH_NS))
         wrong = np.flatnonzero(~missing & ((rest < 0) | (rest >= _GIGA)))
         if len(wrong):
-            raise RunError(
-                f"{self.path}: column '{shortened(nanoseconds)}', row {wrong[0] + 1}: {rest[wrong[0]]} is no number of"
-                f" nanoseconds within a second, 0 to {_GIGA - 1}"
-            )
+            what = f"{rest[wrong[0]]} is no number of nanoseconds within a second, 0 to {_GIGA - 1}"
+            raise self._refusal(nanoseconds, what, int(wrong[0]))
         return np.where(missing, NO_STAMP, np.where(missing, 0, seconds) * _GIGA + rest), note or other
 
     def _whole(self, name: str) -> tuple[IntArray, str | None]:
@@ -202,9 +191,7 @@ class Table:
         if pa.types.is_floating(column.type):
             column = pc.if_else(pc.is_finite(column), column, pa.scalar(None, column.type))
             if pc.any(pc.not_equal(column, pc.round(column))).as_py():
-                raise RunError(
-                    f"{self.path}: column '{shortened(name)}' is beside another of one time: it must be whole"
-                )
+                raise self._refusal(name, "beside another of one time it must be whole")
         return _filled(self._cast(name, column, pa.int64()), NO_STAMP), note
 
     def _of_clock(self, name: str, column: pa.ChunkedArray) -> TimeArray:
@@ -214,7 +201,9 @@ class Table:
         return _filled(self._cast(name, column, kind).cast(pa.int64()), NO_STAMP)
 
     def _dates(self, name: str, column: pa.ChunkedArray) -> tuple[pa.ChunkedArray, str | None] | None:
-        """A column of dates or times as text, as Arrow's, and a note on other text; None for a column without any."""
+        """A column of dates or times, also as text, as Arrow's, and a note on other text; None for one without any."""
+        if _is_any(column.type, _CLOCKS):
+            return column, None
         if not _is_any(column.type, _TEXTS):
             return None
         text, order = dates.iso(column)
@@ -231,11 +220,11 @@ class Table:
         }
         rows = {kind: pc.index(mask, value=True).as_py() + 1 for kind, mask in kinds.items() if pc.any(mask).as_py()}
         if len(rows) > 1:
-            found = ", ".join(f"{kind} in row {row}" for kind, row in rows.items())
-            raise RunError(f"{self.path}: column '{shortened(name)}' mixes stamps: {found}; write all in one way")
-        note = self._words(name, column, good, "a date" if "a time without a date" not in rows else "a time")
+            mixed = ", ".join(f"{kind} in row {row}" for kind, row in rows.items())
+            raise self._refusal(name, f"mixes stamps: {mixed}; write all in one way")
         if "a time without a date" in rows:
-            return dates.durations(text), note
+            return dates.durations(text), self._words(name, column, good, "a time")
+        note = self._words(name, column, good, "a date")
         text = pc.replace_substring(pc.if_else(dated, text, pa.scalar(None, text.type)), ",", ".")
         kind = pa.timestamp("ns", "UTC" if "a date with a time zone" in rows else None)
         if order is not None:
@@ -250,10 +239,8 @@ class Table:
         word = pc.and_(pc.is_valid(text), pc.invert(pc.is_in(text, value_set=pa.array(BLANK, text.type))))
         if pc.any(word).as_py() and not pc.any(pc.match_substring_regex(text, NUMBER)).as_py():
             row = pc.index(word, value=True).as_py()
-            raise RunError(
-                f"{self.path}: column '{shortened(name)}', row {row + 1}: {text[row].as_py()[:40]!r} is no number and"
-                " no ISO 8601 date (2026-11-25T10:00:00.125)"
-            )
+            what = f"{text[row].as_py()[:40]!r} is no number and no ISO 8601 date (2026-11-25T10:00:00.125)"
+            raise self._refusal(name, what, row)
 
     def _within_reach(self, name: str, stamp: TimeArray) -> TimeArray:
         self._refuse_beyond(name, (stamp != NO_STAMP) & ((stamp >= int(REACH_NS)) | (stamp <= -int(REACH_NS))))
@@ -261,16 +248,18 @@ class Table:
 
     def _refuse_beyond(self, name: str, rows: BoolArray) -> None:
         if rows.any():
-            raise RunError(
-                f"{self.path}: column '{shortened(name)}', row {rows.argmax() + 1}: a stamp beyond the year 2110; is it"
-                " of the unit that its name or run.toml says?"
-            )
+            what = "a stamp beyond the year 2110; is it of the unit that its name or run.toml says?"
+            raise self._refusal(name, what, int(rows.argmax()))
+
+    def _refusal(self, name: str, what: str, row: int | None = None) -> RunError:
+        place = "" if row is None else f", row {row + 1}"
+        return RunError(f"{self.path}: column '{shortened(name)}'{place}: {what}")
 
     def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
         try:
             return column.cast(kind)
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-            raise RunError(f"{self.path}: column '{shortened(name)}': {str(error).splitlines()[0]}") from None
+            raise self._refusal(name, str(error).splitlines()[0]) from None
 
     def _ending(self, name: str, accepted: tuple[str, ...], example: str) -> str:
         unit = units.ending(leaf(name))
@@ -285,7 +274,7 @@ class Table:
     def _plain_column(self, name: str) -> pa.ChunkedArray:
         column = self.column(name)
         if _is_any(column.type, _NEITHER_NUMBERS_NOR_TEXT):
-            raise RunError(f"{self.path}: column '{shortened(name)}' holds {_in_words(column.type)}, not numbers")
+            raise self._refusal(name, f"holds {_in_words(column.type)}, not numbers")
         return column
 
     def _numeric(self, name: str) -> tuple[pa.ChunkedArray, str | None]:
@@ -310,10 +299,11 @@ class Table:
         if not count:
             return None
         row = pc.index(words, value=True).as_py()
-        return (
-            f"{self.path.name}: {counted(count, 'cell')} of column '{shortened(name)}' without {what}, first"
-            f" {column[row].as_py()[:40]!r} in row {row + 1}: taken as missing"
-        )
+        return self._missing(name, count, f"without {what}", row, f" {column[row].as_py()[:40]!r}")
+
+    def _missing(self, name: str, count: int, what: str, row: int, first: str = "") -> str:
+        cells = f"{counted(count, 'cell')} of column '{shortened(name)}' {what}"
+        return f"{self.path.name}: {cells}, first{first} in row {row + 1}: taken as missing"
 
 
 @dataclass(frozen=True)

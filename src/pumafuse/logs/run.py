@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 Clock = Literal["stamps", "regular"]
 REFERENCE = "reference"  # the name of a run's reference among its sensors
 NOISE = "noise"  # what arrays and events call how noisy a row is
+TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 
 _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
-_OUT_OF_ORDER_NS = 1_000_000_000  # by which rows are out of order without a word
 _FEW_ROWS = 10  # too few to judge a clock by
 _MOST_ROWS = 30_000_000  # of interpolated commands, all of which are in memory
 _ABOUT = 1.01  # times the interval of commands, a median of stamps that jitter, which is written with few digits
@@ -121,7 +121,7 @@ class Source:
             return self
         told, late = self.joints.values.copy(), self.joints.chain.columns(later, self.label)
         known = np.flatnonzero(np.isfinite(told).all(axis=1) & (self.stamp != NO_STAMP))
-        set_back = np.flatnonzero(np.diff(self.stamp[known]) < -_OUT_OF_ORDER_NS) + 1
+        set_back = np.flatnonzero(np.diff(self.stamp[known]) < -TOLERATED_STEP_BACK_NS) + 1
         for part in np.split(known, set_back):
             rows = part[np.argsort(self.stamp[part], kind="stable")]
             time = self.stamp[rows]
@@ -249,7 +249,7 @@ class Source:
         Rerun keeps rows by their time, in whatever order they were logged; a time that was logged anew counts once.
         """
         order = np.argsort(self.stamp, kind="stable")
-        if (np.diff(self.stamp) >= -_OUT_OF_ORDER_NS).all():
+        if (np.diff(self.stamp) >= -TOLERATED_STEP_BACK_NS).all():
             return self, None
         again = np.append(False, (np.diff(self.stamp[order]) == 0) & (np.diff(order) > 1))
         mine = [value[order] for value in self.values.values()]

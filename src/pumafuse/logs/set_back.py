@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import NO_STAMP, IntArray, TimeArray
-from .run import Run, Source
+from .run import TOLERATED_STEP_BACK_NS, Run, Source
 
-_FARTHEST_NS = 1_000_000_000  # by which rows are out of order; beyond it there is another segment
 _IN_ORDER = 20  # rows in order before a step
 _LEAST, _OF_ALL, _OF_ONE = 1, 3, 5  # rows behind: of each source; of one at least, if all step back; if one does alone
 _MANY = 100  # intervals of which the usual one is the median
@@ -73,7 +72,7 @@ def _step(stamp: TimeArray, begin: int, row: int, end: int) -> Step | None:
     """The step back at a row, which ends rows in order from ``begin`` and begins some until ``end``; if it is one."""
     newest, first = int(stamp[row - 1]), int(stamp[row])
     usual = float(np.median(np.diff(stamp[max(begin, row - _MANY) : row])))
-    if newest - first > _FARTHEST_NS or stamp[begin] > first or usual <= 0.0:
+    if newest - first > TOLERATED_STEP_BACK_NS or stamp[begin] > first or usual <= 0.0:
         return None
     before = stamp[begin + int(np.searchsorted(stamp[begin:row], first, side="right")) - 1 : row]
     after = stamp[row : row + int(np.searchsorted(stamp[row:end], newest, side="right")) + 1][: end - row]
@@ -124,7 +123,7 @@ def _agree(one: Step, other: Step) -> bool:
 def _goes_on(stamp: TimeArray, step: Step) -> bool:
     """Whether a source goes on over a step as if there was none: it has rows just before and after, and no step."""
     known = stamp[stamp != NO_STAMP]
-    near = known[np.abs(known - step.newest) <= step.back + _FARTHEST_NS]
+    near = known[np.abs(known - step.newest) <= step.back + TOLERATED_STEP_BACK_NS]
     if len(near) < _LEAST or not (near.min() < step.newest - step.back and near.max() > step.newest):
         return False
     return bool((np.diff(near) >= 0).all()) and float(np.median(np.diff(near))) < step.back
@@ -133,7 +132,7 @@ def _goes_on(stamp: TimeArray, step: Step) -> bool:
 def _shows(stamp: TimeArray, step: Step) -> bool:
     """Whether an interval of a reference is shorter by about a step, where that is."""
     known = stamp[stamp != NO_STAMP]
-    interval, near = np.diff(known), np.abs(known[1:] - step.newest) <= step.back + _FARTHEST_NS
+    interval, near = np.diff(known), np.abs(known[1:] - step.newest) <= step.back + TOLERATED_STEP_BACK_NS
     return bool(near.any()) and float(interval[near].min()) < float(np.median(interval)) - 0.5 * step.back
 
 
