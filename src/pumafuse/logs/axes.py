@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import NO_STAMP, FloatArray
+from ..arrays import FloatArray, known_rows
 from ..errors import RunError
 from ..space import rotations
 from ..space.rotations import TURNING
@@ -70,9 +70,8 @@ def _turning(run: Run, tool: tuple[float, float, float] | None) -> Run:
     found = run.each(turning)
     told = np.stack([found.command.values[axis] for axis in TURNING])
     farthest = float(np.sqrt(np.nanmax(np.sum(told**2, axis=0))))
-    far = (
-        f"{run.command.label}: the tool is told to turn by {math.degrees(farthest):.0f}° from its reference orientation"
-    )
+    by = f"{math.degrees(farthest):.0f}° from its reference orientation"
+    far = f"{run.command.label}: the tool is told to turn by {by}"
     if farthest > FARTHEST_TURN:
         raise RunError(f"{far}; up to 170° can be followed: cut the log, or give another [tool] in fusion.toml")
     if farthest > FAR_TURN:
@@ -83,22 +82,16 @@ def _turning(run: Run, tool: tuple[float, float, float] | None) -> Run:
 
 def _placed(run: Run, frame: Frame) -> Placed:
     where = f"run '{run.name}'"
-    if isinstance(frame, Rotated):
-        return placed_at(frame, 0.0, 0.0, where)
-    if "x" in run.start and "y" in run.start:
-        return placed_at(frame, run.start["x"], run.start["y"], where)
-    if "x" not in run.command.values or "y" not in run.command.values:
-        raise RunError(
-            f"{where}: a cylindrical frame takes its radius and angle from the start level; give the commands, or"
-            " start, in x and y"
-        )
+    if isinstance(frame, Rotated) or run.start.keys() >= {"x", "y"}:
+        return placed_at(frame, run.start.get("x", 0.0), run.start.get("y", 0.0), where)
+    if not run.command.values.keys() >= {"x", "y"}:
+        level = "a cylindrical frame takes its radius and angle from the start level"
+        raise RunError(f"{where}: {level}; give the commands, or start, in x and y")
     command = segments(run)[0][0].command
-    x, y = command.values["x"], command.values["y"]
-    usable = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & (command.stamp != NO_STAMP))
-    if not len(usable):
+    _, level = known_rows(command.stamp, np.column_stack([command.values["x"], command.values["y"]]))
+    if not len(level):
         raise RunError(f"{command.label}: no command has both x and y")
-    first = usable[np.argmin(command.stamp[usable])]
-    return placed_at(frame, float(x[first]), float(y[first]), where)
+    return placed_at(frame, float(level[0, 0]), float(level[0, 1]), where)
 
 
 def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:

@@ -191,7 +191,7 @@ class Table:
         if pa.types.is_floating(column.type):
             column = pc.if_else(pc.is_finite(column), column, pa.scalar(None, column.type))
             if pc.any(pc.not_equal(column, pc.round(column))).as_py():
-                raise self._refusal(name, "beside another of one time it must be whole")
+                raise self._refusal(name, "is beside another of one time: it must be whole")
         return _filled(self._cast(name, column, pa.int64()), NO_STAMP), note
 
     def _of_clock(self, name: str, column: pa.ChunkedArray) -> TimeArray:
@@ -252,14 +252,14 @@ class Table:
             raise self._refusal(name, what, int(rows.argmax()))
 
     def _refusal(self, name: str, what: str, row: int | None = None) -> RunError:
-        place = "" if row is None else f", row {row + 1}"
-        return RunError(f"{self.path}: column '{shortened(name)}'{place}: {what}")
+        place = "" if row is None else f", row {row + 1}:"
+        return RunError(f"{self.path}: column '{shortened(name)}'{place} {what}")
 
     def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
         try:
             return column.cast(kind)
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-            raise self._refusal(name, str(error).splitlines()[0]) from None
+            raise self._refusal(name, f"cannot be converted: {str(error).splitlines()[0]}") from None
 
     def _ending(self, name: str, accepted: tuple[str, ...], example: str) -> str:
         unit = units.ending(leaf(name))

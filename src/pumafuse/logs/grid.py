@@ -28,11 +28,9 @@ def regular_grid(stamp: TimeArray, period: float, label: str, what: str = COMMAN
     """The stamps moved to the controller's even ticks of T, with a note on drift and stamps off their ticks.
 
     Each command has a tick of its own, in the order of the stamps. Of all such assignments the one with the least sum
-    of squared distances is taken, which for a Gaussian jitter is the likeliest. Where all nearest ticks differ they are
-    the assignment. Where two stamps are nearest to one tick, as with a jitter of 0.2 T happens every hundred commands,
-    one of them is off by little more than half a period; moving a whole row of others would cost more. Stamps more than
-    0.7 T late cost the same however late they are, since a logger that stalls stamps a queue of commands at once: they
-    too are set back between their neighbours and move no other.
+    of squared distances is taken, which for a Gaussian jitter is the likeliest. Stamps more than 0.7 T late cost the
+    same however late they are, since a logger that stalls stamps a queue of commands at once: they are set back between
+    their neighbours and move no other.
 
     The grid's offset is the median of the residuals. T is exact unless the slope of the stamps differs from it by more
     than 5 standard errors: then the two clocks drift apart, the slope is used and the drift is noted.
@@ -62,13 +60,13 @@ def regular_grid(stamp: TimeArray, period: float, label: str, what: str = COMMAN
     residual = since - ticks * tick
     offset = float(np.median(residual))
     off = (residual - offset) / tick
-    late, early = int(np.sum(off > 0.5)), int(np.sum(off < -0.5))
+    astray, early = int(np.sum(np.abs(off) > 0.5)), int(np.sum(off < -0.5))
     if doubt := _doubt(ticks, off):
-        fault = f"{late + early} of {len(stamp)} are stamped more than half a period off their ticks, {doubt}"
+        fault = f"{astray} of {len(stamp)} are stamped more than half a period off their ticks, {doubt}"
         raise _refusal(fault, stamp, period, label, what)
-    if late or early:
+    if astray:
         how = "late: set back to their ticks" if not early else f"off their ticks, {early} of them early: put on them"
-        notes.append(f"{late + early} {what} are stamped more than half a period {how}")
+        notes.append(f"{astray} {what} are stamped more than half a period {how}")
     note = f"{label}: {'; '.join(notes)}" if notes else None
     return stamp[0] + np.rint(ticks * tick + offset).astype(np.int64), note
 

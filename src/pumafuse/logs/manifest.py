@@ -116,8 +116,8 @@ class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def read(self, table: Table) -> tuple[FloatArray, list[str]]:
         """Quaternions x, y, z, w of the rows of a table, (rows, 4), and notes; NaN in rows that have none."""
-        unit = f"_{self.unit}" if self.unit else ""
-        parts = [table.plain(one) if self.quaternion else table.numbers(one, unit) for one in self.columns]
+        ending = Column("", self.unit).ending
+        parts = [table.plain(one) if self.quaternion else table.numbers(one, ending) for one in self.columns]
         return self.quaternions(np.column_stack([part for part, _ in parts])), [note for _, note in parts if note]
 
     def quaternions(self, value: FloatArray) -> FloatArray:
@@ -342,7 +342,10 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     if not axes and not keys.keys() & {"orientation", "joints"}:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in x = 'x_mm'")
     if "noise" in keys:
-        _check_noise(keys["noise"], kind, axes, where, f"{path}.noise")
+        _check_noise(keys["noise"], kind, where, f"{path}.noise")
+    of_whole_rows = next((key for key in ("orientation", "noise") if key in keys), None)
+    if of_whole_rows and any(column.get("where") for columns in axes.values() for column in columns):
+        raise ConfigError(f"{where}: {path}.{of_whole_rows}: axes with rows of their own have none")
     if "time" in keys:
         keys["time"] = _time(keys["time"], where, f"{path}.time")
     if "where" in keys:
@@ -381,24 +384,20 @@ def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path:
         )
     if one.convention and not one.euler and not (one.quaternion and one.convention == "abb"):
         raise ConfigError(f"{where}: {path}.convention: only Euler angles have one, and a quaternion of ABB's")
-    for column in () if one.quaternion else one.columns:
-        _check_unit({"unit": one.unit} if one.unit else {}, ANGLES, where, path)
-        if kind_of(f"_{one.unit}" if one.unit else leaf(column)) != "angle":
+    if not one.quaternion:
+        _check_unit(given, ANGLES, where, path)
+        if column := next((name for name in one.columns if Column(name, one.unit).kind != "angle"), None):
             raise ConfigError(f"{where}: {path}: '{column}' ends in no unit of an angle; give unit = 'deg' or 'rad'")
     if twice := next((axis for axis in TURNING if axis in axes), None):
         raise ConfigError(f"{where}: {path}: the orientation has {twice}, which is an axis of its own, too; give one")
-    if any(column.get("where") for columns in axes.values() for column in columns):
-        raise ConfigError(f"{where}: {path}: axes with rows of their own have no orientation")
 
 
-def _check_noise(given: Any, kind: type[SourceEntry], axes: dict[str, list[Any]], where: str, path: str) -> None:
+def _check_noise(given: Any, kind: type[SourceEntry], where: str, path: str) -> None:
     one = toml.struct(given, RowNoise, where, path)
     if bool(one.sd) == bool(one.variance):
         raise ConfigError(f"{where}: {path}: expected one of sd = 'error_mm' and variance = 'pose.covariance[0]'")
     if kind is not SourceEntry:
         raise ConfigError(f"{where}: {path}: only rows of sensors have a noise")
-    if any(column.get("where") for columns in axes.values() for column in columns):
-        raise ConfigError(f"{where}: {path}: axes with rows of their own have no noise of each row")
 
 
 def _joints(given: Any, beside: Iterable[str], where: str, path: str) -> dict[str, Any]:

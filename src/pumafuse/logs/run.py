@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
@@ -149,12 +148,7 @@ class Source:
         return self.stamp[rows], self.values[axis][rows]
 
     def beside(self, command: Source, turns: Mapping[str, float]) -> Source:
-        """The source with angles that go on moved by whole turns to where they are commanded.
-
-        Args:
-            command: The commands.
-            turns: What a turn is, by axis [rad].
-        """
+        """The source with angles that go on moved by whole ``turns`` [rad], by axis, to where they are commanded."""
         values = dict(self.values)
         for axis in turns.keys() & values.keys() & command.values.keys():
             turn, told, (stamp, mine) = turns[axis], command.series(axis), self.series(axis)
@@ -221,8 +215,7 @@ class Source:
                 f" commands, {interval / 1e6:.4g} ms, and that"
             )
         goes_on = (gap > 0.0) & (gap <= PAUSE * interval)
-        parts = np.where(goes_on, np.maximum(np.rint(np.where(goes_on, gap, 0.0) / (step * 1e9)), 1.0), 1.0)
-        parts = np.append(parts, 1.0).astype(np.int64)
+        parts = np.maximum(np.rint(np.append(np.where(goes_on, gap, 0.0), 0.0) / (step * 1e9)), 1.0).astype(np.int64)
         if parts.sum() > _MOST_ROWS:
             raise RunError(
                 f"{self.label}: interpolation_ms = {step * 1e3:g} makes {parts.sum() / 1e6:.0f} million commands, more"
@@ -479,12 +472,10 @@ def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: s
 def standing_clock(source: Source) -> str:
     """What is wrong with a clock that stands still while values go on, in words; empty of any other.
 
-    Real logs have rows with the stamp of the row before: clocks tick every 1 ms, 10 ms, or 15.6 ms (Windows), a sensor
-    is asked several times. Too coarse is a clock that ticks every 0.1 s or more, where most values of an axis change
-    within a tick, and not by far less than from one tick to the next, as a measurement that is repeated at a standstill
-    does. Measured on scan1 and trunk-servo, their commands or measurements stamped by such clocks: ticks up to 15.6 ms
-    raise the RMSE by a quarter at most, 50 ms double it, 0.1 s raise it up to 4 times, 1 s up to 10 times. As recorded,
-    no row of theirs, nor of any other run at hand, has the stamp of the row before.
+    Too coarse is a clock that ticks every 0.1 s or more, where most values of an axis change within a tick, and not by
+    far less than from one tick to the next, as a measurement that is repeated at a standstill does. On scan1 and
+    trunk-servo, stamped by such clocks, ticks up to 15.6 ms (Windows) raise the RMSE by a quarter at most, 50 ms double
+    it, 0.1 s raise it up to 4 times, 1 s up to 10 times.
     """
     axis, changes = _most_changes(source)
     most = changes.sum()
@@ -593,7 +584,13 @@ def _read(listed: manifest.Manifest, folder: Path) -> Run:
         return tables.read(file, growing=True, fields=fields[entry.rows], where=entry.where, **chosen)
 
     run = of_tables(listed, folder, read)
-    return replace(run, recording=_recording(folder, listed.entries.values()))
+    logged = next((entry for entry in listed.entries.values() if entry.entity), None)
+    if logged is None:
+        return run
+    from .entities import recording_of
+
+    unit = logged.time.ending or ending(logged.time.column) or ""
+    return replace(run, recording=recording_of(folder / logged.file, logged.entity, logged.time.column, unit))
 
 
 def of_tables(
@@ -626,9 +623,7 @@ def of_tables(
         return _on_ticks(found, notes) if entry.clock == "regular" and entry is not listed.command else found
 
     sources = {name: source(name) for name in entries}
-    together = {name: entry for name, entry in entries.items() if not entry.has_own_rows}
-    tables_of = Counter(entry.rows for entry in together.values())
-    has_value = {name: sources[name].has_value for name, entry in together.items() if tables_of[entry.rows] > 1}
+    has_value = {name: sources[name].has_value for name, entry in entries.items() if not entry.has_own_rows}
     empty: dict[tuple[str, ...], BoolArray] = {}  # rows of a table in which none of its sources has a value
     for name, mine in has_value.items():
         empty[entries[name].rows] = ~mine & empty.get(entries[name].rows, True)
@@ -660,16 +655,6 @@ def _on_ticks(source: Source, notes: list[str]) -> Source:
     stamp = source.stamp.copy()
     stamp[known] = grid[place]
     return replace(source, stamp=stamp)
-
-
-def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recording | None:
-    found = next((entry for entry in entries if entry.entity), None)
-    if found is None:
-        return None
-    from .entities import recording_of
-
-    time = found.time
-    return recording_of(folder / found.file, found.entity, time.column, time.ending or ending(time.column) or "")
 
 
 def clock_of(table: tables.Table) -> str:

@@ -513,9 +513,9 @@ class _Layout(NamedTuple):
     point: str  # of decimals: 1,5;2 as well as 1.5,2
     skipped: int  # lines above the header; with it where names are given
     names: list[str] | None
-    units: bool  # whether a line with units is below the header
-    above: int  # how many of the lines above are no comments and not blank
-    broken: bool  # whether cells in quotes go on in the next line
+    units: bool = False  # whether a line with units is below the header
+    above: int = 0  # how many of the lines above are no comments and not blank
+    broken: bool = False  # whether cells in quotes go on in the next line
 
 
 def _layout(text: bytes) -> _Layout:
@@ -529,7 +529,7 @@ def _layout(text: bytes) -> _Layout:
     names = _cells(comment, separator)
     rows_below = lines[first - 1].startswith(_ECHO) or _begins(lines, first, separator)
     if first > 0 and len(names) == len(_cells(lines[first], separator)) and rows_below:
-        return _Layout(separator, _point(text, separator), first, names, units=False, above=0, broken=broken)
+        return _Layout(separator, _point(text, separator), first, names, broken=broken)
     separator = _separator(lines[first])
     header = -1 if _is_headless(lines, first, separator) else _header(lines, full)
     rows = next((n for n in full if n > header), header)
@@ -538,15 +538,14 @@ def _layout(text: bytes) -> _Layout:
     # What stands above rows of numbers and has another number of cells is no header of theirs.
     is_other = first < header < rows and _begins(lines, rows, of_rows) and len(_cells(lines[header], of_rows)) != width
     if header < 0 or is_other:
-        separator, names = of_rows, list(map(_column, range(width)))
-        above = sum(n < rows for n in full)
-        return _Layout(separator, _point(text, separator), rows, names, units=False, above=above, broken=broken)
-    separator = _separator(lines[header])
-    units = header > first and all(map(_UNIT.fullmatch, _cells(lines[header], separator)))
-    top, names = _told_apart(lines, header - units, separator)
-    cells = _cells(lines[header], separator)
-    names = cells if names is None and len(cells) > _WIDE else names
-    skipped = header - units + (names is not None)
+        separator, names, skipped, top, units = of_rows, list(map(_column, range(width))), rows, rows, False
+    else:
+        separator = _separator(lines[header])
+        cells = _cells(lines[header], separator)
+        units = header > first and all(map(_UNIT.fullmatch, cells))
+        top, names = _told_apart(lines, header - units, separator)
+        names = cells if names is None and len(cells) > _WIDE else names
+        skipped = header - units + (names is not None)
     return _Layout(separator, _point(text, separator), skipped, names, units, sum(n < top for n in full), broken)
 
 
@@ -619,10 +618,8 @@ def _is_headless(lines: Sequence[str], first: int, separator: str) -> bool:
     if not _begins(lines, first, separator):
         return False
     row, below = (_cells(lines[first + n], separator) for n in (0, 1))
-    alike = all(
-        map(_NUMBER.fullmatch, (one for one, other in zip(row, below, strict=True) if _NUMBER.fullmatch(other)))
-    )
-    return alike and row != list(map(str, range(len(row))))
+    of_numbers = [one for one, other in zip(row, below, strict=True) if _NUMBER.fullmatch(other)]
+    return all(map(_NUMBER.fullmatch, of_numbers)) and row != list(map(str, range(len(row))))
 
 
 def _column(place: int) -> str:
