@@ -57,13 +57,12 @@ def test_rows_of_each_noise_are_a_sensor_of_their_own(engine: str) -> None:
 
 def written(folder: Path, noise: str, column: np.ndarray) -> Path:
     (folder / "run.toml").write_text(RUN.format(noise))
-    np.savetxt(folder / "command.csv", np.column_stack([GIVEN, 1e3 * COMMAND["x"]]), "%.6f", ",", header="t_s,x_mm")
+    table = np.column_stack([GIVEN, 1e3 * COMMAND["x"]])
+    np.savetxt(folder / "command.csv", table, "%.6f", ",", header="t_s,x_mm", comments="")
     rows = ["t_s,x_mm,told"]
     for stamp, value, told in zip(SEEN, 1e3 * MEASURED, column, strict=True):
         rows.append(f"{stamp:.3f},{value:.6f},{'' if np.isnan(told) else told}")
     (folder / "camera.csv").write_text("\n".join(rows) + "\n")
-    text = (folder / "command.csv").read_text()
-    (folder / "command.csv").write_text(text.removeprefix("# "))
     return folder
 
 

@@ -42,15 +42,13 @@ def going_on(run: Run) -> tuple[Run, list[str]]:
         common = next(filter(None, (_common(run, one, steps) for one in _candidates(steps))), None)
         if common is None:
             return run, [*notes, *_alone(run, steps)]
-        back, newest = common.back, common.newest
-        later = _rows_after(run.command, newest, back)
+        later = _rows_after(run.command, common)
         row = f" in row {later[0] + 1}" if len(later) else ""
         apart = run.reference is not None and not _shows(run.reference.stamp, common)
         but = "; that of the reference is not" if apart else ""
-        notes.append(
-            f"{run.command.label}: all clocks are set back by {back / 1e9:.3f} s{row}: stamps go on from there{but}"
-        )
-        moved = _moved(run, newest, back)
+        step = f"set back by {common.back / 1e9:.3f} s{row}"
+        notes.append(f"{run.command.label}: all clocks are {step}: stamps go on from there{but}")
+        moved = _moved(run, common)
         run = replace(moved, reference=run.reference) if apart else moved
     return run, notes
 
@@ -108,7 +106,7 @@ def _common(run: Run, step: Step, steps: Mapping[str, list[Step]]) -> Step | Non
             return None
     if steps[""] and not any(_agree(one, step) for one in steps[""]):
         return None
-    several = len(agreeing) > 1 or len(_sources(run)) == 1
+    several = len(agreeing) > 1 or not run.sensors
     if not several or max(one.behind for one in agreeing) < _OF_ALL:
         return None
     surest = min(agreeing, key=lambda one: one.usual)
@@ -136,29 +134,30 @@ def _shows(stamp: TimeArray, step: Step) -> bool:
     return bool(near.any()) and float(interval[near].min()) < float(np.median(interval)) - 0.5 * step.back
 
 
-def _rows_after(source: Source, newest: int, back: float) -> IntArray:
+def _rows_after(source: Source, step: Step) -> IntArray:
     """The rows of a source that came after a step, of those with a stamp."""
     known = np.flatnonzero(source.stamp != NO_STAMP)
     stamp = source.stamp[known]
-    rows = [one.row for one in steps_back(stamp) if abs(one.newest - newest) <= back]
-    rows = rows or (np.flatnonzero((np.diff(stamp) < 0) & (np.abs(stamp[:-1] - newest) <= back)) + 1).tolist()
-    return known[rows[0] if rows else _shortest(stamp, newest, back) :]
+    rows = [one.row for one in steps_back(stamp) if abs(one.newest - step.newest) <= step.back]
+    falls = (np.diff(stamp) < 0) & (np.abs(stamp[:-1] - step.newest) <= step.back)
+    rows = rows or (np.flatnonzero(falls) + 1).tolist()
+    return known[rows[0] if rows else _shortest(stamp, step) :]
 
 
-def _shortest(stamp: TimeArray, newest: int, back: float) -> int:
+def _shortest(stamp: TimeArray, step: Step) -> int:
     """Where a source whose interval is longer than the step is cut: where its interval is shorter by the step."""
     interval = np.diff(stamp)
-    near = np.flatnonzero((stamp[1:] > newest - back) & (stamp[:-1] <= newest))
+    near = np.flatnonzero((stamp[1:] > step.newest - step.back) & (stamp[:-1] <= step.newest))
     if not len(near):
-        return int(np.searchsorted(stamp, newest, side="right"))
+        return int(np.searchsorted(stamp, step.newest, side="right"))
     usual = float(np.median(interval))
-    return int(near[np.argmin(np.abs(interval[near] + back - usual))]) + 1
+    return int(near[np.argmin(np.abs(interval[near] + step.back - usual))]) + 1
 
 
-def _moved(run: Run, newest: int, back: float) -> Run:
+def _moved(run: Run, step: Step) -> Run:
     def moved(_: str, source: Source) -> Source:
         stamp = source.stamp.copy()
-        stamp[_rows_after(source, newest, back)] += round(back)
+        stamp[_rows_after(source, step)] += round(step.back)
         return replace(source, stamp=stamp)
 
     return run.each(moved)
