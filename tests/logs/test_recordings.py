@@ -340,12 +340,12 @@ def _bomb(size: int) -> bytes:
     return b"".join(pressed.compress(bytes(1 << 24)) for _ in range(size >> 24)) + pressed.flush()
 
 
-LARGE = 1 << 29
+LARGE = 1 << 28
 BOMBS = {
     "claims what it has": lambda: _chunk(_bomb(LARGE), "zstd", LARGE),
     "claims less": lambda: _chunk(_bomb(LARGE), "zstd", 1000),
     "claims an exabyte": lambda: _chunk(zstandard.compress(bytes(1000)), "zstd", 1 << 60),
-    "claims less, lz4": lambda: _chunk(lz4.frame.compress(bytes(LARGE // 2)), "lz4", 1000),
+    "claims less, lz4": lambda: _chunk(lz4.frame.compress(bytes(LARGE)), "lz4", 1000),
     "claims more, lz4": lambda: _chunk(lz4.frame.compress(bytes(1000)), "lz4", 1 << 60),
 }
 PEAK = """
