@@ -364,7 +364,7 @@ def prefixes(paths: Sequence[str]) -> list[str]:
 
 def holders(fields: Iterable[str]) -> set[str]:
     """The names of columns that are, or hold, one of the fields that are asked for."""
-    return {path[:end] for path in fields for end in (*_ends(path), len(path))}
+    return {path[:end] for path in fields for end in _ends(path)}
 
 
 def numeric_paths(value: Any, path: str = "", names: Any = None) -> Iterator[str]:
@@ -396,13 +396,12 @@ def find(columns: Columns, path: str, where: str, *, part: bool = False) -> pa.C
 
 def longest(columns: Container[str], path: str) -> str | None:
     """The longest name that is the path, or that the path goes on from."""
-    ends = (len(path), *reversed(_ends(path)))
-    return next((path[:end] for end in ends if path[:end] in columns), None)
+    return next((path[:end] for end in reversed(_ends(path)) if path[:end] in columns), None)
 
 
 def _ends(path: str) -> list[int]:
-    """Where names of columns may end within a field path."""
-    return [place for place, letter in enumerate(path) if letter in ".["]
+    """Where names of columns may end in a field path."""
+    return [place for place, letter in enumerate(f"{path}.") if letter in ".["]
 
 
 def joined(tables: Iterable[pa.Table], what: str) -> pa.Table | None:

@@ -199,11 +199,8 @@ def _by_length(value: Any, name: str) -> dict[str, pa.Table]:
             one = one.T
         groups.setdefault(len(one), {})[key] = one
     groups = {rows: group for rows, group in groups.items() if rows >= _FEWEST}
-    titles = (
-        [name] if len(groups) == 1 else [".".join(filter(None, (name, next(iter(one))))) for one in groups.values()]
-    )
-    made = (_table(group).replace_schema_metadata(turned) for group in groups.values())
-    return dict(zip(titles, made, strict=True))
+    made = {next(iter(group)): _table(group).replace_schema_metadata(turned) for group in groups.values()}
+    return {name if len(made) == 1 else ".".join(filter(None, (name, first))): one for first, one in made.items()}
 
 
 def _table(arrays: Arrays) -> pa.Table:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -174,8 +174,7 @@ def _each_place(messages: Iterable[tuple[Record, Message]], faults: Faults) -> I
     begun = ((begin_of(one, record.time), record, one) for record, one in every if one is not None)
     known = sorted(begun, key=lambda one: one[0])
     before: CommandedPath | None = None
-    for place, (begin, record, trajectory) in enumerate(known):
-        end = known[place + 1][0] if place + 1 < len(known) else None
+    for (begin, record, trajectory), end in zip_longest(known, (begin for begin, _, _ in known[1:])):
         try:
             path = CommandedPath(trajectory, begin, before)
         except bags.DAMAGE as error:
