@@ -315,7 +315,8 @@ def test_a_number_of_nines_may_be_a_position(numbers: list[float]) -> None:
 
 
 @pytest.mark.parametrize(
-    "cell", ["2024-02-30T00:00:00", "2024-01-01T25:00:00", "9999-01-01T00:00:00", "1800-01-01T00:00:00"]
+    "cell",
+    ["2024-02-30T00:00:00", "2024-01-01T25:00:00", "9999-01-01T00:00:00", "2200-01-01T00:00:00", "1800-01-01T00:00:00"],
 )
 def test_dates_that_are_none_are_refused(cell: str) -> None:
     """A day, an hour or a century too many is one line with the column."""

@@ -112,8 +112,6 @@ MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "file with a null character": (COMMAND.replace("host.csv", "a\\u0000b"), ("NUL",)),
     "time is absent": (COMMAND.replace("t_ms", "t_s"), ("host.csv", "'t_s'", "did you mean 't_ms'", COLUMNS)),
     "column is a number": (COMMAND.replace('"z_m"', "3"), ("run.toml", "command.vertical", "column")),
-    "column is absent": (COMMAND.replace("z_m", "y_m"), ("host.csv", "'y_m'", "did you mean 'z_m'", COLUMNS)),
-    "column has no unit": (COMMAND.replace("z_m", "note"), ("host.csv", "'note'", "_m, _mm, _um")),
     "start without unit": (COMMAND + "start = { radial = 560.0 }", ("run.toml", "command.start.radial", "radial_mm")),
     "start of an unknown axis": (COMMAND + "start = { radail_mm = 1.0 }", ("'radail'", "did you mean 'radial'")),
     "clock is unknown": (COMMAND + 'clock = "exact"', ("run.toml", "command.clock", "'exact'")),

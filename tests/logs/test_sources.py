@@ -517,7 +517,6 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "where is a date": ("where = { group = 2024-01-01 }\n" + AXIS, ("command.where", "number")),
     "topic of a table": ('topic = "/servo"\n' + AXIS, ("log.parquet", "no topic", ".mcap", "'where'")),
     "entity of a table": ('entity = "/servo"\n' + AXIS, ("log.parquet", "no entity", ".rrd", "'where'")),
-    "topic is a number": ("topic = 3\n" + AXIS, ("command.topic", "str")),
     "field of a number": ('time = "t_ns"\nx = "x_m.y_m"', ("'x_m.y_m'", "no field 'y_m'", "double")),
     "element of a number": (axis("x_m[0]"), ("'x_m[0]'", "no element '0'", "double")),
     "a whole struct": (axis("pose"), ("'pose'", "structs of position", "not numbers")),

@@ -524,12 +524,10 @@ def test_times_of_day_in_whole_seconds_are_stamps(tmp_path: Path) -> None:
         ["9223372036854775808"],
         ["9999999999999999999", "word"],
         ["1e300"],
-        ["2200-01-01T00:00:00"],
-        ["1800-01-01T00:00:00"],
     ],
 )
 def test_stamps_too_far_from_1970_are_refused_in_one_line(tmp_path: Path, cells: list[str]) -> None:
-    """Counts and dates that int64 ns cannot hold, or not the difference of, are refused by their column."""
+    """Counts that int64 ns cannot hold, or not the difference of, are refused by their column."""
     assert "'t_ns'" in refusal(lambda: column(tmp_path, "t_ns", cells).stamps("t_ns"))
 
 
