@@ -42,18 +42,18 @@ class Address:
     @staticmethod
     def parse(text: str) -> Address:
         """Parse a source, as in ``udp://127.0.0.1:5005`` or ``replay:RUN?speed=4``."""
-        kind, colon, rest = text.partition(":")
+        kind, colon, after = text.partition(":")
         if text == "stdin":
             return Address("stdin")
         if kind == "replay" and colon:
-            return _replay(text, rest)
-        if kind == "ros2" and rest:
-            return Address("ros2", rest)
-        if kind == "rtde" and rest:
-            return _rtde(text, rest)
-        if kind == POSES and rest.startswith("//"):
-            return _poses(text, rest)
-        if kind in NETWORK and rest.startswith("//"):
+            return _replay(text, after)
+        if kind == "ros2" and after:
+            return Address("ros2", after)
+        if kind == "rtde" and after:
+            return _rtde(text, after)
+        if kind == POSES and after.startswith("//"):
+            return _poses(text, after)
+        if kind in NETWORK and after.startswith("//"):
             return _network_address(text, f"source '{text}'")
         raise ConfigError(f"no source '{text}'; there are: {_SOURCES}")
 
@@ -81,17 +81,17 @@ def listener(address: Address, listen: str | None, allow: Sequence[str]) -> tupl
     """Where a source listens, and which senders it accepts: on loopback all, elsewhere only those that are allowed."""
     networks = [_network(text) for text in allow]
     where = f"source '{address.text}'"
-    family, place = _resolve(listen or address.host or _LOOPBACK, address.port, where)
+    family, socket_address = _resolve(listen or address.host or _LOOPBACK, address.port, where)
     if listen is None:
-        if not ip_address(place[0]).is_loopback:
+        if not ip_address(socket_address[0]).is_loopback:
             raise ConfigError(
                 f"{where}: listens on loopback only; to be reached from elsewhere, give"
-                f" --listen {place[0]} --allow CIDR, as in --allow 192.168.1.0/24"
+                f" --listen {socket_address[0]} --allow CIDR, as in --allow 192.168.1.0/24"
             )
-        return (family, place), lambda _: True
+        return (family, socket_address), lambda _: True
     if address.host and address.host != listen:
         host = _resolve(address.host, 0, where)[1][0]
-        if host != place[0] and not ip_address(host).is_loopback:
+        if host != socket_address[0] and not ip_address(host).is_loopback:
             raise ConfigError(f"{where}: names another address than --listen {listen}")
 
     @lru_cache(maxsize=4096)
@@ -100,22 +100,22 @@ def listener(address: Address, listen: str | None, allow: Sequence[str]) -> tupl
         peer = peer.ipv4_mapped or peer if isinstance(peer, IPv6Address) else peer
         return any(peer in network for network in networks)
 
-    return (family, place), allowed
+    return (family, socket_address), allowed
 
 
 def _resolve(host: str, port: int, where: str) -> SocketAddress:
     try:
-        family, _, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        family, _, _, _, socket_address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or "not a host's name"
         raise ConfigError(f"{where}: no address of host '{host}' is known: {reason}") from None
-    return family, (str(place[0]), port)
+    return family, (str(socket_address[0]), port)
 
 
-def _replay(text: str, rest: str) -> Address:
-    path, question, option = rest.rpartition("?")
+def _replay(text: str, after: str) -> Address:
+    path, question, option = after.rpartition("?")
     if not question:
-        return Address("replay", rest)
+        return Address("replay", after)
     name, _, value = option.partition("=")
     try:
         speed = math.inf if value == "max" else float(value)
@@ -126,10 +126,10 @@ def _replay(text: str, rest: str) -> Address:
     return Address("replay", path, speed)
 
 
-def _rtde(text: str, rest: str) -> Address:
-    path, _, option = rest.rpartition("?")
-    name, _, place = option.partition("=")
-    host, port = _host_and_port(place, _RTDE)
+def _rtde(text: str, after: str) -> Address:
+    path, _, option = after.rpartition("?")
+    name, _, address = option.partition("=")
+    host, port = _host_and_port(address, _RTDE)
     if not (path and name == "host" and host and port):
         raise ConfigError(
             f"source '{text}': expected rtde:run.toml?host=HOST or HOST:PORT, the address of the robot's controller"
@@ -137,9 +137,9 @@ def _rtde(text: str, rest: str) -> Address:
     return Address("rtde", path, host=host, port=port)
 
 
-def _poses(text: str, rest: str) -> Address:
-    place, question, option = rest.removeprefix("//").partition("?")
-    host, port = _host_and_port(place, _IGTL)
+def _poses(text: str, after: str) -> Address:
+    address, question, option = after.removeprefix("//").partition("?")
+    host, port = _host_and_port(address, _IGTL)
     if not (host and port) or (question and option != "time=received"):
         raise ConfigError(
             f"source '{text}': expected igtl://HOST or igtl://HOST:PORT, and ?time=received for times of receipt"
@@ -148,22 +148,22 @@ def _poses(text: str, rest: str) -> Address:
 
 
 def _network_address(text: str, where: str) -> Address:
-    kind, _, place = text.partition("://")
-    host, port = _host_and_port(place)
+    kind, _, host_and_port = text.partition("://")
+    host, port = _host_and_port(host_and_port)
     if port is None or (kind == "tcp" and not (host and port)):
         raise ConfigError(f"{where}: expected {kind}://HOST:PORT, as in {kind}://{_LOOPBACK}:5005")
     return Address(kind, host=host, port=port)
 
 
-def _host_and_port(place: str, usual: int | None = None) -> tuple[str, int | None]:
+def _host_and_port(address: str, usual: int | None = None) -> tuple[str, int | None]:
     """Host and port of HOST:PORT, or of HOST with the usual port; no port of anything else."""
-    place = place if ":" in place or usual is None else f"{place}:{usual}"
+    address = address if ":" in address or usual is None else f"{address}:{usual}"
     try:
-        parts = urlsplit(f"//{place}")
+        parts = urlsplit(f"//{address}")
         host, port = parts.hostname or "", parts.port
     except ValueError:
         return "", None
-    plain = port is not None and place.lower() == host_port(host, port)
+    plain = port is not None and address.lower() == host_port(host, port)
     return host, port if plain else None
 
 

@@ -80,7 +80,7 @@ class Backlog(Generic[T]):
         patience = 0.0 if now - self._shed_at < _AGAIN else _BEHIND
         if now - self._since < patience or age < 0.5 * self._oldest:
             return
-        kept = [one for one in self._waiting if one[0] > now - _FRESH or _is_command(one[1])]
+        kept = [waiting for waiting in self._waiting if waiting[0] > now - _FRESH or _is_command(waiting[1])]
         self.shed += len(self._waiting) - len(kept)
         self._waiting, self._bytes = deque(kept), sum(_size(item) for _, item in kept)
         self._since, self._oldest, self._shed_at = 0.0, 0.0, now

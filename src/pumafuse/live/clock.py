@@ -214,9 +214,9 @@ class SetBack:
     def take(self, source: int, stamp: int) -> bool:
         """Take the stamp [ns] of the next event of ``COMMAND`` or a sensor; whether it is worth to ask for more."""
         self._events += 1
-        one, commands = self._sources[source], self._sources[-1]
-        one.take(stamp, self._events)
-        return one.in_a_row > 0 or commands.in_a_row > 0
+        clock, commands = self._sources[source], self._sources[-1]
+        clock.take(stamp, self._events)
+        return clock.in_a_row > 0 or commands.in_a_row > 0
 
     @property
     def commands(self) -> int:
@@ -226,15 +226,15 @@ class SetBack:
     def of_all(self) -> float:
         """By how much all clocks were set back [ns], once that shows; else 0."""
         *sensors, commands = self._sources
-        went_on = any(one.went_on(commands.since) and commands.back > one.usual > 0.0 for one in sensors)
-        went_back = any(one.went_back(commands.since) for one in sensors)
+        went_on = any(sensor.went_on(commands.since) and commands.back > sensor.usual > 0.0 for sensor in sensors)
+        went_back = any(sensor.went_back(commands.since) for sensor in sensors)
         shows = commands.in_a_row >= (_COMMANDS if went_back else _ALONE) and not went_on
         return commands.back if shows else 0.0
 
     def of_sensor(self, sensor: int) -> float:
         """By how much the clock of a sensor alone was set back [ns], once, when that shows; else 0."""
-        one, commands = self._sources[sensor], self._sources[-1]
-        if one.in_a_row < _ROWS or one.told == one.since or not commands.went_on(one.since):
+        clock, commands = self._sources[sensor], self._sources[-1]
+        if clock.in_a_row < _ROWS or clock.told == clock.since or not commands.went_on(clock.since):
             return 0.0
-        one.told = one.since
-        return one.back if abs(one.at - commands.at) > one.back else 0.0
+        clock.told = clock.since
+        return clock.back if abs(clock.at - commands.at) > clock.back else 0.0

@@ -33,24 +33,24 @@ class Commands:
 
     def add(self, stamp: int, codes: bytes, values: Sequence[float], oldest: int) -> None:
         """Add the values [m] of a command that were fused, in the place of what the axis had at that stamp [ns]."""
-        for axis, (given, code, value) in enumerate(zip(self._given, codes, values, strict=True)):
+        for axis, (told, code, value) in enumerate(zip(self._given, codes, values, strict=True)):
             if code != _FUSED:
                 continue
             low, high = self._ends[axis]
             self._ends[axis] = min(low, value), max(high, value)
-            if not given or stamp > given[-1][0]:
-                given.append((stamp, value))
+            if not told or stamp > told[-1][0]:
+                told.append((stamp, value))
             else:
-                place = bisect_left(given, (stamp,))
-                given[place : bisect_left(given, (stamp + 1,))] = [(stamp, value)]
-            if len(given) > 2 and given[2][0] <= oldest:  # one was in force then, and one is for its step
-                del given[0]
+                row = bisect_left(told, (stamp,))
+                told[row : bisect_left(told, (stamp + 1,))] = [(stamp, value)]
+            if len(told) > 2 and told[2][0] <= oldest:  # one was in force then, and one is for its step
+                del told[0]
 
     def at(self, axis: int, stamp: int) -> float | None:
         """What is commanded on an axis at ``stamp`` [ns], in m; None before any command."""
-        given = self._given[axis]
-        place = bisect_left(given, (stamp + 1,))
-        return given[place - 1][1] if place else self._before(axis) if given else None
+        told = self._given[axis]
+        row = bisect_left(told, (stamp + 1,))
+        return told[row - 1][1] if row else self._before(axis) if told else None
 
     def travel(self, axis: int) -> float:
         """How far apart the commands of an axis have been [m]; 0 before any."""
@@ -59,16 +59,16 @@ class Commands:
 
     def latest(self) -> list[tuple[int, float, float] | None]:
         """Of each axis stamp [ns], value and step [m] of its latest command; None before any."""
-        return [self._latest(axis, given) if given else None for axis, given in enumerate(self._given)]
+        return [self._latest(axis, told) if told else None for axis, told in enumerate(self._given)]
 
     def forget(self, after: int) -> None:
         """Take back those that are stamped after ``after`` [ns]."""
-        for given in self._given:
-            del given[bisect_left(given, (after + 1,)) :]
+        for told in self._given:
+            del told[bisect_left(told, (after + 1,)) :]
 
-    def _latest(self, axis: int, given: list[tuple[int, float]]) -> tuple[int, float, float]:
-        stamp, value = given[-1]
-        return stamp, value, value - (given[-2][1] if len(given) > 1 else self._before(axis))
+    def _latest(self, axis: int, told: list[tuple[int, float]]) -> tuple[int, float, float]:
+        stamp, value = told[-1]
+        return stamp, value, value - (told[-2][1] if len(told) > 1 else self._before(axis))
 
     def _before(self, axis: int) -> float:
         """Where an axis rests before its first command [m]."""
@@ -91,14 +91,14 @@ class CommandWatch:
 
     def forget(self, after: int) -> None:
         """Take back all that is stamped after an instant [ns]."""
-        self._recent = [one for one in self._recent if one[0] <= after]
+        self._recent = [row for row in self._recent if row[0] <= after]
 
     def limits(self, commands: Commands) -> None:
         """Say when the latest commands leave what the arm model is valid for."""
         arm = self._arm
         if arm.validity == Validity():
             return
-        latest = {axis: found for axis, found in zip(arm.axes, commands.latest(), strict=True) if found is not None}
+        latest = {axis: told for axis, told in zip(arm.axes, commands.latest(), strict=True) if told is not None}
         speed: dict[Kind, float] = {}
         for axis, (_, _, step) in latest.items():
             kind = arm.axes[axis].kind
@@ -125,7 +125,7 @@ class CommandWatch:
         if len(recent) >= _MANY:
             self._recent = []
             if not self._senders:
-                self._look_for_missing(sorted(recent, key=lambda one: one[0]))
+                self._look_for_missing(sorted(recent, key=lambda recent_row: recent_row[0]))
 
     def _look_for_missing(self, recent: list[tuple[int, Mapping[str, Any]]]) -> None:
         stamps = np.array([stamp for stamp, _ in recent])

@@ -71,17 +71,17 @@ class Recent:
         self._rows = list[tuple[int, int, int, bytes]]()  # stamp, source, given axes as bits, values
         self._latest, self._start = [ALWAYS] * len(self._sensors), dict[str, float]()
 
-    def keep(self, stamp: int, source: int, given: int, values: Array[c_double]) -> None:
+    def keep(self, stamp: int, source: int, told: int, values: Array[c_double]) -> None:
         """Keep an event: its values [m or rad], (A,), of axes given as bits; of a dense sensor some."""
         if source == COMMAND:
             if len(self._start) < len(self._axes):
-                begun = {name: values[axis] for axis, name in enumerate(self._axes) if given >> axis & 1}
+                begun = {name: values[axis] for axis, name in enumerate(self._axes) if told >> axis & 1}
                 self._start = {name: value for name, value in begun.items() if math.isfinite(value)} | self._start
         elif abs(stamp - self._latest[source]) < _FINEST_NS:
             return
         else:
             self._latest[source] = stamp
-        self._rows.append((stamp, source, given, bytes(values)))
+        self._rows.append((stamp, source, told, bytes(values)))
 
     def forget(self, after: int) -> None:
         """Take back what is stamped after ``after`` [ns]."""
@@ -92,21 +92,21 @@ class Recent:
         """What came in the span before ``now`` [ns]; None where that is too little. What is older is forgotten."""
         self._rows = [row for row in self._rows if now - _SPAN_NS < row[0] <= now]
         ordered = sorted(self._rows, key=operator.itemgetter(0))
-        stamp, source, given = np.array([row[:3] for row in ordered], dtype=np.int64).reshape(-1, 3).T
+        stamp, source, bits_given = np.array([row[:3] for row in ordered], dtype=np.int64).reshape(-1, 3).T
         value = np.frombuffer(bytearray().join(row[3] for row in ordered)).reshape(-1, len(self._axes))
         commands = source == COMMAND
         if not commands.any() or stamp[-1] - stamp[commands][0] < _SHORTEST_NS:
             return None
-        bits = given[:, None] >> np.arange(len(self._axes)) & 1
+        bits = bits_given[:, None] >> np.arange(len(self._axes)) & 1
         value[bits == 0] = np.nan
         commanded = [axis for axis in range(len(self._axes)) if bits[commands, axis].any()]
-        known = commands | (stamp >= stamp[commands][0] + self._settled)  # where the arm was before is not
+        usable = commands | (stamp >= stamp[commands][0] + self._settled)  # where the arm was before is not
 
         def rows(chosen: IntArray, label: str) -> Source:
             values = {self._axes[axis]: value[chosen, axis] for axis in commanded if bits[chosen, axis].any()}
             return Source(stamp[chosen], values, label, apart=True)
 
-        every = {name: np.flatnonzero(known & (source == number)) for number, name in enumerate(self._sensors)}
+        every = {name: np.flatnonzero(usable & (source == number)) for number, name in enumerate(self._sensors)}
         sensors = {name: rows(chosen, name) for name, chosen in every.items() if len(chosen)}
         names, kinds = {self._axes[axis] for axis in commanded}, self._config.arm.kind_of
         start = {name: level for name, level in self._start.items() if name in names}
@@ -161,7 +161,7 @@ class Diagnosis:
             self._verdicts.get(name) or f"{_innovations(name, axes)} are far larger than expected"
             for name, axes in self._large.items()
         ]
-        return (*(one.fault.sentence for one in self._troubles.values() if one.is_said), *large)
+        return (*(trouble.fault.sentence for trouble in self._troubles.values() if trouble.is_said), *large)
 
     def look(self, window: Window, now: int) -> None:
         """Look at what has come until ``now`` [ns]."""
@@ -181,20 +181,22 @@ class Diagnosis:
         doubtful = self._look_at_reacquired(stamp, source, results)
         fused = self._look_at_innovations(now, stamp, source, results)
         doubtful.update(axis for axes in self._large.values() for axis in axes)
-        for one in self._troubles.values():
-            if one.is_said:  # what the gate keeps out harms nothing
-                doubtful.update(axis for name in one.fault.sensors for axis in one.fault.axes if (name, axis) in fused)
+        for trouble in self._troubles.values():
+            if trouble.is_said:  # what the gate keeps out harms nothing
+                doubtful.update(
+                    axis for name in trouble.fault.sensors for axis in trouble.fault.axes if (name, axis) in fused
+                )
         self.doubtful = tuple(axis for axis in self._axes if axis in doubtful)
 
     # ---- faults of the log ------------------------------------------------------------------------------------------
 
     def _look_for_faults(self, segment: Segment, now: int) -> None:
         travel = {axis: float(np.ptp(segment.given(axis)[1])) for axis in segment.axes}
-        explained = {name for (names, *_), one in self._troubles.items() if one.is_said for name in names}
+        explained = {name for (names, *_), trouble in self._troubles.items() if trouble.is_said for name in names}
         faults = [
-            one
-            for one in faults_of(segment, self._config, origin=0)
-            if one.cause != "nothing" or explained.isdisjoint(one.sensors)
+            fault
+            for fault in faults_of(segment, self._config, origin=0)
+            if fault.cause != "nothing" or explained.isdisjoint(fault.sensors)
         ]
         for fault in faults:
             key = _key(fault)
@@ -204,8 +206,8 @@ class Diagnosis:
             trouble.travel = max(travel[axis] for axis in fault.axes)
             if trouble.is_said and not was_said and not self._is_set_back(fault):
                 self._log.write(str(key), f"{fault.sentence} (by {now / 1e9:.3f} s)")
-        found, named = set(map(_key, faults)), {name for one in faults for name in one.sensors}
-        for key in [one for one in self._troubles if one not in found]:
+        keys, named = set(map(_key, faults)), {name for fault in faults for name in fault.sensors}
+        for key in [key for key in self._troubles if key not in keys]:
             self._not_found(key, travel, not named.isdisjoint(key[0]), now)
 
     def _is_set_back(self, fault: Fault) -> bool:
@@ -255,11 +257,11 @@ class Diagnosis:
         taken = (results.outcome == Outcome.FUSED) | (results.outcome == Outcome.REACQUIRED)
         row, axis = np.nonzero(taken)
         quarter = (now - stamp[row]) // _QUARTER_NS
-        place = (source[row].astype(np.int64) * len(self._axes) + axis) * _QUARTERS + quarter
+        cell = (source[row].astype(np.int64) * len(self._axes) + axis) * _QUARTERS + quarter
         squares, shape = (results.innovation[taken] / results.innovation_sd[taken]) ** 2, (-1, _QUARTERS)
         size = len(self._sensors) * len(self._axes) * _QUARTERS
-        count = np.bincount(place, minlength=size).reshape(shape)
-        total = np.bincount(place, weights=squares, minlength=size).reshape(shape)
+        count = np.bincount(cell, minlength=size).reshape(shape)
+        total = np.bincount(cell, weights=squares, minlength=size).reshape(shape)
         number, nis = count.sum(axis=1), total.sum(axis=1) / np.maximum(count.sum(axis=1), 1)
         everywhere = ((total > _LARGE * count) | (count == 0)).all(axis=1) & (number > 0)
         large = dict[str, dict[str, float]]()

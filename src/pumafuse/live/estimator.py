@@ -197,9 +197,9 @@ class LiveEstimator:
             return no_estimate(stamp, _INVALID, "more than an hour ahead")
         axes: dict[str, AxisNow] = {}
         stale: list[str] = []
-        for axis, found in zip(self.axes, self._window.estimate(stamp, after), strict=True):
-            if found is not None:
-                outputs, fused = found
+        for axis, estimate in zip(self.axes, self._window.estimate(stamp, after), strict=True):
+            if estimate is not None:
+                outputs, fused = estimate
                 axes[axis] = AxisNow(*outputs)
                 if stamp - fused > self._stale_ns:
                     stale.append(axis)
@@ -251,8 +251,10 @@ class LiveEstimator:
             stamp = nanoseconds(t)
         except ValueError:
             return self.sure
-        known = sensor is None or sensor in self._sensors
-        right = self._clock.low <= stamp <= self._clock.high or (known and self._clock.ends_doubt(stamp, sensor))
+        is_configured = sensor is None or sensor in self._sensors
+        right = self._clock.low <= stamp <= self._clock.high or (
+            is_configured and self._clock.ends_doubt(stamp, sensor)
+        )
         return stamp if right else self.sure
 
     def of_tool(self, t: Time, sensor: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -284,7 +286,9 @@ class LiveEstimator:
             for name, sensor in self._sensors.items()
         }
         commands = by_word(counts.outcomes[COMMAND] + self._refused[COMMAND])
-        rejected = (f"sensor '{one}' contradicts '{other}': {_REJECTED}" for one, other in self._contradicting.items())
+        rejected = (
+            f"sensor '{name}' contradicts '{other}': {_REJECTED}" for name, other in self._contradicting.items()
+        )
         faults = (*self._diagnosis.shown, *rejected)
         return Health(newest, self.segment + 1, commands, sensors, self._strangers, faults)
 
@@ -295,8 +299,8 @@ class LiveEstimator:
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
         self._tool = tool_of(self.config, self._log)
         self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled, as is known
-        for one in (self._watch, self._screen, self._holds, self._diagnosis, self._set_back, counts):
-            one.restart()
+        for part in (self._watch, self._screen, self._holds, self._diagnosis, self._set_back, counts):
+            part.restart()
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
         # what came is fed again then, and counted anew.
         self._early: list[_Event] | None = [] if self._frame_start.waits else None
@@ -376,7 +380,7 @@ class LiveEstimator:
 
     def _settle(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
         """Enter commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
-        found = dict[int, UpdateResult]()
+        settled = dict[int, UpdateResult]()
         for stamp, values, stray in commands:
             for name in stray:
                 self._log.write(
@@ -388,8 +392,8 @@ class LiveEstimator:
                 values = {name: value for name, value in values.items() if name not in self.joints}
             if values or not stray:
                 self._counts.outcomes[COMMAND, _STRAY] -= 1
-                found[stamp] = self._enter_command(stamp, values)
-        return found
+                settled[stamp] = self._enter_command(stamp, values)
+        return settled
 
     def _enter_command(self, stamp: int, values: Mapping[str, Any]) -> UpdateResult:
         """Take a command that is to be used; one in joints changes the poses of others, where joints are later."""
@@ -399,7 +403,10 @@ class LiveEstimator:
         by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
         try:
             first = self._parsed(None, self._joints.posed(values, by_stamp.pop(stamp)))
-            others = {other: self._parsed(None, self._joints.posed({}, one)) for other, one in by_stamp.items()}
+            others = {
+                other: self._parsed(None, self._joints.posed({}, joints_told))
+                for other, joints_told in by_stamp.items()
+            }
         except ValueError as error:
             return self._refuse(None, values, _INVALID, str(error))
         result = self._enter(stamp, None, first)
@@ -412,7 +419,7 @@ class LiveEstimator:
         if self._early is None:
             return self._feed(stamp, sensor, values, judged=again)
         if again:
-            self._early = [one for one in self._early if one.sensor is not None or one.stamp != stamp]
+            self._early = [event for event in self._early if event.sensor is not None or event.stamp != stamp]
         return self._take_early(_Event(stamp, sensor, dict(values)), again)
 
     def _judged(self, event: _Event) -> UpdateResult | None:
@@ -459,9 +466,9 @@ class LiveEstimator:
     def _forget(self, after: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""
         self._counts.forget(self._window, after)
-        for one in (self._window, self._commands, self._watch, self._diagnosis.recent, self._joints):
-            if one is not None:
-                one.forget(after)
+        for part in (self._window, self._commands, self._watch, self._diagnosis.recent, self._joints):
+            if part is not None:
+                part.forget(after)
         if self._tool is not None:
             self._place_again(self._tool.forget(after))
         self._screen.restart()
@@ -473,12 +480,12 @@ class LiveEstimator:
 
     def _start_anew(self, event: _Event, newest: int) -> UpdateResult:
         """A new segment from the events that have shown the commands' clock to be another."""
-        aside, self._aside = self._aside, []
-        first = next(one.event.stamp for one in aside if one.event.sensor is None)
+        set_aside, self._aside = self._aside, []
+        first = next(counted.event.stamp for counted in set_aside if counted.event.sensor is None)
         way = "back" if first < newest else "ahead"
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
         self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
-        return self._begin_segment(aside, event)
+        return self._begin_segment(set_aside, event)
 
     def _begin_segment(self, counted: Sequence[_Counted], *new: _Event) -> UpdateResult:
         """Begin a segment with events of the new clock, which are counted anew; what becomes of the last."""
@@ -488,7 +495,7 @@ class LiveEstimator:
                 self._counts.outcomes[source, outcome] -= 1
             if sensor is not None:
                 self._counts.rows[source] -= as_row
-        events = [*(one.event for one in counted), *new]
+        events = [*(counted.event for counted in counted), *new]
         self.segment += 1
         self._start = {}
         if self._joints is not None:
@@ -496,8 +503,8 @@ class LiveEstimator:
         self._begin(self._counts.counted(self._window))
         if self._event_log is not None:
             self._event_log.begin_segment()
-        self._clock.start(next(one.stamp for one in events if one.sensor is None))
-        return [self._take(*one) for one in events][-1]
+        self._clock.start(next(event.stamp for event in events if event.sensor is None))
+        return [self._take(*event) for event in events][-1]
 
     def _take_early(self, event: _Event, again: bool) -> UpdateResult:
         """Take an event while the frame's place may still change; a command before all others moves it."""
@@ -513,11 +520,11 @@ class LiveEstimator:
                 frame_start.place(event.stamp, x, y)
             except RunError as error:
                 return self._refuse(None, event.values, _INVALID, str(error))
-            early = [one for one in self._early if one.stamp >= oldest]
+            early = [earlier for earlier in self._early if earlier.stamp >= oldest]
             self._begin(self._before)
             self._early, self._frame_start = early, frame_start
-            for one in early:
-                self._feed(*one)
+            for earlier in early:
+                self._feed(*earlier)
         if len(self._early) >= _MOST_ASIDE:
             del self._early[: _MOST_ASIDE // 2]
         self._early.append(event)
@@ -525,7 +532,7 @@ class LiveEstimator:
 
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any], judged: bool = False) -> UpdateResult:
         """Give an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
-        window, counts, given, stranger = self._window, self._counts, 0, ""
+        window, counts, bits, stranger = self._window, self._counts, 0, ""
         new, told, noise, tool = window.value, None, 1.0, self._tool
         measured = None if judged else sensor  # whose row it is that comes for the first time
         if measured is not None:
@@ -543,9 +550,9 @@ class LiveEstimator:
                 stranger = name
                 continue
             new[axis] = value if type(value) is float else number(value)
-            given |= 1 << axis
+            bits |= 1 << axis
         if stranger and self.config.frame is not None:
-            given |= self._turned(stamp, sensor, values)
+            bits |= self._turned(stamp, sensor, values)
             stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
         oldest = self._oldest()
         if stamp < oldest:
@@ -558,18 +565,18 @@ class LiveEstimator:
         if measured is not None:
             if tool is not None and told is not None and told.seen is not None:
                 tool.keep(measured, Row(stamp, told.seen, [*new, *window.spread], noise), oldest)
-            held, released = self._held(stamp, measured, given)
+            held, released = self._held(stamp, measured, bits)
             if released or held:
-                return self._without_held(stamp, measured, given, held, released)
-        if not given:
+                return self._without_held(stamp, measured, bits, held, released)
+        if not bits:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
             outcome = Outcome.BEFORE_START if missing else _UNKNOWN
             return self._refuse(sensor, values, outcome, why, counts.outcomes)
         rows, diagnosis = window.port.end, self._diagnosis
         source = COMMAND if sensor is None else self._sensors[sensor]
-        diagnosis.recent.keep(stamp, source, given, new)
-        taken = window.add(stamp, source, given, oldest)
+        diagnosis.recent.keep(stamp, source, bits, new)
+        taken = window.add(stamp, source, bits, oldest)
         if not taken:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
         codes = bytes(window.outcome)
@@ -602,11 +609,11 @@ class LiveEstimator:
         return result
 
     def _without_held(
-        self, stamp: int, sensor: str, given: int, held: int, released: Sequence[tuple[int, str, float, float]]
+        self, stamp: int, sensor: str, bits: int, held: int, released: Sequence[tuple[int, str, float, float]]
     ) -> UpdateResult:
         """Give the window what is news of a measurement that has come to it, and what was not used before and is."""
         self._counts.came(self._sensors[sensor], stamp, self._clock.sure)
-        kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (given & ~held) >> axis & 1}
+        kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (bits & ~held) >> axis & 1}
         again = [name for name, axis in self._bits.items() if held >> axis & 1]
         result = self._feed(stamp, sensor, kept, judged=True) if kept else refused(again, _HELD, REASONS[_HELD])
         for earlier, name, value, spread in released:
@@ -614,20 +621,20 @@ class LiveEstimator:
             self._feed(earlier, sensor, {name: value}, judged=True)
         return result
 
-    def _held(self, stamp: int, sensor: str, given: int) -> tuple[int, list[tuple[int, str, float, float]]]:
+    def _held(self, stamp: int, sensor: str, bits: int) -> tuple[int, list[tuple[int, str, float, float]]]:
         """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
         held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
         follows, values, spread = self._follows[number], self._window.value, self._window.spread
         for axis, name in enumerate(self.axes):
-            if not given >> axis & 1:
+            if not bits >> axis & 1:
                 continue
-            found = self._holds.judge((number, axis), stamp, values[axis], spread, self._commands, follows[axis])
-            if found is NEWS:
+            judge = self._holds.judge((number, axis), stamp, values[axis], spread, self._commands, follows[axis])
+            if judge is NEWS:
                 continue
-            held |= found.held << axis
-            self._counts.outcomes[number, _HELD] += found.held - len(found.released)
-            released += [(earlier, name, one, factor) for earlier, one, factor in found.released]
-            if found.sure:
+            held |= judge.held << axis
+            self._counts.outcomes[number, _HELD] += judge.held - len(judge.released)
+            released += [(earlier, name, component, factor) for earlier, component, factor in judge.released]
+            if judge.sure:
                 self._log.write(
                     f"{sensor} {name} held",
                     f"sensor '{sensor}' repeats its value of {name} to the last digit at {stamp / 1e9:.3f} s: did it"
@@ -656,7 +663,7 @@ class LiveEstimator:
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any], noise: float = 1.0) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
-        window, given, near = self._window, 0, None
+        window, bits, near = self._window, 0, None
         if sensor is not None:
             told = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
             near = np.array([told or 0.0])
@@ -666,8 +673,8 @@ class LiveEstimator:
             axis = self._bits[name]
             window.value[axis], spread = component
             window.spread[axis] = noise * spread
-            given |= 1 << axis
-        return given
+            bits |= 1 << axis
+        return bits
 
     def _say_contradiction(self, stamp: int, sensor: str) -> None:
         """Say which other sensor one contradicts, by how much, and since when."""

@@ -61,7 +61,7 @@ def header(config: FusionConfig, name: str, source: str) -> str:
         sensors=", ".join(_identifiers(f"{upper}_SENSOR", sensors)),
         axis=_structs(axis, axes),
         sensor=_structs(sensor, sensors),
-        view=_structs(view.ravel(), (f"{one} on {axis}" for one in sensors for axis in axes)),
+        view=_structs(view.ravel(), (f"{sensor} on {axis}" for sensor in sensors for axis in axes)),
     )
 
 
@@ -82,23 +82,23 @@ def identifier(text: str) -> str:
 
 def _identifiers(prefix: str, names: Iterable[str]) -> list[str]:
     """A constant of its own for each name."""
-    found: list[str] = []
+    identifiers: list[str] = []
     for name in names:
-        one = identifier(f"{prefix}_{name}").upper()
-        while one in found:
-            one += "_"
-        found.append(one)
-    return found
+        constant = identifier(f"{prefix}_{name}").upper()
+        while constant in identifiers:
+            constant += "_"
+        identifiers.append(constant)
+    return identifiers
 
 
 def _structs(records: Record, names: Iterable[str]) -> str:
     """Initialisers of an array of structs, a line for each number."""
-    found = ""
+    structs = ""
     for record, name in zip(records, names, strict=True):
         fields = zip(record.dtype.names or (), record.tolist(), strict=True)
         numbers = "".join(f"        .{field} = {_exact(number)}\n" for field, number in fields)
-        found += f"    {{ /* {_comment(name)} */\n{numbers}    }},\n"
-    return found
+        structs += f"    {{ /* {_comment(name)} */\n{numbers}    }},\n"
+    return structs
 
 
 def _exact(number: float) -> str:

@@ -29,13 +29,15 @@ class FrameStart:
 
     def start(self, level: Mapping[str, float]) -> dict[str, float]:
         """Convert a start level to axes [m]; its x and y start the frame."""
-        found = {name: value for name, value in level.items() if name in self._axes}
-        rest = {name: value for name, value in level.items() if name not in found}
-        if rest and (self._frame is None or not rest.keys() <= set(CARTESIAN) or ("x" in rest) != ("y" in rest)):
-            raise UnknownNameError("start", "axis", next(iter(rest)), self._axes)
-        if self._frame is not None and "x" in rest:
-            self.placed = self.placed or placed_at(self._frame, rest["x"], rest["y"], "start")
-        return found | {axis: value for axis, (value, _) in self.in_axes(rest, None).items()}
+        in_axes = {name: value for name, value in level.items() if name in self._axes}
+        others = {name: value for name, value in level.items() if name not in in_axes}
+        if others and (
+            self._frame is None or not others.keys() <= set(CARTESIAN) or ("x" in others) != ("y" in others)
+        ):
+            raise UnknownNameError("start", "axis", next(iter(others)), self._axes)
+        if self._frame is not None and "x" in others:
+            self.placed = self.placed or placed_at(self._frame, others["x"], others["y"], "start")
+        return in_axes | {axis: value for axis, (value, _) in self.in_axes(others, None).items()}
 
     def place(self, stamp: int, x: float, y: float) -> None:
         """Start the frame at a command's x and y [m]."""
@@ -47,26 +49,26 @@ class FrameStart:
 
         A measurement comes with the commanded tangential position [m], (1,); x without y is NaN on both axes.
         """
-        found: dict[str, tuple[float, float]] = {}
+        starts: dict[str, tuple[float, float]] = {}
         if self.placed is not None and ("x" in values or "y" in values):
             x, y = (np.array([values.get(name, np.nan)]) for name in ("x", "y"))
             tangential, radial, spread = self.placed.to_axes(x, y, near, self._last)
             if near is None and np.isfinite(tangential[0]):
                 self._last = float(tangential[0])
-            found["tangential"] = float(tangential[0]), float(spread[0])
-            found["radial"] = float(radial[0]), 1.0
+            starts["tangential"] = float(tangential[0]), float(spread[0])
+            starts["radial"] = float(radial[0]), 1.0
         if "z" in values:
-            found["vertical"] = values["z"], 1.0
-        return {axis: component for axis, component in found.items() if axis in self._axes}
+            starts["vertical"] = values["z"], 1.0
+        return {axis: component for axis, component in starts.items() if axis in self._axes}
 
     def in_log(self, positions: Mapping[str, float]) -> dict[str, float] | None:
         """Convert axis positions [m] back to x, y, z [m], as far as they give these; None before the start is known."""
         if self.placed is None:
             return None
-        found: dict[str, float] = {}
+        levels: dict[str, float] = {}
         if "tangential" in positions and "radial" in positions:
             x, y = self.placed.to_log(*(np.array([positions[axis]]) for axis in ("tangential", "radial")))
-            found["x"], found["y"] = float(x[0]), float(y[0])
+            levels["x"], levels["y"] = float(x[0]), float(y[0])
         if "vertical" in positions:
-            found["z"] = positions["vertical"]
-        return found
+            levels["z"] = positions["vertical"]
+        return levels

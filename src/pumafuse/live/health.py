@@ -127,8 +127,8 @@ class Counts:
         self._minute: FloatArray = np.zeros((_VALUES + 1, sensors * _SECONDS))
         self._came: list[tuple[int, int, int]] = []  # rows that are not counted yet
         self._unread = 0  # the first row that is not read yet
-        for one in self._intervals:
-            one.last = None
+        for interval in self._intervals:
+            interval.last = None
 
     def came(self, sensor: int, stamp: int, newest: int) -> None:
         """Count a row that comes; ``newest`` [ns] is the newest stamp of all."""
@@ -153,8 +153,8 @@ class Counts:
         self._settle(window)
         stamp, source, results = window.read(window.port.begin, window.port.end)
         late, measured = stamp > after, source >= 0
-        given = np.count_nonzero(results.outcome != ABSENT, axis=1)
-        np.add.at(self.outcomes[:, Outcome.INVALID], source[late & measured], given[late & measured])
+        given_rows = np.count_nonzero(results.outcome != ABSENT, axis=1)
+        np.add.at(self.outcomes[:, Outcome.INVALID], source[late & measured], given_rows[late & measured])
         self._last[self._last > after] = ALWAYS
         np.maximum.at(self._last, source[~late & measured], stamp[~late & measured])
         self._second[self._second > after // _SECOND] = ALWAYS
@@ -190,33 +190,33 @@ class Counts:
         self._came = []
         self.rows += np.bincount(sensor, minlength=len(self.rows))
         np.maximum.at(self._last, sensor, stamp)
-        place, there = self._places(sensor, stamp)
-        place, late = place[there], np.maximum(newest - stamp, 0)[there] / 1e9
-        np.add.at(self._minute[_ROWS], place, 1.0)
-        np.add.at(self._minute[_LATENESS], place, late)
-        np.maximum.at(self._minute[_LATEST], place, late)
+        cell, is_recent = self._places(sensor, stamp)
+        cell, late = cell[is_recent], np.maximum(newest - stamp, 0)[is_recent] / 1e9
+        np.add.at(self._minute[_ROWS], cell, 1.0)
+        np.add.at(self._minute[_LATENESS], cell, late)
+        np.maximum.at(self._minute[_LATEST], cell, late)
 
     def _read(self, window: Window, end: int) -> None:
         """Count what became of the rows to ``end``, which leave the window."""
         stamp, source, results = window.read(self._unread, end)
         self._unread, sensors, measured = end, len(self.rows), source >= 0
         stamp, source, codes = stamp[measured], source[measured].astype(np.int64), results.outcome[measured]
-        found = np.bincount((256 * source[:, None] + codes).ravel(), minlength=256 * sensors).reshape(sensors, 256)
-        self.outcomes[:-1] += found[:, : len(Outcome)]
-        place, there = self._places(source, stamp)
-        taken = ((codes == Outcome.FUSED) | (codes == Outcome.REACQUIRED)) & there[:, None]
+        reshape = np.bincount((256 * source[:, None] + codes).ravel(), minlength=256 * sensors).reshape(sensors, 256)
+        self.outcomes[:-1] += reshape[:, : len(Outcome)]
+        cell, is_recent = self._places(source, stamp)
+        taken = ((codes == Outcome.FUSED) | (codes == Outcome.REACQUIRED)) & is_recent[:, None]
         nis = (results.innovation[measured][taken] / results.innovation_sd[measured][taken]) ** 2
-        place = place[np.nonzero(taken)[0]]
-        np.add.at(self._minute[_NIS], place, nis)
-        np.add.at(self._minute[_VALUES], place, 1.0)
+        cell = cell[np.nonzero(taken)[0]]
+        np.add.at(self._minute[_NIS], cell, nis)
+        np.add.at(self._minute[_VALUES], cell, 1.0)
         for sensor, intervals in enumerate(self._intervals):
             intervals.look_at(stamp[source == sensor].tolist())
 
     def _places(self, sensor: IntArray, stamp: TimeArray) -> tuple[IntArray, BoolArray]:
         """Where in the last minute rows are counted (n,), and which of them are not a minute old (n,)."""
         second = stamp // _SECOND
-        place = _SECONDS * sensor + second % _SECONDS
+        cell = _SECONDS * sensor + second % _SECONDS
         before = self._second.copy()
-        np.maximum.at(self._second, place, second)
+        np.maximum.at(self._second, cell, second)
         self._minute[:, self._second > before] = 0.0
-        return place, self._second[place] == second
+        return cell, self._second[cell] == second

@@ -51,15 +51,15 @@ class Joints:
         """Where an event tells the joints to be; None if it tells of none."""
         if self.kinds.keys().isdisjoint(values):
             return None
-        found = tuple(number(values.get(joint)) for joint in self.kinds)
-        lacking = [joint for joint, one in zip(self.kinds, found, strict=True) if not math.isfinite(one)]
+        told = tuple(number(values.get(joint)) for joint in self.kinds)
+        lacking = [joint for joint, value in zip(self.kinds, told, strict=True) if not math.isfinite(value)]
         if lacking:
             raise ValueError(f"a pose needs all joints of the [robot]; it has no {', '.join(lacking)}")
-        if far := next((joint for joint, one in zip(self.kinds, found, strict=True) if abs(one) > MOST), None):
+        if far := next((joint for joint, value in zip(self.kinds, told, strict=True) if abs(value) > MOST), None):
             raise ValueError(f"joint {far} is told to be where no robot can be")
         if twice := next((name for name in (*CARTESIAN, *TURNING, ORIENTATION) if name in values), None):
             raise ValueError(f"gives joints and {twice}, which their pose has; give one")
-        return found
+        return told
 
     def posed(self, values: Mapping[str, Any], told: Told) -> dict[str, Any]:
         """The values of an event with the pose of the tool in the place of joints."""
@@ -67,8 +67,8 @@ class Joints:
 
     def _pose_of(self, told: Told) -> dict[str, Any]:
         position, orientation = self._chain.pose(np.array([told]))
-        found: dict[str, Any] = dict(zip(CARTESIAN, position[0].tolist(), strict=True))
-        return found | {ORIENTATION: tuple(orientation[0].tolist())} if self._turns else found
+        pose: dict[str, Any] = dict(zip(CARTESIAN, position[0].tolist(), strict=True))
+        return pose | {ORIENTATION: tuple(orientation[0].tolist())} if self._turns else pose
 
     def command(self, stamp: int, told: Told, oldest: int) -> dict[int, Told]:
         """Take a command in: by stamps where it tells each joint to be, and where those tell it that it changes.
@@ -76,29 +76,29 @@ class Joints:
         A joint that answers later is told later, on the line from command to command, as
         :meth:`pumafuse.logs.run.Source.delayed` has it.
         """
-        place = bisect_left(self._given, stamp)
-        again = place < len(self._given) and self._given[place] == stamp
-        self._given[place : place + again], self._told[place : place + again] = [stamp], [told]
-        until = self._given[place + 1] + self._latest if place + 1 < len(self._given) else stamp
-        end = max(bisect_left(self._given, until), place + 1) if self._late else place + 1
-        found = {self._given[row]: self._delayed(row) for row in range(place, end)}
+        at = bisect_left(self._given, stamp)
+        again = at < len(self._given) and self._given[at] == stamp
+        self._given[at : at + again], self._told[at : at + again] = [stamp], [told]
+        until = self._given[at + 1] + self._latest if at + 1 < len(self._given) else stamp
+        end = max(bisect_left(self._given, until), at + 1) if self._late else at + 1
+        command = {self._given[row]: self._delayed(row) for row in range(at, end)}
         while len(self._given) > 1 and self._given[1] <= oldest - self._latest:  # one is on the line to the next
             del self._given[0], self._told[0]
-        return found
+        return command
 
     def _delayed(self, row: int) -> Told:
         """Where a command tells the joints to be, those that are later by what was told before."""
-        found = list(self._told[row])
+        told = list(self._told[row])
         for joint, by in self._late.items():
             at = self._given[row] - by
             before = max(bisect_right(self._given, at) - 1, 0)
             after = min(before + 1, len(self._given) - 1)
             share = max(at - self._given[before], 0) / max(self._given[after] - self._given[before], 1)
-            value = self._told[before][joint]
-            found[joint] = value + share * (self._told[after][joint] - value)
-        return tuple(found)
+            value = self.told[before][joint]
+            told[joint] = value + share * (self._told[after][joint] - value)
+        return tuple(told)
 
     def forget(self, after: int) -> None:
         """Take back the commands stamped after an instant [ns]; what came before does not depend on them."""
-        place = bisect_right(self._given, after)
-        del self._given[place:], self._told[place:]
+        row = bisect_right(self._given, after)
+        del self._given[row:], self._told[row:]

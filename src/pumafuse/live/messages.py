@@ -95,15 +95,15 @@ def _turned(orientation: Orientation, where: str) -> Callable[[Any], tuple[float
     """The quaternion x, y, z, w of a row; None where it has none."""
     plain = orientation.quaternion is not None
     columns = [Column(name, orientation.unit) for name in orientation.columns]
-    numbers = [getter(one.column) for one in columns] if plain else [_Number(one, where) for one in columns]
+    numbers = [getter(column.column) for column in columns] if plain else [_Number(column, where) for column in columns]
 
     def turned(row: Any) -> tuple[float, ...] | None:
         try:
             value = np.array([[float(number(row)) for number in numbers]])
         except _LACKS:
             return None
-        found = orientation.quaternions(value)[0]
-        return None if np.isnan(found).any() else tuple(found.tolist())
+        quaternion = orientation.quaternions(value)[0]
+        return None if np.isnan(quaternion).any() else tuple(quaternion.tolist())
 
     return turned
 
@@ -117,7 +117,7 @@ def _stamp(time: Time, where: str) -> Callable[[Any, int], float | int]:
     shift = round(time.shift * 1e9)
     if time.column == LOG_TIME:
         return lambda _, received: received + shift
-    get, rest = getter(time.column), getter(time.nanoseconds)
+    get, get_nanoseconds = getter(time.column), getter(time.nanoseconds)
     unit = time.ending or ending(leaf(time.column))
     per_unit = 10 ** (9 - 3 * TIMES.index(unit)) if unit in TIMES else None
 
@@ -125,7 +125,7 @@ def _stamp(time: Time, where: str) -> Callable[[Any, int], float | int]:
         try:
             value = get(row)
             if time.nanoseconds:
-                return int(value) * 10**9 + int(rest(row)) + shift
+                return int(value) * 10**9 + int(get_nanoseconds(row)) + shift
             for seconds, nanoseconds in SPLIT_STAMPS:
                 if hasattr(value, seconds) and hasattr(value, nanoseconds):
                     return getattr(value, seconds) * 10**9 + getattr(value, nanoseconds) + shift
@@ -211,19 +211,21 @@ class Reader:
     def _event(self, row: Any, received: int) -> Iterator[Event]:
         if not self._met(row):
             return
-        values: dict[str, Any] = {axis: sum(one(row) for one in numbers) for axis, numbers in self._values.items()}
+        values: dict[str, Any] = {
+            axis: sum(number(row) for number in numbers) for axis, numbers in self._values.items()
+        }
         if self._turns and self.name:
             self._go_beside(values)
-        known = {axis: value for axis, value in values.items() if value == value}
+        finite = {axis: value for axis, value in values.items() if value == value}
         if not self.name:
-            self._commanded.update(known)
+            self._commanded.update(finite)
         if self._turned is not None and (turned := self._turned(row)) is not None:
-            known[ORIENTATION] = turned
+            finite[ORIENTATION] = turned
         if self._noise is not None and self.entry.noise is not None:
-            known[NOISE] = self.entry.noise.factor(_number(self._noise, row)).item()
-        if known or not self.entry.has_own_rows:
+            finite[NOISE] = self.entry.noise.factor(_number(self._noise, row)).item()
+        if finite or not self.entry.has_own_rows:
             as_logged = self.name and not self.entry.has_own_rows  # a sensor's row says what it has not, as in a log
-            yield Event(self._stamp(row, received), self.name, {**values, **known} if as_logged else known or values)
+            yield Event(self._stamp(row, received), self.name, {**values, **finite} if as_logged else finite or values)
 
     def _go_beside(self, values: dict[str, Any]) -> None:
         """Move angles that go on by whole turns to where they were commanded when the first of them came."""
@@ -248,7 +250,7 @@ class Reader:
         if event.t - before.t > PAUSE * statistics.median(self._gaps):
             return
         both = [before.values, event.values]
-        values = {axis: np.array([one[axis] for one in both]) for axis in both[0].keys() & both[1].keys()}
+        values = {axis: np.array([row[axis] for row in both]) for axis in both[0].keys() & both[1].keys()}
         turned = values.pop(ORIENTATION, None)
         stamp = np.array([before.t, event.t], dtype=np.int64)
         path = Source(stamp, values, "command", orientation=turned).interpolated(step)

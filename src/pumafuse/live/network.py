@@ -43,18 +43,18 @@ def source(address: Address, listen: str | None, allow: list[str], notify: Calla
     """The source of an address."""
     if address.kind == "tcp":
         return TcpClient(address, notify)
-    place, allowed = listener(address, listen, allow)
+    address_of_socket, allowed = listener(address, listen, allow)
     if listen is not None:
-        accepted = f"{address.kind}: accepts {', '.join(allow)} on {host_port(*place[1])}"
+        accepted = f"{address.kind}: accepts {', '.join(allow)} on {host_port(*address_of_socket[1])}"
         notify(f"{accepted}, neither encrypted nor authenticated; a tunnel should carry what leaves the cell")
-    return (UdpListener if address.kind == "udp" else TcpListener)(place, allowed, notify)
+    return (UdpListener if address.kind == "udp" else TcpListener)(address_of_socket, allowed, notify)
 
 
 class UdpListener:
     """Lines from datagrams of one or more lines."""
 
-    def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
-        self._place, self._allowed = place, allowed
+    def __init__(self, socket_address: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
+        self._place, self._allowed = socket_address, allowed
         self._notify, self._log = notify, RateLimitedLog(notify)
         self._backlog = Backlog[bytes]("datagrams", self._log)
         self._room = memoryview(bytearray(_LARGEST))  # of the next one: to make it each time scatters memory
@@ -163,17 +163,17 @@ def _read_lines(
             some = True
             if whole := lines.cut(piece):
                 put(whole)
-    if rest := lines.rest():
-        put(rest)
+    if remainder := lines.rest():
+        put(remainder)
     return some
 
 
 class TcpListener(_Tcp):
     """Lines from all who connect."""
 
-    def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
+    def __init__(self, socket_address: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
         super().__init__(notify)
-        self._place, self._allowed = place, allowed
+        self._place, self._allowed = socket_address, allowed
         self._open, self._silent = set[socket.socket](), dict[socket.socket, None]()
         self._accepted = self._refused = 0
 
@@ -376,7 +376,7 @@ class Several(_Merged):
         """Begin to listen."""
         for source in self._sources:
             source.start()
-        self._threads = [_in_a_thread(self._ask, one) for one in self._sources]
+        self._threads = [_in_a_thread(self._ask, source) for source in self._sources]
 
     def get(self) -> Items:
         """Some of one source; none after a tenth of a second without any. What a source has raised is raised."""
@@ -405,23 +405,23 @@ class Several(_Merged):
             self._error = error
 
 
-def _listen(listening: socket.socket, kind: str, place: tuple[str, int], notify: Callable[[str], None]) -> str:
+def _listen(listening: socket.socket, kind: str, address: tuple[str, int], notify: Callable[[str], None]) -> str:
     """Let a socket listen; returns its address as people write it."""
     try:
-        listening.bind(place)
+        listening.bind(address)
         if kind == "tcp-listen":
             listening.listen()
     except OSError as error:
         listening.close()
-        raise RunError(f"{kind}://{host_port(*place)}: cannot be listened at: {error.strerror}") from None
+        raise RunError(f"{kind}://{host_port(*address)}: cannot be listened at: {error.strerror}") from None
     name = f"{kind}://{host_port(*listening.getsockname()[:2])}"
     notify(f"listening at {name}")
     return name
 
 
-def _in_a_thread(work: Callable[..., None], *given: object) -> threading.Thread:
+def _in_a_thread(work: Callable[..., None], *arguments: object) -> threading.Thread:
     """Do what may wait for long in a thread that ends with the process."""
-    thread = threading.Thread(target=work, args=given, name="network", daemon=True)
+    thread = threading.Thread(target=work, args=arguments, name="network", daemon=True)
     thread.start()
     return thread
 

@@ -128,7 +128,7 @@ def _poses(kind: str, device: str, content: bytes) -> _Poses:
         poses = (list(layout.unpack_from(content, at + _NAME.size)) for at in begins)
         return [(_text(_NAME.unpack_from(content, at)[0]), pose) for at, pose in zip(begins, poses, strict=True)]
     layouts = _POSES[kind]
-    fits = next((one for one in layouts if one.size == len(content)), layouts[-1])
+    fits = next((layout for layout in layouts if layout.size == len(content)), layouts[-1])
     return [(device, list(fits.unpack(content)))]
 
 

@@ -103,19 +103,19 @@ class Recorder:
     def append(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> None:
         """Add an event."""
         cells = {axis: _cell(values[axis]) for axis in self._columns if axis in values}
-        turned = [repr(number(one)) for one in values[ORIENTATION]] if ORIENTATION in values else []
+        turned = [repr(number(value)) for value in values[ORIENTATION]] if ORIENTATION in values else []
         noise = _cell(values.get(NOISE))
         if not cells and not turned:
             return
-        given = [axis for axis, cell in cells.items() if cell] + [ORIENTATION] * bool(turned) + [NOISE] * bool(noise)
-        if sensor is None and given and not self._commanded:
+        filled = [axis for axis, cell in cells.items() if cell] + [ORIENTATION] * bool(turned) + [NOISE] * bool(noise)
+        if sensor is None and filled and not self._commanded:
             self._commanded, self._due = True, 0.0
         elif not self._commanded and len(self._pending) >= _MOST_BEFORE:
             del self._pending[: _MOST_BEFORE // 2]
         line = ",".join(
             [cells.get(axis, "") for axis in self._columns] + (turned or [""] * len(self._turning)) + [noise]
         )
-        self._pending.append(_Row(stamp, sensor, given, f"{stamp},{line}\n".encode()))
+        self._pending.append(_Row(stamp, sensor, filled, f"{stamp},{line}\n".encode()))
 
     def discard(self, after: int) -> None:
         """Remove the events stamped after ``after`` [ns]."""
@@ -311,11 +311,11 @@ class Writer:
         """Write a file's rows, in the place of what a full disk took of them before; whether the file had gone."""
         descriptor = os.open(job.folder / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         try:
-            known = self._sizes.get(name, 0)
-            gone = os.fstat(descriptor).st_size < known
-            self._sizes[name] = known = 0 if gone else known
-            os.ftruncate(descriptor, known)
-            rows = job.rows[name] if known else self._header + job.rows[name]
+            size = self._sizes.get(name, 0)
+            gone = os.fstat(descriptor).st_size < size
+            self._sizes[name] = size = 0 if gone else size
+            os.ftruncate(descriptor, size)
+            rows = job.rows[name] if size else self._header + job.rows[name]
             while rows:
                 rows = rows[os.write(descriptor, rows) :]
             self._sizes[name] = os.fstat(descriptor).st_size

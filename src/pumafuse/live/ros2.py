@@ -67,8 +67,8 @@ class Ros2Source:
                 who = f"sensor '{name}' has" if name else "the commands have"
                 raise ConfigError(f"run.toml: {who} no topic; give the running robot's, as in topic = '/joint_states'")
         readers = readers_of(listed)
-        names = dict.fromkeys(one.entry.topic for one in readers)
-        self._topics = [Topic(name, [one for one in readers if one.entry.topic == name]) for name in names]
+        names = dict.fromkeys(reader.entry.topic for reader in readers)
+        self._topics = [Topic(name, [reader for reader in readers if reader.entry.topic == name]) for name in names]
         self._command = readers[-1]
         self._notify, self._log = notify, RateLimitedLog(notify)
         self._backlog = Backlog[Event]("messages", self._log)
@@ -143,7 +143,7 @@ class Ros2Source:
         if self._command.next_due is not None:
             at = self.clock()
             self._burst += [(at, event) for event in self._command.due(at)]
-        self._burst.sort(key=lambda one: one[0])
+        self._burst.sort(key=lambda received: received[0])
         for _, event in self._burst:
             self._backlog.append(now, event)
         self._burst.clear()
@@ -174,8 +174,8 @@ class Ros2Source:
             if not count and before is None:
                 if now - self._began < _ALONE:
                     continue
-                there = [one for one, _ in self.node.get_topic_names_and_types() if one != name]
-                self._notify(f"{name}: nobody publishes it so far; {suggestion(name, there)}")
+                names = [other for other, _ in self.node.get_topic_names_and_types() if other != name]
+                self._notify(f"{name}: nobody publishes it so far; {suggestion(name, names)}")
             elif not count:
                 self._log.write(f"{name} gone", f"{name}: nobody publishes it any more")
             elif not before:
@@ -188,9 +188,9 @@ class Ros2Source:
         """Subscribe by the first of the publishers' types that has what ``run.toml`` asks for."""
         infos = self.node.get_publishers_info_by_topic(name)
         for kind in dict.fromkeys(info.topic_type for info in infos):
-            package, _, rest = kind.partition("/")
+            package, _, type_name = kind.partition("/")
             try:
-                message = getattr(import_module(f"{package}.msg"), rest.rpartition("/")[2])
+                message = getattr(import_module(f"{package}.msg"), type_name.rpartition("/")[2])
                 lacking = [path for reader in topic.readers for path in reader.lacks(message())]
             except (ImportError, AttributeError):
                 self._log.write(f"{name} {kind}", f"{name}: no package here has its type {kind}: source one that does")
@@ -248,10 +248,10 @@ class Ros2Estimates:
             self._set_header(self._pose.header, estimate.stamp)
             self._publish_pose(self._pose)
         if self._state is not None:
-            there = [name for name in self._joints if name in estimate.axes]
-            self._state.name = there
-            self._state.position = [estimate.axes[name].position for name in there]
-            self._state.velocity = [estimate.axes[name].velocity for name in there]
+            joints = [name for name in self._joints if name in estimate.axes]
+            self._state.name = joints
+            self._state.position = [estimate.axes[name].position for name in joints]
+            self._state.velocity = [estimate.axes[name].velocity for name in joints]
             self._set_header(self._state.header, estimate.stamp)
             self._publish_joints(self._state)
 
@@ -272,11 +272,11 @@ class Ros2Estimates:
     def _set_pose(self, estimate: LiveEstimate) -> bool:
         """Set the pose and its covariance; whether the estimate has one."""
         position = {name: axis.position for name, axis in estimate.axes.items()}
-        there = position if estimate.cartesian is None else estimate.cartesian
-        if not set(CARTESIAN) <= there.keys():
+        position_of = position if estimate.cartesian is None else estimate.cartesian
+        if not set(CARTESIAN) <= position_of.keys():
             return False
         pose = self._pose.pose.pose
-        pose.position.x, pose.position.y, pose.position.z = (there[axis] for axis in CARTESIAN)
+        pose.position.x, pose.position.y, pose.position.z = (position_of[axis] for axis in CARTESIAN)
         rows = {name: np.array([value]) for name, value in position.items()}
         sd = {name: np.array([axis.position_sd]) for name, axis in estimate.axes.items()}
         covariance = np.zeros((6, 6))
@@ -310,7 +310,7 @@ class Ros2Estimates:
                 "segments": str(health.segments),
             },
         )
-        return [whole, *(self._of_sensor(name, one, health) for name, one in health.sensors.items())]
+        return [whole, *(self._of_sensor(name, sensor, health) for name, sensor in health.sensors.items())]
 
     def _of_sensor(self, name: str, sensor: SensorHealth, health: Health) -> Any:
         kind = self._diagnostic.DiagnosticStatus

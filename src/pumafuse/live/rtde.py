@@ -61,7 +61,7 @@ class RtdeSource(EventClient):
             received = time.time_ns()
             if kind == _DATA and body[:1] == recipe:
                 row = SimpleNamespace(**dict(zip(columns, layout.unpack_from(body, 1), strict=True)))
-                yield [event for one in self._readers for event in one.events(row, received)]
+                yield [event for reader in self._readers for event in reader.events(row, received)]
 
     def _agree(
         self, connection: socket.socket, packages: Iterator[tuple[int, bytes]]
@@ -70,35 +70,35 @@ class RtdeSource(EventClient):
 
         def ask(kind: int, body: bytes) -> bytes:
             connection.sendall(_HEAD.pack(_HEAD.size + len(body), kind) + body)
-            for answer, found in packages:
+            for answer, content in packages:
                 if answer == kind:
-                    return found
+                    return content
             raise Refused("the robot has ended the connection instead of an answer")
 
         if ask(_VERSION, struct.pack(">H", _PROTOCOL)) != b"\x01":
             raise Refused(f"the robot does not know version {_PROTOCOL} of RTDE (software 3.3 or newer does)")
-        found = ask(_OUTPUTS, struct.pack(">d", self._rate) + ",".join(self._variables).encode())
-        known = dict(zip(self._variables, found[1:].decode("ascii", "replace").split(","), strict=False))
-        if unknown := [name for name in self._variables if known.get(name) not in _TYPES]:
+        told = ask(_OUTPUTS, struct.pack(">d", self._rate) + ",".join(self._variables).encode())
+        types = dict(zip(self._variables, told[1:].decode("ascii", "replace").split(","), strict=False))
+        if unknown := [name for name in self._variables if types.get(name) not in _TYPES]:
             raise Refused(f"the robot has no variable {', '.join(unknown)}; names are those of record.py")
-        sizes = {name: int(_TYPES[kind][:-1] or 1) for name, kind in known.items()}
+        sizes = {name: int(_TYPES[kind][:-1] or 1) for name, kind in types.items()}
         columns = [
             column
             for name, size in sizes.items()
-            for column in ([name] if size == 1 else [f"{name}_{place}" for place in range(size)])
+            for column in ([name] if size == 1 else [f"{name}_{index}" for index in range(size)])
         ]
         empty = SimpleNamespace(**dict.fromkeys(columns, 0.0))
-        if lacking := [path for one in self._readers for path in one.lacks(empty)]:
+        if lacking := [path for reader in self._readers for path in reader.lacks(empty)]:
             raise Refused(f"the robot has no column {', '.join(lacking)}; it has {', '.join(columns)}")
         if ask(_BEGIN, b"") != b"\x01":
             raise Refused(f"the robot does not begin to send {self._rate:g} times a second")
-        return found[:1], struct.Struct(">" + "".join(_TYPES[kind] for kind in known.values())), columns
+        return told[:1], struct.Struct(">" + "".join(_TYPES[kind] for kind in types.values())), columns
 
 
 def _variable(column: str) -> str:
     """The variable that a column is of: ``target_q_0`` is an element of ``target_q``; registers are numbered alike."""
-    name, _, place = column.rpartition("_")
-    return name if len(place) == 1 and place.isdigit() and not name.endswith("_register") else column
+    name, _, index = column.rpartition("_")
+    return name if len(index) == 1 and index.isdigit() and not name.endswith("_register") else column
 
 
 def _packages(connection: socket.socket) -> Iterator[tuple[int, bytes]]:

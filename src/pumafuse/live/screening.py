@@ -128,34 +128,34 @@ class HoldWatch:
         self, key: tuple[int, int], stamp: int, value: float, spreads: Array[c_double], commands: Commands, lag: int
     ) -> Judged:
         """Judge a value of a sensor and an axis, late by up to a lag [ns]; out of order nothing is held."""
-        if (one := self._seen.get(key)) is None:
-            one = self._seen[key] = _Repeated()
-        axis, waited = key[1], one.waiting
-        if stamp <= one.stamp:
-            one.forget()
+        if (Repeated := self._seen.get(key)) is None:
+            Repeated = self._seen[key] = _Repeated()
+        axis, waited = key[1], Repeated.waiting
+        if stamp <= Repeated.stamp:
+            Repeated.forget()
             return Judged(False, False, waited) if waited else NEWS
-        if one.is_new(stamp, value):
+        if Repeated.is_new(stamp, value):
             return Judged(False, False, waited) if waited else NEWS
-        if (habit := one.habit) is None:
+        if (habit := Repeated.habit) is None:
             return NEWS
-        if one.count == 2:
-            one.low = one.high = commands.at(axis, one.since) or 0.0
-        if stamp - lag >= one.since and (led := commands.at(axis, stamp - lag)) is not None:
-            one.low, one.high = min(one.low, led), max(one.high, led)
-        moved = one.high - one.low
-        if habit.is_again(one.count - 1) or habit.froze(
-            one.count, moved, commands.travel(axis), one.leapt, one.repeats
+        if Repeated.count == 2:
+            Repeated.low = Repeated.high = commands.at(axis, Repeated.since) or 0.0
+        if stamp - lag >= Repeated.since and (led := commands.at(axis, stamp - lag)) is not None:
+            Repeated.low, Repeated.high = min(Repeated.low, led), max(Repeated.high, led)
+        moved = Repeated.high - Repeated.low
+        if habit.is_again(Repeated.count - 1) or habit.froze(
+            Repeated.count, moved, commands.travel(axis), Repeated.leapt, Repeated.repeats
         ):
-            one.waiting = []
+            Repeated.waiting = []
             return Judged(True, True)
-        led, before = (commands.at(axis, instant) or 0.0 for instant in (stamp, one.since - lag))
-        odd = led != before and (one.leapt or one.repeats ** (one.count - 1) < _ODD)
-        if one.believed or not (odd or habit.is_clear(max(led - one.low, one.high - led))):
+        led, before = (commands.at(axis, instant) or 0.0 for instant in (stamp, Repeated.since - lag))
+        odd = led != before and (Repeated.leapt or Repeated.repeats ** (Repeated.count - 1) < _ODD)
+        if Repeated.believed or not (odd or habit.is_clear(max(led - Repeated.low, Repeated.high - led))):
             return NEWS
         waited.append((stamp, value, spreads[axis]))
         if stamp - waited[0][0] <= self._patience:
             return Judged(True, False)
-        one.waiting, one.believed = [], True
+        Repeated.waiting, Repeated.believed = [], True
         return Judged(True, False, waited)
 
 
@@ -204,7 +204,7 @@ class CommandScreen:
             for name, value in out.items():
                 if not returns(number(now.get(name)), self._axes[name].value, [value]):
                     return []
-            told.append(Screened(stamp, {name: one for name, one in values.items() if name not in out}, out))
+            told.append(Screened(stamp, {name: value for name, value in values.items() if name not in out}, out))
         self._waiting, self.until = [], NEVER
         return told
 
@@ -213,5 +213,5 @@ class CommandScreen:
 
     def _learn(self, values: Mapping[str, Any], consecutive: bool) -> None:
         for name, value in values.items():
-            if math.isfinite(given := number(value)):
-                self._axes.setdefault(name, Steps()).add(given, consecutive)
+            if math.isfinite(cell := number(value)):
+                self._axes.setdefault(name, Steps()).add(cell, consecutive)

@@ -60,7 +60,7 @@ def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     arrival = np.concatenate([np.maximum.accumulate(source.stamp) for _, source in sources])
     events = [event for name, source in sources for event in _events(name, source.in_joints())]
     order = np.argsort(arrival, kind="stable")
-    return arrival[order], [events[place] for place in order.tolist()]
+    return arrival[order], [events[row] for row in order.tolist()]
 
 
 def _events(name: str, source: Source) -> Iterator[Event]:

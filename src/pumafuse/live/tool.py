@@ -97,7 +97,7 @@ class Tool:
         self._log, arm = log, config.arm
         turns = set(TURNING) <= set(arm.axes)
         self._reference = np.array(config.tool.reference) if turns and config.tool is not None else None
-        self._placings = {name: Placing(one, arm) for name, one in config.sensors.items() if one.is_placed}
+        self._placings = {name: Placing(sensor, arm) for name, sensor in config.sensors.items() if sensor.is_placed}
         self._takes_orientation = takes_orientation(config)
         self._latency = {name: round(config.sensors[name].latency * 1e9) for name in self._placings}
         self._rows: dict[str, list[Row]] = {}
@@ -114,11 +114,11 @@ class Tool:
             return values
         if not self._takes_orientation:
             raise ValueError(NO_TOOL)
-        found = dict(values)
-        told = unit(found.pop(ORIENTATION))
+        parsed = dict(values)
+        told = unit(parsed.pop(ORIENTATION))
         if sensor is not None:
-            return found | {ORIENTATION: told}
-        return found if self._reference is None else found | self._commanded(told, self._reference)
+            return parsed | {ORIENTATION: told}
+        return parsed if self._reference is None else parsed | self._commanded(told, self._reference)
 
     def _commanded(self, told: FloatArray, reference: FloatArray) -> dict[str, float]:
         """A commanded orientation (1, 4) as axes."""
@@ -133,8 +133,8 @@ class Tool:
 
     def of_tool(self, sensor: str, stamp: int, values: Mapping[str, Any]) -> Told:
         """What a sensor tells of the tool."""
-        found, spread = dict(values), dict[str, FloatArray]()
-        oriented: FloatArray | None = found.pop(ORIENTATION, None)
+        of_axes, spread = dict(values), dict[str, FloatArray]()
+        oriented: FloatArray | None = of_axes.pop(ORIENTATION, None)
         placing, seen = self._placings.get(sensor), None
         if placing is not None:
             oriented = oriented if placing.is_oriented else None
@@ -148,12 +148,12 @@ class Tool:
             elif placing.has_marker and oriented is not None:
                 lever = placing.lever(oriented)
                 point, spread = point - lever, placing.spread(lever)
-            found.update(zip(CARTESIAN, point[0].tolist(), strict=True))
+            of_axes.update(zip(CARTESIAN, point[0].tolist(), strict=True))
         if oriented is not None and self._reference is not None:
             vector = rotations.vectors(oriented, self._reference)
-            found.update(zip(TURNING, vector[0].tolist(), strict=True))
+            of_axes.update(zip(TURNING, vector[0].tolist(), strict=True))
             spread |= dict.fromkeys(TURNING, rotations.spread(vector))
-        return Told(found, {axis: float(factor[0]) for axis, factor in spread.items()}, seen)
+        return Told(of_axes, {axis: float(factor[0]) for axis, factor in spread.items()}, seen)
 
     def _lever(self, sensor: str, stamp: TimeArray) -> FloatArray:
         """From the tool point to what a sensor sees [m], by the commands, (n, 3); NaN as long as there is none."""
@@ -210,24 +210,24 @@ class CommandedTurn:
 
     def add(self, stamp: int, vector: list[float], oldest: int) -> int | None:
         """Add rx, ry, rz [rad] in the place of what had the same stamp; from when on that turns the tool otherwise."""
-        place = bisect_left(self._given, stamp)
-        again = place < len(self._given) and self._given[place] == stamp
-        if again and self._vector[place] == vector:
+        row = bisect_left(self._given, stamp)
+        again = row < len(self._given) and self._given[row] == stamp
+        if again and self._vector[row] == vector:
             return None
-        self._given[place : place + again], self._vector[place : place + again] = [stamp], [vector]
-        if place == 0:
+        self._given[row : row + again], self._vector[row : row + again] = [stamp], [vector]
+        if row == 0:
             self._start = vector
-        del self._motion[place:]
-        for later in range(place, len(self._given)):
+        del self._motion[row:]
+        for later in range(row, len(self._given)):
             self._motion.append([self._after(later, axis) for axis in range(len(TURNING))])
         if len(self._given) > 2 and self._given[2] <= oldest:  # one acts then, and one may be given anew
             del self._given[0], self._vector[0], self._motion[0]
-        return stamp + min(self._delay) if place else ALWAYS
+        return stamp + min(self._delay) if row else ALWAYS
 
-    def _after(self, place: int, axis: int) -> Record:
-        motion = self._motion[place - 1][axis].copy() if place else at_rest()
-        given, relative = self._commands(slice(place, place + 1), axis)
-        follow(self._axes[axis], motion, given, relative, np.empty(0, np.int64))
+    def _after(self, row: int, axis: int) -> Record:
+        motion = self._motion[row - 1][axis].copy() if row else at_rest()
+        told, relative = self._commands(slice(row, row + 1), axis)
+        follow(self._axes[axis], motion, told, relative, np.empty(0, np.int64))
         return motion
 
     def _commands(self, chosen: slice, axis: int) -> tuple[TimeArray, FloatArray]:
@@ -237,36 +237,36 @@ class CommandedTurn:
 
     def at(self, time: IntArray) -> FloatArray:
         """rx, ry and rz [rad] at some instants, int64 ns, ascending, (n,) → (n, 3); NaN before any command is known."""
-        found = np.full((len(time), len(TURNING)), np.nan)
+        turned = np.full((len(time), len(TURNING)), np.nan)
         if not self._given:
-            return found
+            return turned
         first, last = int(time[0]), int(time[-1])
         for axis, delay in enumerate(self._delay):
-            place, end = (bisect_right(self._given, instant - delay) for instant in (first, last))
-            motion = self._motion[place - 1][axis].copy() if place else at_rest()
-            moved = follow(self._axes[axis], motion, *self._commands(slice(place, end), axis), time)
-            found[:, axis] = self._start[axis] + moved
-        return found
+            row, end = (bisect_right(self._given, instant - delay) for instant in (first, last))
+            motion = self._motion[row - 1][axis].copy() if row else at_rest()
+            moved = follow(self._axes[axis], motion, *self._commands(slice(row, end), axis), time)
+            turned[:, axis] = self._start[axis] + moved
+        return turned
 
     def forget(self, after: int) -> int | None:
         """Take back the commands stamped after an instant [ns]; from when on the tool is turned otherwise then [ns]."""
-        place = bisect_right(self._given, after)
-        if place == len(self._given):
+        row = bisect_right(self._given, after)
+        if row == len(self._given):
             return None
-        since = self._given[place] + min(self._delay)
-        del self._given[place:], self._vector[place:], self._motion[place:]
-        return since if place else ALWAYS
+        since = self._given[row] + min(self._delay)
+        del self._given[row:], self._vector[row:], self._motion[row:]
+        return since if row else ALWAYS
 
 
 def unit(orientation: Any) -> FloatArray:
     """A quaternion x, y, z, w of norm 1, (1, 4)."""
     listed = isinstance(orientation, list | tuple) or (isinstance(orientation, np.ndarray) and orientation.ndim == 1)
-    given = cast(Sequence[Any], orientation) if listed else ()
-    parts = [number(one) for one in given] if len(given) == 4 else [math.nan] * 4
-    found = rotations.of_quaternions(np.array([parts]))
-    if not np.isfinite(found).all():
+    cells = cast(Sequence[Any], orientation) if listed else ()
+    parts = [number(cell) for cell in cells] if len(cells) == 4 else [math.nan] * 4
+    of_quaternions = rotations.of_quaternions(np.array([parts]))
+    if not np.isfinite(of_quaternions).all():
         raise ValueError(f"the orientation is no quaternion x, y, z, w of norm 1: {orientation!r:.60}")
-    return found
+    return of_quaternions
 
 
 def _stamp(row: Row) -> int:

@@ -21,8 +21,8 @@ from .tool import NOISE, ORIENTATION
 _LONGEST = 64 * 1024  # bytes of a line
 _QUATERNION = "q"  # x, y, z, w; an arm that does not turn a tool may have an axis of this name
 _KEYS = {  # of an estimate, and their scale
-    kind: (f"position_{one.unit}", f"sd_{one.unit}", f"velocity_{one.unit}_s", one.scale)
-    for kind, one in SCREEN.items()
+    kind: (f"position_{screen.unit}", f"sd_{screen.unit}", f"velocity_{screen.unit}_s", screen.scale)
+    for kind, screen in SCREEN.items()
 }
 
 
@@ -37,14 +37,14 @@ class Lines:
 
     def cut(self, piece: bytes) -> list[bytes]:
         """The lines that end in this piece."""
-        *lines, rest = piece.split(b"\n")
+        *lines, remainder = piece.split(b"\n")
         if lines:
             lines[0] = self._torn + lines[0]
             if self._too_long:
                 del lines[0]
             self._torn, self._too_long = b"", False
         if not self._too_long:
-            self._torn += rest
+            self._torn += remainder
         if len(self._torn) > _LONGEST:
             lines.append(self._torn)
             self._torn, self._too_long = b"", True
@@ -119,14 +119,14 @@ class LineDecoder:
         try:
             tree = _TREE.decode(line)
             head = msgspec.convert(tree, _Head)
-            given = tree if head.command is None else head.command
-            values = msgspec.structs.astuple(msgspec.convert(given, self._struct))
+            fields = tree if head.command is None else head.command
+            values = msgspec.structs.astuple(msgspec.convert(fields, self._struct))
         except msgspec.ValidationError as error:
             raise BadLine(str(error)) from None
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            rest = line.removeprefix(codecs.BOM_UTF8)  # with which PowerShell begins what it pipes
-            if rest != line and not rest.startswith(codecs.BOM_UTF8):
-                return self.decode(rest)
+            stripped = line.removeprefix(codecs.BOM_UTF8)  # with which PowerShell begins what it pipes
+            if stripped != line and not stripped.startswith(codecs.BOM_UTF8):
+                return self.decode(stripped)
             raise BadLine(f"not JSON: {error}") from None
         if head.command is not None:
             if head.sensor is not None or NOISE in tree or not self._values.isdisjoint(tree):
