@@ -94,7 +94,7 @@ class Joints:
             before = max(bisect_right(self._given, at) - 1, 0)
             after = min(before + 1, len(self._given) - 1)
             share = max(at - self._given[before], 0) / max(self._given[after] - self._given[before], 1)
-            value = self.told[before][joint]
+            value = self._told[before][joint]
             told[joint] = value + share * (self._told[after][joint] - value)
         return tuple(told)
 
