@@ -23,9 +23,9 @@ REACH_NS = 4.6e18  # |stamp| whose differences int64 ns can hold: the years 1824
 
 def known_rows(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
     """Stamps and values of the rows that have both, in the order of time; of one stamp the first, (n,) and (n, …)."""
-    there = (stamp != NO_STAMP) & np.isfinite(value).reshape(len(stamp), -1).all(axis=1)
-    known, first = np.unique(stamp[there], return_index=True)
-    return known, value[there][first]
+    valid = (stamp != NO_STAMP) & np.isfinite(value).reshape(len(stamp), -1).all(axis=1)
+    stamps, first = np.unique(stamp[valid], return_index=True)
+    return stamps, value[valid][first]
 
 
 def median(values: FloatArray) -> float:

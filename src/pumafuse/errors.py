@@ -80,16 +80,16 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def unknown_part(path: Path, key: str, name: str, known: Mapping[str, str], notes: Sequence[str]) -> RunError:
+def unknown_part(path: Path, key: str, name: str, parts: Mapping[str, str], notes: Sequence[str]) -> RunError:
     """What to say where a recording has nothing of a name: what it has, with the types."""
     why = "".join(f"; {note.removeprefix(f'{path.name}: ')}" for note in notes)
-    if not known:
+    if not parts:
         return RunError(f"{path}: the recording is empty{why}")
-    if name in known:
+    if name in parts:
         return RunError(f"{path}: {key} '{name}' has nothing that can be read{why}")
-    guess, near, _ = suggestion(name, known).partition("?")
+    guess, near, _ = suggestion(name, parts).partition("?")
     asked = f"no {key} '{name}'" if name else f"the key '{key}' is missing"
-    listed = ", ".join(f"{one} ({kind})" for one, kind in known.items())
+    listed = ", ".join(f"{part} ({kind})" for part, kind in parts.items())
     return RunError(f"{path}: {asked}; {f'{guess}? ' if near else ''}it has: {listed}{why}")
 
 

@@ -63,8 +63,8 @@ def replacing(folder: Path) -> Generator[Path]:
     """A new folder to write into, which replaces ``folder`` on leaving the block."""
     with _refused(folder):
         folder = folder.resolve()  # a link stays a link, its target is replaced
-    with _beside(folder) as place:
-        new, old, before = place / "new", place / "old", _identity(folder)
+    with _beside(folder) as temporary:
+        new, old, before = temporary / "new", temporary / "old", _identity(folder)
         new.mkdir()
         yield new
         if _identity(folder) != before:
@@ -88,8 +88,8 @@ def write_file(path: Path, content: str | bytes, *, replace: bool = True) -> Non
     """Write a file whole or not at all; without ``replace`` there was none when the work began, and must be none."""
     with _refused(path):
         path = path.resolve()
-    with _beside(path) as place:
-        new = place / "new"
+    with _beside(path) as temporary:
+        new = temporary / "new"
         new.write_bytes(content.encode() if isinstance(content, str) else content)
         if path.exists() and not replace:
             raise FolderError(f"{path}: {_MEANWHILE}")
@@ -116,8 +116,8 @@ def _beside(path: Path) -> Generator[Path]:
     """
     with _refused(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=_prefix(path, os.getppid()), dir=path.parent) as place:
-            yield Path(place)
+        with tempfile.TemporaryDirectory(prefix=_prefix(path, os.getppid()), dir=path.parent) as temporary:
+            yield Path(temporary)
 
 
 @contextmanager

@@ -87,9 +87,9 @@ def _plain(value: Any, path: str) -> Any:
         for key in tree:
             if not isinstance(key, str):
                 raise ConfigError(f"{path or 'the dict'}: a key is {key!r:.40}, not a text")
-        return {str(key): _plain(one, f"{ahead}{key}") for key, one in tree.items()}
+        return {str(key): _plain(value, f"{ahead}{key}") for key, value in tree.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one, path) for one in cast(Sequence[Any], value)]
+        return [_plain(value, path) for value in cast(Sequence[Any], value)]
     if isinstance(value, str):
         return value.encode("utf-8", "replace").decode()
     if isinstance(value, bool | int | float | Decimal | datetime.date | datetime.time):
@@ -149,9 +149,9 @@ def as_lengths(tree: Any, kind: Any = None) -> Any:
     """Tables with the key names for lengths, which are those of structs; names of fields of ``kind`` stay."""
     if not isinstance(tree, Mapping):
         return tree
-    own = {field.encode_name for field in msgspec.structs.fields(kind)} if isinstance(kind, type) else ()
+    names = {field.encode_name for field in msgspec.structs.fields(kind)} if isinstance(kind, type) else ()
     named = cast(Mapping[str, Any], tree).items()
-    return {key if key in own else as_length(key): as_lengths(value, kind) for key, value in named}
+    return {key if key in names else as_length(key): as_lengths(value, kind) for key, value in named}
 
 
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
@@ -168,10 +168,10 @@ def _of_kind(value: Any, axis: Kind) -> Any:
         return value
     if isinstance(value, msgspec.Struct):
         tag = value.__struct_config__
-        found = {} if tag.tag_field is None else {tag.tag_field: tag.tag}
+        fields = {} if tag.tag_field is None else {tag.tag_field: tag.tag}
         for field in msgspec.structs.fields(value):
-            found[of_kind(field.encode_name, axis)] = _of_kind(getattr(value, field.name), axis)
-        return found
+            fields[of_kind(field.encode_name, axis)] = _of_kind(getattr(value, field.name), axis)
+        return fields
     if isinstance(value, Mapping):
         return {key: _of_kind(item, axis) for key, item in cast(Mapping[str, Any], value).items()}
     if isinstance(value, list | tuple):
@@ -201,7 +201,7 @@ def _problems(tree: Any, kind: Any, path: str, axis: Kind = "length") -> Iterato
         kind = structs[0]  # of a table that may be absent
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and isinstance(tree, Mapping):
         fields = {of_kind(field.encode_name, axis): field for field in msgspec.structs.fields(kind)}
-        of_others = {of_kind(one.encode_name, other): name for name, one in fields.items() for other in KINDS}
+        of_others = {of_kind(field.encode_name, other): name for name, field in fields.items() for other in KINDS}
         tag = kind.__struct_config__.tag_field
         for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
             if key in fields:

@@ -188,16 +188,16 @@ def in_unit(value: float, unit: str) -> float | Decimal:
     else:
         exact = _PRECISE.divide(Decimal(value), _RADIANS)
         rounded = (Context(prec=digits).plus(exact) for digits in range(15, 25))
-        decimal = next(one for one in rounded if si(one, unit) == value)
+        decimal = next(number for number in rounded if si(number, unit) == value)
     plain = float(decimal)
     return plain if Decimal(repr(plain)) == decimal else decimal  # the 17th digit would be lost in a float
 
 
 def unwrapped(angle: FloatArray, turn: float = TURN) -> FloatArray:
     """Angles that go on, from those that begin anew after each turn [all in rad]; NaN stays."""
-    found, known = angle.copy(), np.isfinite(angle)
-    found[known] = np.unwrap(angle[known], period=turn)
-    return found
+    unwrapped, is_known = angle.copy(), np.isfinite(angle)
+    unwrapped[is_known] = np.unwrap(angle[is_known], period=turn)
+    return unwrapped
 
 
 def wraps(angle: FloatArray) -> IntArray:
@@ -212,18 +212,18 @@ def wraps(angle: FloatArray) -> IntArray:
     if turns in (1, 2):
         jumps = np.flatnonzero(np.abs(step) > turns * _JUMP)
         turn = turns * TURN
-        rest = np.pad(np.abs(step - turn * np.round(step / turn)), 2, mode="edge")
-        beside = np.max([rest[jumps + place] for place in _BESIDE], axis=0)
-        true = (beside < _STEP) & (rest[jumps + 2] <= _ALIKE * beside + 1.0 / DEG)
+        pad = np.pad(np.abs(step - turn * np.round(step / turn)), 2, mode="edge")
+        beside = np.max([pad[jumps + shift] for shift in _BESIDE], axis=0)
+        true = (beside < _STEP) & (pad[jumps + 2] <= _ALIKE * beside + 1.0 / DEG)
         if len(jumps) and true.mean() > 0.9:
             return rows[jumps + 1]
     jumps = np.flatnonzero(np.abs(step) > _JUMP)
     if turns < 2 or len(jumps) > _FEW_JUMPS * len(step):
         return rows[:0]
-    rest = np.pad(step - TURN * np.round(step / TURN), 2, mode="edge")
-    around = rest[jumps[:, None] + _BESIDE]
+    pad = np.pad(step - TURN * np.round(step / TURN), 2, mode="edge")
+    around = pad[jumps[:, None] + _BESIDE]
     beside = np.abs(around).max(axis=1)
-    goes_on = np.abs(rest[jumps + 2] - around.mean(axis=1)) <= 0.5 * beside + _NOISE
+    goes_on = np.abs(pad[jumps + 2] - around.mean(axis=1)) <= 0.5 * beside + _NOISE
     true = (beside > 0.0) & (beside < _STEP) & goes_on
     return rows[jumps + 1] if len(jumps) and true.mean() > 0.9 else rows[:0]
 
@@ -244,12 +244,14 @@ def nanoseconds(time: FloatArray) -> TimeArray:
 def _converted(value: Any, unit: str | None, path: str, convert: Callable[[Any, str, str], Any]) -> Any:
     """``value`` with every number in it converted; ``unit`` is "" for none, None within provenance."""
     if isinstance(value, Mapping):
-        found: dict[str, Any] = {}
+        converted: dict[str, Any] = {}
         for key, item in cast(Mapping[str, Any], value).items():
-            place, own = f"{path}.{key}" if path else key, ending(key)
-            known = unit is not None and place != PROVENANCE
-            found[key] = _converted(item, (unit if own is None else own) if known else None, place, convert)
-        return found
+            key_path, unit_of_key = f"{path}.{key}" if path else key, ending(key)
+            is_converted = unit is not None and key_path != PROVENANCE
+            converted[key] = _converted(
+                item, (unit if unit_of_key is None else unit_of_key) if is_converted else None, key_path, convert
+            )
+        return converted
     if isinstance(value, list | tuple):
         return [_converted(item, unit, path, convert) for item in cast(list[Any], value)]
     if isinstance(value, float | Decimal) or (type(value) is int and unit and _UNITS[unit] != 0):

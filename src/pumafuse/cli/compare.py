@@ -58,10 +58,10 @@ class Difference(toml.Reported, frozen=True, kw_only=True):
     at: float = msgspec.field(name="at_s")
 
 
-def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | None = None, draw: bool = False) -> None:
+def run(paths: Sequence[Path], reference: Path | None, json: bool, tum: Path | None = None, draw: bool = False) -> None:
     """Compare result folders; write their trajectories and references into the folder ``tum``."""
     compared = list[Compared]()
-    for folder in given:
+    for folder in paths:
         result = results.read(folder)
         track = result.reference
         if reference is not None:
@@ -83,12 +83,12 @@ def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | N
     if draw:
         _draw(compared, why)
     if json:
-        say_json([{**_reported(one), "take": one.name == best} for one in compared])
+        say_json([{**_reported(result), "take": result.name == best} for result in compared])
         return
-    scored = [(one.name, one.result.summary, one.scores) for one in compared if one.scores]
-    every = [(one.name, one.result.summary) for one in compared]
+    scored = [(result.name, result.result.summary, result.scores) for result in compared if result.scores]
+    every = [(result.name, result.result.summary) for result in compared]
     print_tables(score_table(scored, kind) for kind in KINDS)
-    print_tables([orientation_table((one.name, one.orientation) for one in compared)])
+    print_tables([orientation_table((result.name, result.orientation) for result in compared)])
     print_tables(consistency_table(every, kind) for kind in KINDS)
     print_tables(skill_table(every, kind) for kind in KINDS)
     print_tables(_difference_table(compared, kind) for kind in KINDS)
@@ -102,13 +102,15 @@ def _differences(first: Result, other: Result) -> dict[str, Difference]:
     if other is first or not same or first.segment.any() or other.segment.any():
         return {}
     time = first.time[(first.time >= other.time[0]) & (first.time <= other.time[-1])]
-    found = dict[str, Difference]()
-    mine, yours = (one.positions(first.config) for one in (first, other))
+    differences = dict[str, Difference]()
+    positions, yours = (result.positions(first.config) for result in (first, other))
     for axis in (axis for axis in first.axes if axis in other.axes and len(time)):
-        apart = np.interp(time, other.time, yours[axis]) - np.interp(time, first.time, mine[axis])
+        apart = np.interp(time, other.time, yours[axis]) - np.interp(time, first.time, positions[axis])
         at = int(np.argmax(np.abs(apart)))
-        found[axis] = Difference(rms=float(np.sqrt(np.mean(apart**2))), largest=float(apart[at]), at=float(time[at]))
-    return found
+        differences[axis] = Difference(
+            rms=float(np.sqrt(np.mean(apart**2))), largest=float(apart[at]), at=float(time[at])
+        )
+    return differences
 
 
 def verdict(compared: Sequence[Compared]) -> tuple[str | None, str]:
@@ -118,27 +120,27 @@ def verdict(compared: Sequence[Compared]) -> tuple[str | None, str]:
     narrow gate would gain by rejecting; else by how well the next measurement of the sensors is predicted that all
     have.
     """
-    every = [one.result.summary for one in compared]
-    if len(every) < 2 or len({(one.run, one.origin_ns) for one in every}) > 1:
+    every = [result.result.summary for result in compared]
+    if len(every) < 2 or len({(summary.run, summary.origin_ns) for summary in every}) > 1:
         return None, ""
-    if len({(one.from_s, one.to_s) for one in every}) > 1:
+    if len({(summary.from_s, summary.to_s) for summary in every}) > 1:
         return None, "nothing is chosen: the results are of different parts of the run"
-    by_error = _shared([_errors(one.scores) for one in compared])
+    by_error = _shared([_errors(result.scores) for result in compared])
     if by_error is not None:
         return _least(compared, by_error, "its error against the reference (RMSE, mean over the axes) is")
-    if all(_measured(one.result) == _measured(compared[0].result) for one in compared):
-        likelihood = [sum(axis.log_likelihood for axis in one.axes.values()) for one in every]
+    if all(_measured(result.result) == _measured(compared[0].result) for result in compared):
+        likelihood = [sum(axis.log_likelihood for axis in summary.axes.values()) for summary in every]
         order = sorted(range(len(compared)), key=lambda number: -likelihood[number])
         best, second = (compared[number].name for number in order[:2])
         ahead = likelihood[order[0]] - likelihood[order[1]]
-        if ahead < _EQUAL and len({one.mode for one in every}) > 1:
+        if ahead < _EQUAL and len({summary.mode for summary in every}) > 1:
             why = "innovations are those of one filter, and only a reference could tell how much a smoothed one gains"
             return None, f"no result is ahead: they differ in mode; {why}"
         if ahead < _EQUAL:
             return None, f"no result is ahead: the log-likelihoods of {best} and {second} differ by {ahead:.1f} only"
         why = "the log-likelihood of the same measurements, each before it is used, is"
         return best, f"take {best}: {why} {ahead:.1f} higher than that of {second}"
-    predictions = _shared([_predictions(one.result) for one in compared])
+    predictions = _shared([_predictions(result.result) for result in compared])
     if predictions is None:
         return None, "nothing to choose by: the results have no reference, and no sensor in common"
     return _least(compared, predictions, "its error of predicting the next measurement (RMS, mean over the sensors) is")
@@ -156,40 +158,43 @@ def _least(compared: Sequence[Compared], logs: Sequence[float], what: str) -> tu
 def _shared(each: Sequence[Mapping[str, float]]) -> list[float] | None:
     """The means over the keys that all have; None without any."""
     keys = set(each[0]).intersection(*each[1:])
-    return [sum(one[key] for key in keys) / len(keys) for one in each] if keys else None
+    return [sum(by_key[key] for key in keys) / len(keys) for by_key in each] if keys else None
 
 
 def _measured(result: Result) -> dict[tuple[str, str], tuple[int, float | None]]:
     """By axis and sensor how many components were fused or rejected, and by which gate."""
-    gates = {name: one.gate for name, one in result.config.sensors.items()}
+    gates = {name: sensor.gate for name, sensor in result.config.sensors.items()}
     return {
-        (axis, name): (sum(one.outcomes.get(word, 0) for word in ("fused", "rejected", "reacquired")), gates.get(name))
+        (axis, name): (
+            sum(sensor.outcomes.get(word, 0) for word in ("fused", "rejected", "reacquired")),
+            gates.get(name),
+        )
         for axis, part in result.summary.axes.items()
-        for name, one in part.sensors.items()
+        for name, sensor in part.sensors.items()
     }
 
 
 def _errors(scores: Mapping[str, ScoreSummary]) -> dict[str, float]:
     """Logarithms of the errors against the reference, by axis."""
-    return {axis: math.log(one.rmse) for axis, one in scores.items() if one.rmse > 0.0}
+    return {axis: math.log(score.rmse) for axis, score in scores.items() if score.rmse > 0.0}
 
 
 def _predictions(result: Result) -> dict[str, float]:
     """Logarithms of the errors of prediction, by axis and sensor."""
     return {
-        f"{axis}, {name}": math.log(one.skill.filter.rms)
+        f"{axis}, {name}": math.log(sensor.skill.filter.rms)
         for axis, part in result.summary.axes.items()
-        for name, one in part.sensors.items()
-        if one.skill is not None and one.skill.filter.rms > 0.0
+        for name, sensor in part.sensors.items()
+        if sensor.skill is not None and sensor.skill.filter.rms > 0.0
     }
 
 
 def _difference_table(compared: Sequence[Compared], kind: Kind) -> Table:
     unit = SCREEN[kind].unit
     rows = [
-        [each.name, axis, position(one.rms, kind), position(one.largest, kind), f"{one.at:.2f}"]
+        [each.name, axis, position(difference.rms, kind), position(difference.largest, kind), f"{difference.at:.2f}"]
         for each in compared
-        for axis, one in each.differences.items()
+        for axis, difference in each.differences.items()
         if each.result.summary.axes[axis].kind == kind
     ]
     headings = ["result", "axis", f"RMS, {unit}", f"largest, {unit}", "at, s"]
@@ -199,7 +204,7 @@ def _difference_table(compared: Sequence[Compared], kind: Kind) -> Table:
 def _draw(compared: Sequence[Compared], why: str) -> None:
     from ..views.figures import comparison_figure
 
-    drawn = comparison_figure({one.name: one.result for one in compared}, compared[0].track, why)
+    drawn = comparison_figure({result.name: result.result for result in compared}, compared[0].track, why)
     picture = io.BytesIO()
     drawn.savefig(picture, format="png", dpi=130)
     folders.write_file(Path(FIGURE), picture.getvalue())
@@ -209,20 +214,20 @@ def _draw(compared: Sequence[Compared], why: str) -> None:
 def _write_trajectories(compared: Sequence[Compared], output: Path) -> None:
     """Write ``<folder>.tum`` for each result, and ``<folder>.reference.tum`` where it has a reference in x, y, z."""
     folders.check_writable(output, False, [], lambda _: False)
-    names = [Path(one.name).resolve().name for one in compared]
+    names = [Path(result.name).resolve().name for result in compared]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise FolderError(f"{output}: two results are called '{twice}', and so would be their files; rename a folder")
     with folders.replacing(output) as new:
-        for one, name in zip(compared, names, strict=True):
-            track, of = one.track, (one.result.config, one.result.summary.origin_ns)
-            write_tum(one.result.track, *of, one.name, new / f"{name}.tum")
+        for result, name in zip(compared, names, strict=True):
+            track, of = result.track, (result.result.config, result.result.summary.origin_ns)
+            write_tum(result.result.track, *of, result.name, new / f"{name}.tum")
             if track is not None and (track.cartesian or set(CARTESIAN) <= set(track.position)):
-                write_tum(track, *of, f"{one.name}: the reference", new / f"{name}.reference.tum")
+                write_tum(track, *of, f"{result.name}: the reference", new / f"{name}.reference.tum")
 
 
-def _reported(one: Compared) -> dict[str, Any]:
+def _reported(compared: Compared) -> dict[str, Any]:
     """A result as JSON, in the units of its axes."""
-    summary, of = one.result.summary, one.result.summary.axes
+    summary, of = compared.result.summary, compared.result.summary.axes
 
     def by_sensor(number: Callable[[SensorSummary, Kind], object]) -> dict[str, dict[str, object]]:
         return {
@@ -230,16 +235,16 @@ def _reported(one: Compared) -> dict[str, Any]:
         }
 
     return {
-        "folder": one.name,
+        "folder": compared.name,
         "run": summary.run,
         "mode": summary.mode,
-        "axes": {axis: toml.reported(each, of[axis].kind) for axis, each in one.scores.items()},
-        "orientation": one.orientation and toml.reported(one.orientation),
+        "axes": {axis: toml.reported(each, of[axis].kind) for axis, each in compared.scores.items()},
+        "orientation": compared.orientation and toml.reported(compared.orientation),
         "log_likelihood": {axis: part.log_likelihood for axis, part in of.items()},
         "nis": by_sensor(lambda each, _: each.nis_mean),
         "rejected": by_sensor(lambda each, _: share_rejected(each)),
         "skill": by_sensor(lambda each, kind: each.skill and toml.reported(each.skill, kind)),
-        "difference": {axis: toml.reported(each, of[axis].kind) for axis, each in one.differences.items()},
+        "difference": {axis: toml.reported(each, of[axis].kind) for axis, each in compared.differences.items()},
         "commands": summary.commands,
         "rows": summary.rows,
     }

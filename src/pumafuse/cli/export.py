@@ -19,15 +19,18 @@ def run(config: Path, output: Path, force: bool) -> None:
     name = identifier(output.stem)
     if name.lower() in ("pf", "pumafuse"):
         raise ConfigError(f"{output}: its names would be those of pumafuse.h; choose another")
-    known = FusionConfig.load(config)
-    if not known.sensors:
+    configured = FusionConfig.load(config)
+    if not configured.sensors:
         raise ConfigError(f"{config}: has no sensor: without one there is nothing to fuse")
-    LiveEstimator(known)  # refuses what it cannot follow
-    warn(known.arm.doubts() + known.arm.joint_doubts())
-    write_file(output, header(known, name, str(config)), replace=force)
-    axes = ", ".join(known.arm.axes)
-    say(f"{name}_model, of {axes} measured by {', '.join(known.sensors)}, written to {output}")
-    if known.frame is not None:
+    LiveEstimator(configured)  # refuses what it cannot follow
+    warn(configured.arm.doubts() + configured.arm.joint_doubts())
+    write_file(output, header(configured, name, str(config)), replace=force)
+    axes = ", ".join(configured.arm.axes)
+    say(f"{name}_model, of {axes} measured by {', '.join(configured.sensors)}, written to {output}")
+    if configured.frame is not None:
         say(f"it is in the arm's axes: turning x, y, z into {axes}, as [frame] says, is left to the controller")
-    if known.tool is not None or any(sensor.is_placed for sensor in known.sensors.values()):
-        say(f"it is in the base's axes: {left_out(known)} left to the controller, which gives {axes} of the tool point")
+    if configured.tool is not None or any(sensor.is_placed for sensor in configured.sensors.values()):
+        say(
+            f"it is in the base's axes: {left_out(configured)} left to the controller, which gives {axes} of the tool"
+            " point"
+        )

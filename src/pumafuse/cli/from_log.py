@@ -61,20 +61,20 @@ def run(
     """
     results.check_writable(output, force, with_run=True)
     try:
-        found = survey(log)
+        surveyed = survey(log)
     except UndecidedError as error:
         raise RunError(f"{error}; `pumafuse init {shlex.quote(str(log))}` writes one to sort") from None
-    for name in found.run.sensors:
-        if by := early(found, name):
-            advice = f"; `pumafuse init {log}` writes one" if found.roles else ""
+    for name in surveyed.run.sensors:
+        if by := early(surveyed, name):
+            advice = f"; `pumafuse init {log}` writes one" if surveyed.roles else ""
             raise RunError(f"{log}: {too_early(name, max(by.values()))}{advice}")
-    found = replace(found, run=found.run.between(*part))  # so that latencies are those of the part
-    arm, begins = guess(found)
-    init.show(found, begins)
+    surveyed = replace(surveyed, run=surveyed.run.between(*part))  # so that latencies are those of the part
+    arm, begins = guess(surveyed)
+    init.show(surveyed, begins)
     while True:
-        texts, here = drafts(found, arm, begins, output), Path()
-        recorded = described(drafts(found, arm, begins, here)["run.toml"], here).between(*part)
-        begun = init.registered(found, recorded) if found.own_frames else None
+        texts, here = drafts(surveyed, arm, begins, output), Path()
+        recorded = described(drafts(surveyed, arm, begins, here)["run.toml"], here).between(*part)
+        begun = init.registered(surveyed, recorded) if surveyed.own_frames else None
         begun = begun or FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
         begun.sensor_names(sensors)  # before anything is fitted
         try:
@@ -82,86 +82,86 @@ def run(
                 fitted = tune(recorded, begun, fit=_FITTED, intervals=_FITTED_ARM, progress=progress)
             break
         except LostError as error:
-            found = _without(found, error)
+            surveyed = _without(surveyed, error)
             say(f"left out: {error}")
-            arm, begins = guess(found)
+            arm, begins = guess(surveyed)
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)
     est = replace(est, fitted=True)
     results.check_fused(est.counts, est.config)
     summary = results.write(est, output, force, lambda new: draw(new, est, recorded, extras), texts["run.toml"])
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
-    strays = _off_the_path(found, summary)
-    slow = otherwise_than_at_first(found, fitted.details.lags, fitted.config.arm)
+    strays = _off_the_path(surveyed, summary)
+    slow = otherwise_than_at_first(surveyed, fitted.details.lags, fitted.config.arm)
     for line in [*strays, *slow, *_told_by_one(summary)]:
         say(line)
-    for name in (name for name, one in fitted.config.sensors.items() if one.latency == 0.0):
+    for name in (name for name, sensor in fitted.config.sensors.items() if sensor.latency == 0.0):
         say(taken(name, 0.0))
     folder = shlex.quote(str(output))
     another = "pumafuse fuse ANOTHER_LOG"
-    if found.roles is not None:  # it is read by what `init` finds in it, as this one was
+    if surveyed.roles is not None:  # it is read by what `init` finds in it, as this one was
         another = "pumafuse init ANOTHER_LOG -o ANOTHER && pumafuse fuse ANOTHER"
     say(f"written to {output}\nnext: {another} -c {folder}/fusion.toml -o DIR")
-    if any(one.suffix in _BAGS for one in (log.iterdir() if log.is_dir() else [log])):
+    if any(path.suffix in _BAGS for path in (log.iterdir() if log.is_dir() else [log])):
         say(f"or as a node of ROS 2: pumafuse live ros2:{folder}/run.toml -c {folder}/fusion.toml")
     end(fitted.details)
     if strays:
         raise typer.Exit(WORSE)
 
 
-def _without(found: Survey, lost: LostError) -> Survey:
+def _without(survey: Survey, lost: LostError) -> Survey:
     """What was found, without axes on which a sensor follows nothing; raises the error if nothing else follows."""
     bad = {(name, axis) for name in lost.fault.sensors for axis in lost.fault.axes}
-    there = {name: one.values for name, one in found.run.sensors.items()}
-    kept = {name: {axis: of[axis] for axis in of if (name, axis) not in bad} for name, of in there.items()}
-    related = {key: one for key, one in found.relations.items() if key not in bad}
-    follows = any(abs(one.correlation) >= FOLLOWS for (name, _), one in related.items() if name in kept)
-    if lost.fault.cause != "nothing" or not follows or all(len(kept[name]) == len(there[name]) for name in there):
+    measured = {name: sensor.values for name, sensor in survey.run.sensors.items()}
+    kept = {name: {axis: of[axis] for axis in of if (name, axis) not in bad} for name, of in measured.items()}
+    related = {key: relation for key, relation in survey.relations.items() if key not in bad}
+    follows = any(abs(relation.correlation) >= FOLLOWS for (name, _), relation in related.items() if name in kept)
+    if lost.fault.cause != "nothing" or not follows or all(len(kept[name]) == len(measured[name]) for name in measured):
         raise lost
-    sensors = {name: replace(found.run.sensors[name], values=values) for name, values in kept.items() if values}
-    return replace(found, run=replace(found.run, sensors=sensors), relations=related)
+    sensors = {name: replace(survey.run.sensors[name], values=values) for name, values in kept.items() if values}
+    return replace(survey, run=replace(survey.run, sensors=sensors), relations=related)
 
 
-def _off_the_path(found: Survey, summary: Summary) -> list[str]:
+def _off_the_path(survey: Survey, summary: Summary) -> list[str]:
     """A sentence on each axis of which the filter predicts every sensor much worse than the path through the commands.
 
     The path needs no arm, but it knows the next command: what moves as that is given was commanded earlier.
     """
     lines, follows = dict[str, str](), set[str]()
-    for (name, axis), one in found.relations.items():
+    for (name, axis), relation in survey.relations.items():
         part = summary.axes.get(axis)  # a sensor in a frame of its own, or one not asked for, has none
         skill = part.sensors[name].skill if part is not None and name in part.sensors else None
-        if part is None or skill is None or abs(one.correlation) < FOLLOWS:
+        if part is None or skill is None or abs(relation.correlation) < FOLLOWS:
             continue
         screen, off = SCREEN[part.kind], SD_OF_MEDIAN * skill.filter.median
-        least = _NOTHING * float(np.ptp(found.run.sensors[name].values[axis]))
-        if off < max(_STRAYS_FAR * one.misfit, least):
+        least = _NOTHING * float(np.ptp(survey.run.sensors[name].values[axis]))
+        if off < max(_STRAYS_FAR * relation.misfit, least):
             follows.add(axis)
         lines[axis] = (
-            f"{axis}: {name} is {one.misfit * screen.scale:.3g} {screen.unit} off the path through the commands"
-            f" {one.lag * MS:.0f} ms before, and the filter predicts it to {off * screen.scale:.3g}: no arm was"
+            f"{axis}: {name} is {relation.misfit * screen.scale:.3g} {screen.unit} off the path through the commands"
+            f" {relation.lag * MS:.0f} ms before, and the filter predicts it to {off * screen.scale:.3g}: no arm was"
             f" found by which {axis} follows. Does its controller go on between commands (interpolation_ms in"
             " run.toml), or were these given earlier than they are stamped (shift_s)?"
         )
     return [line for axis, line in lines.items() if axis not in follows]
 
 
-def otherwise_than_at_first(found: Survey, lags: Mapping[str, FittedLag], arm: ArmModel) -> list[str]:
+def otherwise_than_at_first(survey: Survey, lags: Mapping[str, FittedLag], arm: ArmModel) -> list[str]:
     """A sentence on the axes whose fitted lag is far from that of the first look, which needs no arm.
 
     What has play or a fastest speed lags otherwise with each motion. So much play as explains it does, and no less.
     """
-    seen = {axis for (_, axis), one in found.relations.items() if abs(one.correlation) >= FOLLOWS}
+    seen = {axis for (_, axis), relation in survey.relations.items() if abs(relation.correlation) >= FOLLOWS}
     others = [
-        f"{axis} ({one.before_ms:.0f} ms at the first look, {one.lag_ms:.0f} fitted)"
-        for axis, one in lags.items()
+        f"{axis} ({lag.before_ms:.0f} ms at the first look, {lag.lag_ms:.0f} fitted)"
+        for axis, lag in lags.items()
         if axis in seen
         and not arm.axes[axis].max_speed
-        and abs(one.lag_ms - one.before_ms)
+        and abs(lag.lag_ms - lag.before_ms)
         > max(
-            _OTHERWISE * min(one.lag_ms, one.before_ms),
+            _OTHERWISE * min(lag.lag_ms, lag.before_ms),
             _SAME_LAG_MS,
-            MS * (arm.axes[axis].play or 0.0) / _speed(found.run.command, axis),
+            MS * (arm.axes[axis].play or 0.0) / _speed(survey.run.command, axis),
         )
     ]
     if not others:
@@ -180,13 +180,13 @@ def _speed(command: Source, axis: str) -> float:
 
 def _told_by_one(summary: Summary) -> list[str]:
     """A sentence on each sensor that is alone on axes where its noise is told from the arm's by being white alone."""
-    found = dict[str, list[str]]()
+    by_reason = dict[str, list[str]]()
     for axis, part in summary.axes.items():
-        for name, one in part.sensors.items():
-            if one.finding == Finding.UNTESTED.value:
-                found.setdefault(name, []).append(axis)
+        for name, sensor in part.sensors.items():
+            if sensor.finding == Finding.UNTESTED.value:
+                by_reason.setdefault(name, []).append(axis)
     return [
         f"{name} alone measures {', '.join(axes)}: what strays there is taken for the arm. If {name} filters its"
         " values, or its noise lasts, nothing here shows it, and error bars are too small"
-        for name, axes in found.items()
+        for name, axes in by_reason.items()
     ]

@@ -45,10 +45,10 @@ def run(
 
     With ``resume`` results that are there and were made in the same way are kept.
     """
-    given = FusionConfig.load(config)
-    given.sensor_names(sensors)  # before any run is read
-    warn(given.arm.doubts())
-    making = results.Making(given, sensors, rate, mode, engine, part, extras)
+    configured = FusionConfig.load(config)
+    configured.sensor_names(sensors)  # before any run is read
+    warn(configured.arm.doubts())
+    making = results.Making(configured, sensors, rate, mode, engine, part, extras)
     job = partial(_fuse, making, force)
     if len(runs) == 1:
         summary = making.made(output, runs[0]) if resume else None
@@ -60,14 +60,19 @@ def run(
         say(f"{where} {output}")
         return
     places = dict(zip(map(str, runs), folders_of(runs, output), strict=True))
-    there = {path: summary for path, place in places.items() if resume and (summary := making.made(place, Path(path)))}
-    jobs = {path: partial(job, Path(path), place) for path, place in places.items() if path not in there}
+    done_before = {
+        path: summary for path, folder in places.items() if resume and (summary := making.made(folder, Path(path)))
+    }
+    jobs = {path: partial(job, Path(path), folder) for path, folder in places.items() if path not in done_before}
     done, failed = run_jobs("fusing", jobs, places.values())
-    if there or done:
-        found = there | done
-        summaries = {place.name: found[path] for path, place in places.items() if path in found}
+    if done_before or done:
+        by_path = done_before | done
+        summaries = {folder.name: by_path[path] for path, folder in places.items() if path in by_path}
         print_tables(runs_table(summaries, kind) for kind in KINDS)
-        say(f"written to {output}" + (f"; {len(there)} of {len(found)} were there already" if there else ""))
+        say(
+            f"written to {output}"
+            + (f"; {len(done_before)} of {len(by_path)} were there already" if done_before else "")
+        )
     report_failures(failed, len(places), output)
 
 
@@ -164,10 +169,10 @@ def show(summary: Summary) -> None:
 
 def folders_of(runs: Sequence[Path], output: Path) -> list[Path]:
     """A folder for each run, named after its path; equal names get a number."""
-    found = dict[str, None]()
+    names_of_runs = dict[str, None]()
     for path in map(Path.resolve, runs):
         named = path.parent if path.name == "run.toml" else path
         name = named.name if named.is_dir() else re.sub(r"(\.(csv|jsonl|ndjson|parquet))?(\.gz)?$", "", named.name)
         names = (f"{name or 'run'}{number}" for number in chain([""], map("_{}".format, count(2))))
-        found[next(one for one in names if one not in found)] = None
-    return [output / name for name in found]
+        names_of_runs[next(name for name in names if name not in names_of_runs)] = None
+    return [output / name for name in names_of_runs]

@@ -46,15 +46,15 @@ def run(
     campaign, name = StepTrials.read(folder), folder.resolve().name
     most = None if tolerance is None else si(tolerance, f"_{SCREEN[campaign.kind].unit}")
     period = None if period_ms is None else si(period_ms, "_ms")
-    found = identify(campaign, period=period, samples=samples, paper=paper, tolerance=most, name=name)
-    warn(found.notes)
-    write_file(output, found.arm.to_toml(), replace=force)
+    identification = identify(campaign, period=period, samples=samples, paper=paper, tolerance=most, name=name)
+    warn(identification.notes)
+    write_file(output, identification.arm.to_toml(), replace=force)
     if report is not None:
-        reports.write_identification(found, campaign, report, force)
+        reports.write_identification(identification, campaign, report, force)
     if json:
-        say(found.to_json())
+        say(identification.to_json())
         return
-    _show(found)
+    _show(identification)
     say(f"written to {output}" + (f" and {report}" if report is not None else ""))
     say(f"next: pumafuse verify RUN --arm {output}")
 
@@ -67,11 +67,11 @@ def _is_arm(path: Path) -> bool:
     return True
 
 
-def _show(found: Identification) -> None:
-    print_tables([table(*reports.models(found))])
-    say("\n".join(reports.sentences(found)))
-    if found.dependences:
-        print_tables([table(*reports.dependences(found))])
-    print_tables([table(*reports.scatter(found))])
-    for one in found.performance:
-        say(f"combined model by {one.factor}: {one.verdict}")
+def _show(identification: Identification) -> None:
+    print_tables([table(*reports.models(identification))])
+    say("\n".join(reports.sentences(identification)))
+    if identification.dependences:
+        print_tables([table(*reports.dependences(identification))])
+    print_tables([table(*reports.scatter(identification))])
+    for performance in identification.performance:
+        say(f"combined model by {performance.factor}: {performance.verdict}")

@@ -29,22 +29,22 @@ _FEW = 4  # columns that are named
 def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     """Look at a log, print what it holds, and write three files to begin with."""
     folder = Path(f"{name_of(log)}-fusion") if output is None else output
-    there = [name for name in FILES if (folder / name).exists()]
-    if there and not force:
-        raise ConfigError(f"{folder}: has {there[0]} already; --force replaces it, or choose another folder")
+    existing = [name for name in FILES if (folder / name).exists()]
+    if existing and not force:
+        raise ConfigError(f"{folder}: has {existing[0]} already; --force replaces it, or choose another folder")
     try:
-        found = survey(log, rate)
+        surveyed = survey(log, rate)
     except UndecidedError as error:
         write_file(folder / MANIFEST, sketch(name_of(log), error, folder), replace=force)
         then = f"`pumafuse fuse {shlex.quote(str(folder))} -o DIR`"
         raise RunError(f"{error}; what there is was written to {folder / MANIFEST}: sort it, then {then}") from None
-    arm, sensors = guess(found)
-    texts = drafts(found, arm, sensors, folder)
-    show(found, sensors)
-    if found.own_frames:
-        recorded = described(drafts(found, arm, sensors, Path())["run.toml"], Path())
+    arm, sensors = guess(surveyed)
+    texts = drafts(surveyed, arm, sensors, folder)
+    show(surveyed, sensors)
+    if surveyed.own_frames:
+        recorded = described(drafts(surveyed, arm, sensors, Path())["run.toml"], Path())
         try:
-            config = registered(found, recorded)
+            config = registered(surveyed, recorded)
         except RunError as error:  # what it was read by is there to be mended
             write_file(folder / MANIFEST, texts[MANIFEST], replace=force)
             again = f"what was read is in {folder / MANIFEST}: mend it, then `pumafuse init {folder} --force`"
@@ -53,24 +53,24 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
             texts |= {"fusion.toml": config.to_toml(), "arm.toml": config.arm.to_toml()}
     for name, text in texts.items():
         write_file(folder / name, text, replace=force)
-    place = shlex.quote(str(folder))
+    folder_word = shlex.quote(str(folder))
     say(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
-    tuned, fused = f"{place}/tuned", f"{place}/fused"
-    if not found.own_frames:
-        say(f"  pumafuse latency {place}")
-    say(f"  pumafuse tune {place} -c {place}/fusion.toml -o {tuned} --fit noise,delay,plant")
-    say(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
+    tuned, fused = f"{folder_word}/tuned", f"{folder_word}/fused"
+    if not surveyed.own_frames:
+        say(f"  pumafuse latency {folder_word}")
+    say(f"  pumafuse tune {folder_word} -c {folder_word}/fusion.toml -o {tuned} --fit noise,delay,plant")
+    say(f"  pumafuse fuse {folder_word} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
 
 
-def registered(found: Survey, recorded: Run) -> FusionConfig | None:
+def registered(survey: Survey, recorded: Run) -> FusionConfig | None:
     """The configuration with the sensors registered that stand in frames of their own, which is printed."""
     from ..registration.runs import register  # scipy takes its time, and most logs need none of it
     from . import register as shown
 
     try:
-        done = register(recorded, along_base=list(found.run.sensors))
+        done = register(recorded, along_base=list(survey.run.sensors))
     except RunError as error:
-        if not found.run.sensors:
+        if not survey.run.sensors:
             raise
         say(f"not registered: {error}")
         return None
@@ -78,27 +78,27 @@ def registered(found: Survey, recorded: Run) -> FusionConfig | None:
     return done.config
 
 
-def show(found: Survey, sensors: Mapping[str, SensorGuess]) -> None:
+def show(survey: Survey, sensors: Mapping[str, SensorGuess]) -> None:
     """Print what was found, and what the user has to decide."""
-    print_tables(_tables(found))
-    for number, question in enumerate(questions(found, sensors), 1):
+    print_tables(_tables(survey))
+    for number, question in enumerate(questions(survey, sensors), 1):
         say(f"{number}. {question}" if number > 1 else f"To decide:\n1. {question}")
 
 
-def _tables(found: Survey) -> Iterator[Table]:
+def _tables(survey: Survey) -> Iterator[Table]:
     """What the log holds, who is who, and what follows what."""
-    parts = [_part_row(part) for part in found.parts] or _described_rows(found)
+    parts = [_part_row(part) for part in survey.parts] or _described_rows(survey)
     yield table(["file or topic", "type", "rows", "rate, Hz", "gaps", "clock", "not used"], parts)
-    if found.roles is not None:
-        roles = found.roles
-        named = [("command", roles.command), *((f"sensor {one.name}", one) for one in roles.sensors)]
+    if survey.roles is not None:
+        roles = survey.roles
+        named = [("command", roles.command), *((f"sensor {sensor.name}", sensor) for sensor in roles.sensors)]
         named += [] if roles.reference is None else [("reference", roles.reference)]
         rows = [row for what, stream in named for row in _axis_rows(what, stream)]
-        rows += [["not used", ", ".join(one.axes), one.part.label, "", "", why] for one, why in roles.left_out]
+        rows += [["not used", ", ".join(stream.axes), stream.part.label, "", "", why] for stream, why in roles.left_out]
         headings = ["what", "axis", "column", "unit", "range", "because"]
         yield table(headings, [[printable(cell, 200) for cell in row] for row in rows])
-    yield _relations_table(found)
-    yield table(["decided", "", "how surely"], [[printable(cell, 200) for cell in row] for row in decisions(found)])
+    yield _relations_table(survey)
+    yield table(["decided", "", "how surely"], [[printable(cell, 200) for cell in row] for row in decisions(survey)])
 
 
 def _part_row(part: Part) -> list[str]:
@@ -111,9 +111,9 @@ def _part_row(part: Part) -> list[str]:
     return [printable(cell, 200) for cell in (part.label, kind, str(part.rows), interval, gaps, clock, unused)]
 
 
-def _described_rows(found: Survey) -> list[list[str]]:
+def _described_rows(survey: Survey) -> list[list[str]]:
     """Of a log whose run.toml says what is where."""
-    sources = {"command": found.run.command, **found.run.measured}
+    sources = {"command": survey.run.command, **survey.run.measured}
     return [
         [printable(source.label_for(name)), "", str(len(source.stamp)), *_rate(source.stamp), "run.toml", ""]
         for name, source in sources.items()
@@ -134,23 +134,25 @@ def _axis_rows(what: str, stream: Stream) -> Iterator[list[str]]:
         what = because = ""
     for axis, signals in stream.axes.items():
         low, high = (f(signals[0].plain[np.isfinite(signals[0].plain)]) for f in (np.min, np.max))
-        columns = " + ".join(_where(one) for one in signals)
+        columns = " + ".join(_where(signal) for signal in signals)
         unit = f"{signals[0].unit}, {BASES[signals[0].basis]}"
         yield [what, axis, columns, unit, f"{low:.4g} … {high:.4g}", because]
         what = because = ""
 
 
-def _where(one: Signal) -> str:
+def _where(signal: Signal) -> str:
     """A column, and in which of the rows it is the axis."""
-    return ", ".join([one.column, *(f"{name} = {key}" for name, key in one.where.items())])
+    return ", ".join([signal.column, *(f"{name} = {key}" for name, key in signal.where.items())])
 
 
-def _relations_table(found: Survey) -> Table:
+def _relations_table(survey: Survey) -> Table:
     rows: list[list[str]] = []
-    for (name, axis), one in found.relations.items():
-        screen = SCREEN[found.run.kinds.get(axis, "length")]
-        sizes = [f"{size * screen.scale:.2g} {screen.unit}" for size in (one.offset, one.scatter, one.misfit)]
-        numbers = [f"{one.lag * MS:.0f}", f"{one.correlation:+.3f}", f"{one.slope:.3f}"]
-        rows.append([name, axis, *numbers, *sizes, f"{one.outliers:.1%}"])
+    for (name, axis), relation in survey.relations.items():
+        screen = SCREEN[survey.run.kinds.get(axis, "length")]
+        sizes = [
+            f"{size * screen.scale:.2g} {screen.unit}" for size in (relation.offset, relation.scatter, relation.misfit)
+        ]
+        numbers = [f"{relation.lag * MS:.0f}", f"{relation.correlation:+.3f}", f"{relation.slope:.3f}"]
+        rows.append([name, axis, *numbers, *sizes, f"{relation.outliers:.1%}"])
     headings = ["follows the\ncommands", "axis", "lag, ms", "correlation", "gain", "offset", "noise", "left over"]
     return table([*headings, "outliers"], rows)

@@ -57,7 +57,7 @@ _SENSOR: Columns = {
 
 
 def run(
-    given: list[str],
+    addresses: list[str],
     config: Path,
     rate: float | None,
     window: float,
@@ -71,10 +71,10 @@ def run(
     ros_args: list[str],
 ) -> None:
     """Estimate from a stream until it ends, or a signal ends it; the arguments are the options, in s and Hz."""
-    sources, known, start = list(map(Address.parse, given)), FusionConfig.load(config), dict[str, float]()
-    alone, kinds = sources[0], [one.kind for one in sources]
+    sources, configured, start = list(map(Address.parse, addresses)), FusionConfig.load(config), dict[str, float]()
+    alone, kinds = sources[0], [source.kind for source in sources]
     if listen and not set(LISTENERS) & set(kinds):
-        raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {given[0]}")
+        raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {addresses[0]}")
     if len(sources) > 1 and (lonely := {"stdin", "replay"} & set(kinds)):
         raise ConfigError(f"{lonely.pop()}: is a source alone; several may be of the network")
     if kinds.count("ros2") > 1:
@@ -82,13 +82,13 @@ def run(
     recorded = Run.read(alone.path) if alone.kind == "replay" else None
     if recorded is not None:
         start = dict(recorded.start)
-        known = with_tool(msgspec.structs.replace(known, frame=recorded.frame or known.frame), recorded)
-    files = {one: manifest.file_of(Path(one.path)) for one in sources if one.kind in OF_A_RUN}
+        configured = with_tool(msgspec.structs.replace(configured, frame=recorded.frame or configured.frame), recorded)
+    files = {source: manifest.file_of(Path(source.path)) for source in sources if source.kind in OF_A_RUN}
     listed = {address: manifest.load(file) for address, file in files.items()}
-    for address, one in listed.items():
-        start |= one.command.start
-        robot = known.robot if one.robot is None else one.robot.beside(files[address].parent)
-        known = msgspec.structs.replace(known, frame=one.frame or known.frame, robot=robot)
+    for address, address_of in listed.items():
+        start |= address_of.command.start
+        robot = configured.robot if address_of.robot is None else address_of.robot.beside(files[address].parent)
+        configured = msgspec.structs.replace(configured, frame=address_of.frame or configured.frame, robot=robot)
     errors = console(sys.stderr)
 
     def notify(text: str) -> None:
@@ -97,19 +97,23 @@ def run(
 
     with contextlib.ExitStack() as stack:
         remotes = [
-            _opened(one, listed.get(one), known, stack, notify, listen=listen, allow=allow, ros_args=ros_args)
-            for one in sources
-            if one.kind in (*NETWORK, *OF_A_RUN, POSES)
+            _opened(
+                source, listed.get(source), configured, stack, notify, listen=listen, allow=allow, ros_args=ros_args
+            )
+            for source in sources
+            if source.kind in (*NETWORK, *OF_A_RUN, POSES)
         ]
         remote = Several(remotes) if len(remotes) > 1 else next(iter(remotes), None)
-        ros = next((one for one in remotes if isinstance(one, Ros2Source)), None)
+        ros = next((source for source in remotes if isinstance(source, Ros2Source)), None)
         signals = stack.enter_context(_caught_signals())
         sender = stack.enter_context(contextlib.closing(UdpSender(out))) if out else None
-        estimator = partial(LiveEstimator, known, window=window, stale_after=stale_after, start=start, on_notice=notify)
+        estimator = partial(
+            LiveEstimator, configured, window=window, stale_after=stale_after, start=start, on_notice=notify
+        )
         gc.freeze()  # what is here stays: looking through it again and again would take longer than an estimate may
-        for doubt in known.arm.doubts() + ([] if known.robot else known.arm.joint_doubts()):
+        for doubt in configured.arm.doubts() + ([] if configured.robot else configured.arm.joint_doubts()):
             notify(doubt)
-        recorder = Recorder(record, known, start, notify) if record else None
+        recorder = Recorder(record, configured, start, notify) if record else None
         live = estimator(event_log=recorder)
         if recorder is not None:
             stack.callback(lambda: recorder.close(live.sure))
@@ -117,7 +121,7 @@ def run(
         if rerun:
             from ..views.live import LiveView
 
-            views.append(stack.enter_context(contextlib.closing(LiveView(rerun, known, notify))))
+            views.append(stack.enter_context(contextlib.closing(LiveView(rerun, configured, notify))))
         if ros is not None:
             views.append(Ros2Estimates(ros, live))
         write = sender or _output(published=ros is not None, status=status)
@@ -132,7 +136,7 @@ def run(
             if left := _listen(remote, feeder, signals):
                 notify(f"{left} lines had come and were not taken in any more: the end was asked for")
         else:
-            for items in standard_input() if recorded is None else replayed(recorded, known, alone.speed):
+            for items in standard_input() if recorded is None else replayed(recorded, configured, alone.speed):
                 feeder.take(items)
                 if signals:
                     break
@@ -278,10 +282,15 @@ def status(stream: Stream, summaries: Sequence[Callable[[], str]] = (), now: int
 def _sensor_table(live: LiveEstimator, now: int | None) -> Table:
     """Rate, lateness, dropouts and NIS of each sensor, and its components by outcome."""
     sensors = live.health(now).sensors
-    words = [one.word for one in Outcome if any(sensor.outcomes[one.word] for sensor in sensors.values())]
+    words = [outcome.word for outcome in Outcome if any(sensor.outcomes[outcome.word] for sensor in sensors.values())]
     rows = [
-        [name, *cells(one, _SENSOR), "stale" if one.stale else "", *(str(one.outcomes[word]) for word in words)]
-        for name, one in sensors.items()
+        [
+            name,
+            *cells(sensor, _SENSOR),
+            "stale" if sensor.stale else "",
+            *(str(sensor.outcomes[word]) for word in words),
+        ]
+        for name, sensor in sensors.items()
     ]
     made = table(["sensor", *_SENSOR, "", *words], rows)
     made.caption = "outcomes count components: each axis of a row by itself"

@@ -417,7 +417,12 @@ def _unexpected(error: Exception) -> str:
     from importlib.metadata import version
 
     frames, package = list(traceback.walk_tb(error.__traceback__)), Path(__file__).parents[1]
-    paths = [one for frame, _ in frames for one in frame.f_locals.values() if isinstance(one, Path) and one.exists()]
+    paths = [
+        f_local
+        for frame, _ in frames
+        for f_local in frame.f_locals.values()
+        if isinstance(f_local, Path) and f_local.exists()
+    ]
     read = f", reading {paths[-1]}" if paths else ""
     files = [(Path(frame.f_code.co_filename), line) for frame, line in frames]
     where = [f"{file.relative_to(package)}:{line}" for file, line in files if file.is_relative_to(package)]

@@ -105,8 +105,8 @@ def report_failures(failed: Mapping[str, str], count: int, where: Path) -> None:
     for name, problem in failed.items():
         say(f"pumafuse: {name}: {problem}", err=True)
     if failed:
-        rest = "" if len(failed) == count else f"; the others are in {where}"
-        raise PumafuseError(f"{len(failed)} of {count} runs failed (see above){rest}")
+        kept = "" if len(failed) == count else f"; the others are in {where}"
+        raise PumafuseError(f"{len(failed)} of {count} runs failed (see above){kept}")
 
 
 def _guarded(name: str, job: Callable[[], R]) -> tuple[str, R | None, str | None]:

@@ -22,7 +22,7 @@ from .tables import print_tables, table
 
 SUMMARY = "registration.json"
 _OURS = frozenset({SUMMARY, "fusion.toml", ARM_FILE, ROBOT_FILE})
-_MENDED = {one.value for one in AS_READ}  # findings after which run.toml is to be mended
+_MENDED = {finding.value for finding in AS_READ}  # findings after which run.toml is to be mended
 _NOT_ALL = 3  # exit code: some sensor was not registered
 
 
@@ -39,51 +39,57 @@ def run(
     """Register sensors and write the configuration; the arguments are the options of the command."""
     if output is not None:
         folders.check_writable(output, force, [SUMMARY], _OURS.__contains__)
-    given = None if config is None else FusionConfig.load(config)
+    configured = None if config is None else FusionConfig.load(config)
     runs = [Run.read(path).between(*part) for path in paths]
     with Console(stderr=True).status("looking for frames and markers"):
-        found = register(runs, given, sensor=sensor, fix=fix)
+        registration = register(runs, configured, sensor=sensor, fix=fix)
     if output is not None:
         with folders.replacing(output) as new:
-            found.config.save(new)
-            (new / SUMMARY).write_text(found.to_json(), encoding="utf-8")
+            registration.config.save(new)
+            (new / SUMMARY).write_text(registration.to_json(), encoding="utf-8")
     if json:
-        say(found.to_json().removesuffix("\n"))
+        say(registration.to_json().removesuffix("\n"))
     else:
-        show(found.details)
+        show(registration.details)
         if output is not None:
             folder = shlex.quote(str(output))
-            first = any(_MENDED.intersection(one.findings) for one in found.details.sensors.values())
+            first = any(_MENDED.intersection(sensor.findings) for sensor in registration.details.sensors.values())
             after = "mend run.toml as said above, and register anew" if first else None
             say(f"written to {output}\nnext: {after or f'pumafuse fuse RUN -c {folder}/fusion.toml -o DIR'}")
-    if any(one.frame is None for one in found.details.sensors.values()):
+    if any(sensor.frame is None for sensor in registration.details.sensors.values()):
         raise typer.Exit(_NOT_ALL)
 
 
-def show(found: RegistrationSummary) -> None:
+def show(registration_summary: RegistrationSummary) -> None:
     """Print what was found of each sensor on stdout."""
-    for name, one in found.sensors.items():
-        _show(name, one)
-    if found.joints:
+    for name, sensor in registration_summary.sensors.items():
+        _show(name, sensor)
+    if registration_summary.joints:
         say("joints do not answer alike; each is later than the one that answers first by")
-        rows = [[n, f"{one.later * MS:.2f}", _limits(one.later_ci95, MS, ".2f")] for n, one in found.joints.items()]
+        rows = [
+            [n, f"{joint.later * MS:.2f}", _limits(joint.later_ci95, MS, ".2f")]
+            for n, joint in registration_summary.joints.items()
+        ]
         print_tables([table(["joint", "later_ms", "95 % interval"], rows)])
 
 
-def _show(name: str, one: RegisteredSensor) -> None:
+def _show(name: str, registered: RegisteredSensor) -> None:
     """Print what was found of one sensor."""
-    if one.frame is None or one.marker is None or one.lag is None:
+    if registered.frame is None or registered.marker is None or registered.lag is None:
         say(f"{name}: not registered")
         return
-    turned = "" if one.angular_rms is None else f" and {one.angular_rms * DEG:.3g}°"
-    say(f"{name}: {one.rows} measurements; left over {(one.rms or 0.0) * MM:.3g} mm{turned} RMS")
-    rows = [*_places("frame", one.frame), *_places("marker", one.marker)]
-    rows.append(["lag, ms", f"{one.lag * MS:.2f}", _limits(one.lag_ci95, MS, ".2f")])
-    if one.latency is not None:
-        rows.append(["latency_ms", f"{one.latency * MS:.2f}", _limits(one.latency_ci95, MS, ".2f")])
+    turned = "" if registered.angular_rms is None else f" and {registered.angular_rms * DEG:.3g}°"
+    say(f"{name}: {registered.rows} measurements; left over {(registered.rms or 0.0) * MM:.3g} mm{turned} RMS")
+    rows = [*_places("frame", registered.frame), *_places("marker", registered.marker)]
+    rows.append(["lag, ms", f"{registered.lag * MS:.2f}", _limits(registered.lag_ci95, MS, ".2f")])
+    if registered.latency is not None:
+        rows.append(["latency_ms", f"{registered.latency * MS:.2f}", _limits(registered.latency_ci95, MS, ".2f")])
     print_tables([table(["number", "found", "95 % interval"], rows)])
-    if one.latency is not None and one.latency_ci95 == (one.latency, one.latency):
-        say(taken(name, one.latency))
+    if registered.latency is not None and registered.latency_ci95 == (
+        registered.latency,
+        registered.latency,
+    ):
+        say(taken(name, registered.latency))
 
 
 def taken(name: str, latency: float) -> str:
@@ -94,11 +100,11 @@ def taken(name: str, latency: float) -> str:
     )
 
 
-def _places(what: str, found: Registered) -> list[list[str]]:
+def _places(what: str, registered: Registered) -> list[list[str]]:
     """Rows of a place and an orientation."""
-    parts = [("at_mm", found.at, found.at_ci95, MM)]
-    if what == "frame" or any(found.rotation):
-        parts.append(("rotation_vector_deg", found.rotation, found.rotation_ci95, DEG))
+    parts = [("at_mm", registered.at, registered.at_ci95, MM)]
+    if what == "frame" or any(registered.rotation):
+        parts.append(("rotation_vector_deg", registered.rotation, registered.rotation_ci95, DEG))
     return [
         [f"{what}.{key}, {axis}", f"{value * scale:.3f}", _limits(interval, scale, ".3f")]
         for key, values, limits, scale in parts

@@ -11,11 +11,11 @@ import typer
 
 def say(text: str, *, err: bool = False) -> None:
     """Print a text on standard output, or on standard error, without control characters but ends of lines."""
-    typer.echo("".join(one if one.isprintable() or one == "\n" else "?" for one in text), err=err)
+    typer.echo("".join(letter if letter.isprintable() or letter == "\n" else "?" for letter in text), err=err)
 
 
 def say_json(tree: Any) -> None:
     """Print a tree of dictionaries, lists and structs on standard output."""
     encoded = msgspec.json.Encoder(decimal_format="number").encode(tree)
     text = msgspec.json.format(encoded, indent=2).decode()
-    say("".join(one if one.isprintable() or one == "\n" else json.dumps(one)[1:-1] for one in text))
+    say("".join(letter if letter.isprintable() or letter == "\n" else json.dumps(letter)[1:-1] for letter in text))

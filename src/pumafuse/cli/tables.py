@@ -49,8 +49,8 @@ _ORIENTATION: Columns = {
 
 def console(file: TextIO) -> Console:
     """A stream for people: 120 columns wide where it is no terminal; nowhere if it is closed, which makes it None."""
-    there = file or StringIO()
-    return Console(file=there, highlight=False, emoji=False, width=None if there.isatty() else 120)
+    target = file or StringIO()
+    return Console(file=target, highlight=False, emoji=False, width=None if target.isatty() else 120)
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> Table:
@@ -83,11 +83,11 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | N
 
 def print_tables(tables: Iterable[Table], stream: Literal["stdout", "stderr"] = "stdout") -> None:
     """Print the tables that have anything in them, whole, however narrow the screen is."""
-    for one in tables:
-        if one.columns:
+    for table in tables:
+        if table.columns:
             out = console(getattr(sys, stream))
-            out.width = max(out.width, out.measure(one, options=out.options.update(width=_WIDEST)).minimum)
-            out.print(one, crop=False)
+            out.width = max(out.width, out.measure(table, options=out.options.update(width=_WIDEST)).minimum)
+            out.print(table, crop=False)
 
 
 def number(value: float | None, form: str = ".3f") -> str:
@@ -112,29 +112,31 @@ def headings(columns: Columns, kind: Kind) -> list[str]:
 
 def cells(row: object, columns: Columns, kind: Kind = "length") -> list[str]:
     """The attributes of ``row`` as text."""
-    found = ((getattr(row, name), form, scale) for name, form, scale in columns.values())
+    values = ((getattr(row, name), form, scale) for name, form, scale in columns.values())
     of_positions = SCREEN[kind].scale
     return [
         "–" if value is None else format(value * (of_positions if scale is None else scale), form)
-        for value, form, scale in found
+        for value, form, scale in values
     ]
 
 
 def outcome_table(summary: Summary, kind: Kind) -> Table:
     """Components by outcome, innovations and their expected size, for each axis of a kind and sensor."""
-    sensors = [(axis, name, one) for _, axis, _, name, one in _sensors([("", summary)], kind)]
-    words = sorted({word for *_, one in sensors for word in one.outcomes}, key=lambda word: (word != "fused", word))
+    sensors = [(axis, name, sensor) for _, axis, _, name, sensor in _sensors([("", summary)], kind)]
+    words = sorted(
+        {word for *_, sensor in sensors for word in sensor.outcomes}, key=lambda word: (word != "fused", word)
+    )
     rows = [
         [
             axis,
             name,
-            *(str(one.outcomes.get(word, 0)) for word in words),
-            position(one.innovation_rms, kind),
-            position(one.innovation_sd, kind),
-            interval(one.bias, one.bias_sd, kind),
-            one.verdict,
+            *(str(sensor.outcomes.get(word, 0)) for word in words),
+            position(sensor.innovation_rms, kind),
+            position(sensor.innovation_sd, kind),
+            interval(sensor.bias, sensor.bias_sd, kind),
+            sensor.verdict,
         ]
-        for axis, name, one in sensors
+        for axis, name, sensor in sensors
     ]
     unit = SCREEN[kind].unit
     of_positions = (f"innovation, {unit}", f"expected, {unit}", f"bias, {unit}")
@@ -158,9 +160,15 @@ def skill_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:
         return f"{position(error.rms, kind)} / {position(error.median, kind)}"
 
     rows = [
-        [name, axis, sensor, str(one.skill.predictions), *map(prediction, msgspec.structs.astuple(one.skill)[1:])]
-        for name, axis, _, sensor, one in _sensors(results, kind)
-        if one.skill is not None
+        [
+            name,
+            axis,
+            sensor,
+            str(of_sensor.skill.predictions),
+            *map(prediction, msgspec.structs.astuple(of_sensor.skill)[1:]),
+        ]
+        for name, axis, _, sensor, of_sensor in _sensors(results, kind)
+        if of_sensor.skill is not None
     ]
     by = ["last one\nheld", "constant\nvelocity", "command\nalone", "this\nfilter"]
     title = f"Error of predicting the next measurement, RMS / median in {SCREEN[kind].unit}, by …"
@@ -170,8 +178,15 @@ def skill_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:
 def consistency_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:
     """What each result says of itself on axes of a kind: likelihood, and of each sensor NIS and the share rejected."""
     rows = [
-        [name, axis, f"{part.log_likelihood:.1f}", sensor, number(one.nis_mean), number(share_rejected(one), ".1%")]
-        for name, axis, part, sensor, one in _sensors(results, kind)
+        [
+            name,
+            axis,
+            f"{part.log_likelihood:.1f}",
+            sensor,
+            number(of_sensor.nis_mean),
+            number(share_rejected(of_sensor), ".1%"),
+        ]
+        for name, axis, part, sensor, of_sensor in _sensors(results, kind)
     ]
     return table(["result", "axis", "log-likelihood", "sensor", "NIS", "rejected"], rows)
 
@@ -183,7 +198,9 @@ def _sensors(
     for name, summary in results:
         for axis, part in summary.axes.items():
             if part.kind == kind:
-                yield from ((name, axis, part, sensor, one) for sensor, one in part.sensors.items())
+                yield from (
+                    (name, axis, part, sensor, sensor_summary) for sensor, sensor_summary in part.sensors.items()
+                )
 
 
 def share_rejected(sensor: SensorSummary) -> float | None:
@@ -196,9 +213,9 @@ def share_rejected(sensor: SensorSummary) -> float | None:
 def score_table(results: Iterable[tuple[str, Summary, Mapping[str, ScoreSummary]]], kind: Kind) -> Table:
     """Scores by axis against a reference, for each result and axis of a kind; of the velocity where there is one."""
     rows = [
-        [name, axis, *cells(one, _SCORE, kind)]
+        [name, axis, *cells(score, _SCORE, kind)]
         for name, summary, scores in results
-        for axis, one in scores.items()
+        for axis, score in scores.items()
         if summary.axes[axis].kind == kind
     ]
     return table(["result", "axis", *headings(_SCORE, kind)], rows)
@@ -206,18 +223,23 @@ def score_table(results: Iterable[tuple[str, Summary, Mapping[str, ScoreSummary]
 
 def orientation_table(results: Iterable[tuple[str, OrientationScore | None]]) -> Table:
     """The angle between estimated and reference orientation of each result, where there is one."""
-    rows = [[name, *cells(one, _ORIENTATION)] for name, one in results if one is not None]
+    rows = [[name, *cells(score, _ORIENTATION)] for name, score in results if score is not None]
     return table(["result", *_ORIENTATION], rows)
 
 
 def runs_table(results: Mapping[str, Summary], kind: Kind) -> Table:
     """Many results: lines for each of up to 20 by name, and for each axis of a kind all of them together."""
-    axes = {name: [axis for axis, one in given.axes.items() if one.kind == kind] for name, given in results.items()}
+    axes = {
+        name: [axis for axis, axis_summary in result.axes.items() if axis_summary.kind == kind]
+        for name, result in results.items()
+    }
     rows: list[list[str]] = []
     if len(results) <= _FEW_RUNS:
-        rows += [[name, axis, *_pooled([one], axis, kind)] for name, one in results.items() for axis in axes[name]]
-    for axis in dict.fromkeys(axis for mine in axes.values() for axis in mine):
-        having = [one for name, one in results.items() if axis in axes[name]]
+        rows += [
+            [name, axis, *_pooled([result], axis, kind)] for name, result in results.items() for axis in axes[name]
+        ]
+    for axis in dict.fromkeys(axis for names in axes.values() for axis in names):
+        having = [result for name, result in results.items() if axis in axes[name]]
         rows.append([f"all {len(having)}", axis, *_pooled(having, axis, kind)])
     unit = SCREEN[kind].unit
     scores = (f"RMSE, {unit}", f"worst, {unit}", "95 % coverage", "NEES")
@@ -230,15 +252,17 @@ def _pooled(summaries: Sequence[Summary], axis: str, kind: Kind) -> list[str]:
     scores = [part.score for part in parts if part.score is not None]
     sensors = [sensor for part in parts for sensor in part.sensors.values()]
     fused, rejected = ([sensor.outcomes.get(word, 0) for sensor in sensors] for word in ("fused", "rejected"))
-    score = pooled(scores, [one.rows for one in scores])
+    score = pooled(scores, [score.rows for score in scores])
     skills = [sensor.skill for sensor in sensors if sensor.skill is not None]
     return [
         position(score and score.rmse, kind),
-        position(max((one.rmse for one in scores), default=None), kind),
+        position(max((score.rmse for score in scores), default=None), kind),
         number(score and score.coverage, ".1%"),
         number(score and score.nees_mean, ".2f"),
         number(weighted_mean([sensor.nis_mean for sensor in sensors], fused), ".2f"),
-        number(weighted_mean([one.of_best_other for one in skills], [one.predictions for one in skills]), ".2f"),
+        number(
+            weighted_mean([skill.of_best_other for skill in skills], [skill.predictions for skill in skills]), ".2f"
+        ),
         str(sum(fused)),
         str(sum(rejected)),
         str(sum(len(summary.notes) for summary in summaries)),

@@ -52,13 +52,13 @@ def run(
         kinds = kinds_of(fit)
     except ConfigError as error:
         raise typer.BadParameter(str(error)) from None
-    given = FusionConfig.load(config)
+    configured = FusionConfig.load(config)
     runs = [Run.read(path).between(*part) for path in paths]
     other = None if validate is None else Run.read(validate)
     with fitting() as progress:
-        found = tune(
+        tuning = tune(
             runs,
-            given,
+            configured,
             fit=kinds,
             fix=fix,
             share=[share] if share else [],
@@ -69,18 +69,18 @@ def run(
             progress=progress,
         )
     with folders.replacing(output) as new:
-        found.config.save(new)
-        (new / SUMMARY).write_text(found.to_json(), encoding="utf-8")
+        tuning.config.save(new)
+        (new / SUMMARY).write_text(tuning.to_json(), encoding="utf-8")
         if report:
             from ..views.tuning_report import page
 
-            (new / PAGE).write_text(page(found, runs), encoding="utf-8")
+            (new / PAGE).write_text(page(tuning, runs), encoding="utf-8")
     if json:
-        say(found.to_json().removesuffix("\n"))
+        say(tuning.to_json().removesuffix("\n"))
     else:
-        _show(found.details, found.config.arm.update_period)
+        _show(tuning.details, tuning.config.arm.update_period)
         say(f"written to {output}\nnext: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR")
-    end(found.details)
+    end(tuning.details)
 
 
 def end(summary: TuningSummary) -> None:
@@ -120,19 +120,20 @@ def _show(summary: TuningSummary, period: float) -> None:
     lines += [formatting.together(pair) for pair in pairs[:_PAIRS]]
     if len(pairs) > _PAIRS:
         lines.append(f"and {len(pairs) - _PAIRS} more pairs: `correlations` in {SUMMARY}")
-    for one in summary.biases:
-        off = f"{interval(one.bias, one.sd, one.kind)} {SCREEN[one.kind].unit}"
-        lines.append(f"{one.run}: {one.sensor} is off by {off} on {one.axis}")
+    for bias in summary.biases:
+        off = f"{interval(bias.bias, bias.sd, bias.kind)} {SCREEN[bias.kind].unit}"
+        lines.append(f"{bias.run}: {bias.sensor} is off by {off} on {bias.axis}")
     for line in lines:
         say(line)
     likelihood = [
-        [axis, str(one.components), f"{one.before:.1f}", f"{one.after:.1f}"] for axis, one in summary.likelihood.items()
+        [axis, str(likelihood.components), f"{likelihood.before:.1f}", f"{likelihood.after:.1f}"]
+        for axis, likelihood in summary.likelihood.items()
     ]
     print_tables([table(["fitted on", "measurements", "log-likelihood before", "after"], likelihood)])
     validation = [
-        [one.run, one.axis, *of_sensor[:1], one.rmse, one.coverage, *of_sensor[1:]]
-        for one in map(formatting.validated, summary.validation or ())
-        for of_sensor in zip(one.sensors, one.nis, one.correlation, strict=True)
+        [check.run, check.axis, *of_sensor[:1], check.rmse, check.coverage, *of_sensor[1:]]
+        for check in map(formatting.validated, summary.validation or ())
+        for of_sensor in zip(check.sensors, check.nis, check.correlation, strict=True)
     ]
     headings = ["validated on", "axis", "sensor", "RMSE", "coverage", "NIS", "correlation at lag 1"]
     print_tables([table(headings, validation)])

@@ -36,17 +36,17 @@ def run(
     model = ArmModel.load(arm)
     warn(model.doubts())
     levels = {axis: si(level, f"_{model.screen_of(axis).unit}") for axis, level in start.items()}
-    found = [one for path in paths for one in verify(Run.read(path), model, sensors=sensors, start=levels)]
+    results = [result for path in paths for result in verify(Run.read(path), model, sensors=sensors, start=levels)]
     if report is not None:
-        reports.write_verification(found, model, report, force)
-    verified = [verification for verification, _ in found]
-    warn(f"run '{one.run}': {note}" for one in verified for note in one.notes)
+        reports.write_verification(results, model, report, force)
+    verified = [verification for verification, _ in results]
+    warn(f"run '{result.run}': {note}" for result in verified for note in result.notes)
     if json:
-        say_json([toml.reported(one, one.kind) for one in verified])
+        say_json([toml.reported(result, result.kind) for result in verified])
     else:
         print_tables(table(*of_kind) for of_kind in reports.verifications(verified))
         say("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
         if report is not None:
             say(f"written to {report}")
-    if not all(one.holds for one in verified):
+    if not all(result.holds for result in verified):
         raise typer.Exit(_FAILED)

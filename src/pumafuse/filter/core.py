@@ -110,7 +110,7 @@ def _loaded() -> ctypes.CDLL:
         library.pf_error.restype = ctypes.c_char_p
         for name, (result, *arguments) in _FUNCTIONS.items():
             function = getattr(held if name.startswith("live_") else library, f"pf_{name}")
-            function.restype, function.argtypes = _KINDS.get(result), [_KINDS[one] for one in arguments]
+            function.restype, function.argtypes = _KINDS.get(result), [_KINDS[argument] for argument in arguments]
             setattr(library, f"pf_{name}", function)
     except (OSError, AttributeError) as error:
         raise PumafuseError(f"{LIBRARY}: the filter's core does not load ({error}): {again}") from None
@@ -196,15 +196,15 @@ class Filter(Handle):
         Returns:
             Outputs by :class:`Output`, axis and time, (8, A, n).
         """
-        outputs, (table, found) = np.zeros((len(Output), self._axes, len(times))), _tables(events, results)
+        outputs, (table, rows) = np.zeros((len(Output), self._axes, len(times))), _tables(events, results)
         ends, asked = span or (0, len(events.time)), (len(times), at(times), at(outputs))
-        checked(library.pf_filter_run(self._core, _MODES.index(mode), table, *ends, found, *asked))
+        checked(library.pf_filter_run(self._core, _MODES.index(mode), table, *ends, rows, *asked))
         return outputs
 
     def bias(self, sensor: int, axis: int) -> tuple[float, float] | None:
         """Mean and sd [m] of the constant bias of a sensor on an axis; None where none is in the state."""
-        found = (ctypes.c_double * 2)()
-        return (found[0], found[1]) if library.pf_filter_bias(self._core, sensor, axis, found) else None
+        state = (ctypes.c_double * 2)()
+        return (state[0], state[1]) if library.pf_filter_bias(self._core, sensor, axis, state) else None
 
 
 def linearise(
@@ -230,17 +230,17 @@ def classify(model: Model, events: Events, origin: int, too_late: BoolArray) -> 
 
     ``origin`` is the first command's stamp [ns]; rows that are ``too_late``, (n,), come far behind earlier ones.
     """
-    known = np.empty_like(events.known)
+    codes = np.empty_like(events.known)
     structs = ctypes.byref(struct_of(model)), ctypes.byref(_events_of(events))
-    library.pf_classify(*structs, origin, at(too_late), at(known))
-    return known
+    library.pf_classify(*structs, origin, at(too_late), at(codes))
+    return codes
 
 
 def transition(axis: Record, dt: float) -> FloatArray:
     """What an axis (1,) does over ``dt`` [s]: see ``pf_transition``, (17,)."""
-    found = np.empty(17)
-    library.pf_transition(at(axis), dt, at(found))
-    return found
+    numbers = np.empty(17)
+    library.pf_transition(at(axis), dt, at(numbers))
+    return numbers
 
 
 def constant_velocity(

@@ -43,8 +43,8 @@ class Events(NamedTuple):
     def empty(axes: int, events: int = 0) -> Events:
         """Room for some events that give nothing."""
         time, table = np.zeros(events, dtype=np.int64), np.zeros((events, axes))
-        known = np.full((events, axes), ABSENT, dtype=np.uint8)
-        return Events(time, np.zeros(events, dtype=np.int16), time.copy(), table, np.zeros((0, axes)), known)
+        values_there = np.full((events, axes), ABSENT, dtype=np.uint8)
+        return Events(time, np.zeros(events, dtype=np.int16), time.copy(), table, np.zeros((0, axes)), values_there)
 
     def rows(self, chosen: IntArray | slice) -> Events:
         """Some of the events, in the order of ``chosen``."""
@@ -60,8 +60,8 @@ class Events(NamedTuple):
 
     def columns(self, axes: list[int]) -> Events:
         """The events with the values of some axes alone."""
-        value, spread, known = (np.ascontiguousarray(part[:, axes]) for part in (self.value, self.spread, self.known))
-        return self._replace(value=value, spread=spread, known=known)
+        value, spread, codes = (np.ascontiguousarray(part[:, axes]) for part in (self.value, self.spread, self.known))
+        return self._replace(value=value, spread=spread, known=codes)
 
 
 class Results(NamedTuple):

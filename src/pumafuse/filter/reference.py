@@ -199,15 +199,15 @@ class Axis:
         nu = math.remainder(z - level - H @ x, view["turn"] or math.inf)
         return Innovation(self.time, nu, H @ P @ H + R, R)
 
-    def fuse(self, s: int, found: Innovation, reacquires: bool) -> float:
+    def fuse(self, s: int, innovation: Innovation, reacquires: bool) -> float:
         """Fuse a measurement; where it re-acquires, the offset may have moved by ν before. Returns √S."""
         if reacquires:
-            self.kf.P[OFFSET, OFFSET] += (found.nu / self.sensors[s]["scale"]) ** 2
-        self.kf.update(self.H[s] @ self.kf.x + found.nu, R=found.R, H=self.H[s : s + 1])
+            self.kf.P[OFFSET, OFFSET] += (innovation.nu / self.sensors[s]["scale"]) ** 2
+        self.kf.update(self.H[s] @ self.kf.x + innovation.nu, R=innovation.R, H=self.H[s : s + 1])
         missed = self.sensors[s]["scale"] * self.moved_by() - self.by @ self.H[s]  # how ν changes
         self.by = self.by + np.outer(missed, self.kf.K)
         self.kf.P = 0.5 * (self.kf.P + self.kf.P.T)  # or rounding leads away from symmetry, over a million steps
-        self.gate.fuse(s, found.time, reacquires)
+        self.gate.fuse(s, innovation.time, reacquires)
         return math.sqrt(self.kf.S[0, 0])
 
     def moved_by(self) -> FloatArray:
@@ -277,12 +277,12 @@ class Gate:
                 return other
         return NOBODY
 
-    def reject(self, s: int, found: Innovation, too_soon: bool) -> None:
+    def reject(self, s: int, innovation: Innovation, too_soon: bool) -> None:
         """Remember a measurement, unless it comes too soon after one that is remembered."""
         if s in self.rejected and self.unsettled < NEVER:
-            self.unsettled = found.time
+            self.unsettled = innovation.time
         if s not in self.rejected or not too_soon:
-            self.rejected[s] = found
+            self.rejected[s] = innovation
 
     def fuse(self, s: int, time: int, reacquires: bool) -> None:
         """Forget what was rejected; and re-acquisitions, once all sensors have agreed for long."""
@@ -303,9 +303,9 @@ class Filter:
         self.sensors, self.events, self.decides = model.sensor, events, events.known == Outcome.FUSED
         self.axes: list[Axis] = []
         for a, plant in enumerate(plants):
-            mine = self.decides[:, a] & (events.source == COMMAND)
-            given = np.searchsorted(events.stamp[mine], events.time[mine], side="right")
-            in_flight = int((given - np.arange(len(given))).max(initial=0))
+            commands_here = self.decides[:, a] & (events.source == COMMAND)
+            told = np.searchsorted(events.stamp[commands_here], events.time[commands_here], side="right")
+            in_flight = int((told - np.arange(len(told))).max(initial=0))
             self.axes.append(Axis(plant, model.axis[a], model.sensor, model.view[:, a], origin, in_flight))
 
     def run(self, results: Results, times: TimeArray, progress: Callable[[float], None] | None = None) -> FloatArray:
@@ -339,27 +339,27 @@ class Filter:
     def measure(self, row: int, axes: list[int], results: Results) -> None:
         """Axes of a measurement, which pass the gate together or not at all."""
         events, s, time = self.events, int(self.events.source[row]), int(self.events.time[row])
-        gate, found = self.sensors[s]["gate"], dict[int, Innovation]()
+        gate, innovations = self.sensors[s]["gate"], dict[int, Innovation]()
         for a in axes:
             self.axes[a].predict(time)
             spread = events.spread[row, a] if len(events.spread) else 1.0
-            found[a] = self.axes[a].innovation(s, events.value[row, a], spread)
-            results.innovation[row, a], results.innovation_sd[row, a] = found[a].nu, math.sqrt(found[a].S)
-        beyond = [a for a in axes if gate > 0.0 and abs(found[a].nu) > gate * math.sqrt(found[a].S)]
-        agree = [self.axes[a].agrees(s, found[a]) for a in beyond]
+            innovations[a] = self.axes[a].innovation(s, events.value[row, a], spread)
+            results.innovation[row, a], results.innovation_sd[row, a] = innovations[a].nu, math.sqrt(innovations[a].S)
+        beyond = [a for a in axes if gate > 0.0 and abs(innovations[a].nu) > gate * math.sqrt(innovations[a].S)]
+        agree = [self.axes[a].agrees(s, innovations[a]) for a in beyond]
         against = max((self.axes[a].gate.contradicted(s, time) for a in beyond), default=NOBODY)
         if all(agree) and against != NOBODY:
             results.contradicts[row] = against
         for a in axes:
             if all(agree) and against == NOBODY:
                 results.outcome[row, a] = Outcome.REACQUIRED if a in beyond else Outcome.FUSED
-                results.innovation_sd[row, a] = self.axes[a].fuse(s, found[a], reacquires=a in beyond)
+                results.innovation_sd[row, a] = self.axes[a].fuse(s, innovations[a], reacquires=a in beyond)
             else:
                 results.outcome[row, a] = Outcome.REJECTED
-                self.axes[a].gate.reject(s, found[a], too_soon=None in agree)
+                self.axes[a].gate.reject(s, innovations[a], too_soon=None in agree)
 
     def bias(self, sensor: int, axis: int) -> tuple[float, float] | None:
         """Mean and sd [m] of the constant bias of a sensor on an axis; None where none is in the state."""
-        one, i = self.axes[axis], FIRST_BIAS + len(self.sensors) + sensor
-        variance = max(one.kf.P[i, i], 0.0) + float(one.by[:, i] ** 2 @ one.doubts**2)
-        return (float(one.kf.x[i]), max(math.sqrt(variance), FINEST)) if one.views[sensor]["bias_sd"] else None
+        state, i = self.axes[axis], FIRST_BIAS + len(self.sensors) + sensor
+        variance = max(state.kf.P[i, i], 0.0) + float(state.by[:, i] ** 2 @ state.doubts**2)
+        return (float(state.kf.x[i]), max(math.sqrt(variance), FINEST)) if state.views[sensor]["bias_sd"] else None

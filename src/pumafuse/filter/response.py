@@ -12,51 +12,51 @@ from .core import AXIS, MOTION, Record, at, library
 
 def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Record:
     """An axis without noise as the core takes it, (1,): T, Td in s, the level of its rest [m], NaN if not known."""
-    found, plant, gain = np.zeros(1, AXIS), axis.plant, axis.gain
-    found["period"], found["delay"], found["start"] = period, delay, start
+    record, plant, gain = np.zeros(1, AXIS), axis.plant, axis.gain
+    record["period"], record["delay"], record["start"] = period, delay, start
     if isinstance(plant, FirstOrder):
-        found["time_constant"] = plant.time_constant
+        record["time_constant"] = plant.time_constant
     else:
-        found["natural_frequency"], found["damping"] = plant.natural_frequency, plant.damping
-    found["slope"], found["intercept"], found["recovery"] = gain.slope, gain.intercept, axis.gain_recovery or 0.0
-    found["max_speed"], found["play"] = axis.max_speed or 0.0, axis.play or 0.0
+        record["natural_frequency"], record["damping"] = plant.natural_frequency, plant.damping
+    record["slope"], record["intercept"], record["recovery"] = gain.slope, gain.intercept, axis.gain_recovery or 0.0
+    record["max_speed"], record["play"] = axis.max_speed or 0.0, axis.play or 0.0
     if (sag := axis.sag) is not None:
-        found["sag_offset"], found["sag_slope"], found["sag_knee"] = sag.offset, sag.slope, sag.knee or 0.0
-        found["sag_slope_beyond"] = sag.slope if sag.slope_beyond is None else sag.slope_beyond
-        found["sag_knee_below"] = sag.knee_below or 0.0
-        found["sag_slope_below"] = sag.slope if sag.slope_below is None else sag.slope_below
-    return found
+        record["sag_offset"], record["sag_slope"], record["sag_knee"] = sag.offset, sag.slope, sag.knee or 0.0
+        record["sag_slope_beyond"] = sag.slope if sag.slope_beyond is None else sag.slope_beyond
+        record["sag_knee_below"] = sag.knee_below or 0.0
+        record["sag_slope_below"] = sag.slope if sag.slope_below is None else sag.slope_below
+    return record
 
 
 def response(
-    axis: AxisModel, period: float, delay: float, given: TimeArray, command: FloatArray, start: float, time: TimeArray
+    axis: AxisModel, period: float, delay: float, told_at: TimeArray, command: FloatArray, start: float, time: TimeArray
 ) -> FloatArray:
     """The position [m] relative to ``start`` of an axis that rests there until its first command, (n,).
 
-    Period T and delay Td are in s; a command u [m] is ``given`` at int64 ns, ascending, (k,); the position is asked for
-    at each ``time``, int64 ns, ascending, (n,).
+    Period T and delay Td are in s. Each command u [m] is ``told_at`` a time, int64 ns, ascending, (k,). The position is
+    asked for at each ``time``, int64 ns, ascending, (n,).
     """
     position = np.empty(len(time))
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
     record = record_of(axis, period, delay, start)
-    library.pf_response(1, at(record), len(given), at(given), at(command), len(time), at(time), at(position))
+    library.pf_response(1, at(record), len(told_at), at(told_at), at(command), len(time), at(time), at(position))
     return position
 
 
 def at_rest() -> Record:
     """What an axis does before its first command, (1,)."""
-    found = np.zeros(1, MOTION)
-    found["time"] = ALWAYS
-    return found
+    at_rest = np.zeros(1, MOTION)
+    at_rest["time"] = ALWAYS
+    return at_rest
 
 
-def follow(axis: Record, motion: Record, given: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
+def follow(axis: Record, motion: Record, told_at: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
     """The position [m] of an axis from what it does after a command on, (n,).
 
     No bit of it depends on what else is asked for, or on the pieces in which commands come. The axis, (1,), is of
     :func:`record_of`, with a start level of 0; its ``motion``, (1,), becomes that after the last command. A command u
-    [m] relative to the level of its rest is ``given`` at int64 ns, ascending, (k,); ``time`` likewise, (n,).
+    [m] relative to the level of its rest is ``told_at`` at int64 ns, ascending, (k,); ``time`` likewise, (n,).
     """
     position = np.empty(len(time))
-    library.pf_follow(at(axis), at(motion), len(given), at(given), at(command), len(time), at(time), at(position))
+    library.pf_follow(at(axis), at(motion), len(told_at), at(told_at), at(command), len(time), at(time), at(position))
     return position

@@ -69,13 +69,13 @@ class Window(Handle):
         origin = self.port.origin
         return None if origin == NEVER else origin
 
-    def add(self, stamp: int, source: int, given: int, oldest: int) -> bool:
-        """Take in an event whose axes are ``given`` as bits; no event stamped before ``oldest`` will ever come [ns].
+    def add(self, stamp: int, source: int, bits: int, oldest: int) -> bool:
+        """Take in an event whose axes are ``bits`` as bits; no event stamped before ``oldest`` will ever come [ns].
 
         Returns:
             False if to make room the window had to let go of its time.
         """
-        taken = library.pf_live_add(self._core, stamp, source, given, oldest)
+        taken = library.pf_live_add(self._core, stamp, source, bits, oldest)
         return taken > 0 if taken >= 0 else checked(taken)
 
     def estimate(self, time: int, after: int = NEVER) -> list[tuple[list[float], int] | None]:

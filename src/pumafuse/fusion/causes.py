@@ -133,12 +133,12 @@ Evidence: TypeAlias = Mapping[Tried, Weight]
 
 def evidence_of(est: Estimates, axis: str) -> Evidence:
     """What every alternative would gain on one axis."""
-    mine, number = est.measurements, est.measurements.axes.index(axis)
-    decided = (mine.axis == number) & (mine.outcome <= Outcome.REACQUIRED)
+    measured, number = est.measurements, est.measurements.axes.index(axis)
+    decided = (measured.axis == number) & (measured.outcome <= Outcome.REACQUIRED)
     return together(
-        _of_part(_part(est, segment, axis, mine.where(chosen)))
-        for place, segment in enumerate(est.segments)
-        if len(chosen := _middle(est.config, segment, axis, decided & (mine.segment == place))) >= _FEWEST
+        _of_part(_part(est, segment, axis, measured.where(chosen)))
+        for number, segment in enumerate(est.segments)
+        if len(chosen := _middle(est.config, segment, axis, decided & (measured.segment == number))) >= _FEWEST
     )
 
 
@@ -160,30 +160,30 @@ def _needs_commands(config: FusionConfig, axis: str) -> bool:
 
 def together(parts: Iterable[Evidence]) -> Evidence:
     """The evidence of several parts of a run: gains, scores and information add up."""
-    found: dict[Tried, Weight] = {}
+    weights: dict[Tried, Weight] = {}
     for part in parts:
         for tried, weight in part.items():
-            found[tried] = Weight(*map(add, found.get(tried, Weight()), weight))
-    return found
+            weights[tried] = Weight(*map(add, weights.get(tried, Weight()), weight))
+    return weights
 
 
 def suspects(evidence: Evidence) -> tuple[Suspect, ...]:
     """The cause that explains the innovations best, and those that explain them about as well; best first."""
     best: dict[tuple[Cause, str], Suspect] = {}
-    for one in _weighed(evidence):
-        key = _ALIKE.get(one.cause, one.cause), one.sensor
-        if key not in best or one.gain > best[key].gain:
-            best[key] = one
-    ordered = sorted(best.values(), key=lambda one: -one.gain)
+    for weighed in _weighed(evidence):
+        key = _ALIKE.get(weighed.cause, weighed.cause), weighed.sensor
+        if key not in best or weighed.gain > best[key].gain:
+            best[key] = weighed
+    ordered = sorted(best.values(), key=lambda suspect: -suspect.gain)
     if not ordered or ordered[0].gain < _CLEAR:
         return ()
     first = ordered[0]
     least = max(_CLEAR, min(_NEAR * first.gain, first.gain - _CLOSE))
     doubtful = _least_of_correlated(evidence, first)
     return tuple(
-        one
-        for one in ordered[:_LONGEST]
-        if one.gain >= least or (one.cause is Cause.CORRELATED and one.gain > doubtful)
+        suspect
+        for suspect in ordered[:_LONGEST]
+        if suspect.gain >= least or (suspect.cause is Cause.CORRELATED and suspect.gain > doubtful)
     )
 
 
@@ -195,8 +195,10 @@ def _least_of_correlated(evidence: Evidence, first: Suspect) -> float:
     """
     if first.cause not in (Cause.NOISE, Cause.PROCESS) or first.size > 1.0:
         return math.inf
-    mine = [weight for tried, weight in evidence.items() if (tried.cause, tried.sensor) == (first.cause, first.sensor)]
-    return 0.0 if max(mine, key=lambda weight: weight.gain).colour > _COLOURED else first.gain - _CLEAR
+    weights = [
+        weight for tried, weight in evidence.items() if (tried.cause, tried.sensor) == (first.cause, first.sensor)
+    ]
+    return 0.0 if max(weights, key=lambda weight: weight.gain).colour > _COLOURED else first.gain - _CLEAR
 
 
 def _weighed(evidence: Evidence) -> Iterator[Suspect]:
@@ -221,8 +223,10 @@ def _gain_of_shape(weight: Weight) -> float:
     then the variance of all innovations is that of the rest.
     """
     explained = weight.score**2 / weight.information
-    before, rest = weight.squares / weight.number, (weight.squares - explained) / weight.number
-    widened = 0.5 * weight.number * (rest - 1.0 - math.log(rest)) if 1.0 < rest < 1.0 + _REST * (before - 1.0) else 0.0
+    before, after = weight.squares / weight.number, (weight.squares - explained) / weight.number
+    widened = (
+        0.5 * weight.number * (after - 1.0 - math.log(after)) if 1.0 < after < 1.0 + _REST * (before - 1.0) else 0.0
+    )
     return 0.5 * explained + widened
 
 
@@ -286,15 +290,15 @@ class _Part:
 def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -> _Part:
     """Components with the commands that act meanwhile, or without, where these are many and not needed."""
     arm, time = est.config.arm, est.origin + nanoseconds(measured.time)
-    given, command = segment.given(axis)
-    first, last = np.searchsorted(given + round(arm.delay_of(axis) * 1e9), time[[0, -1]]).tolist()
+    told_at, command = segment.given(axis)
+    first, last = np.searchsorted(told_at + round(arm.delay_of(axis) * 1e9), time[[0, -1]]).tolist()
     if last - first > _COMMANDS * len(time) and not _needs_commands(est.config, axis):
         last = first
     start = float(command[first - 1]) if first else segment.start[axis]
     scales = np.array(
         [est.config.sensors[name].scale if name in est.config.sensors else 1.0 for name in measured.sensors]
     )
-    commands = start, given[first:last], command[first:last]
+    commands = start, told_at[first:last], command[first:last]
     return _Part(est.config, segment, axis, measured, time, scales[measured.sensor], *commands)
 
 
@@ -312,20 +316,20 @@ def _of_part(part: _Part) -> Evidence:
     normalised = nu / sd
     density = -np.log(sd) - 0.5 * normalised**2
     gains = (density - density[:, :1]).sum(axis=0)
-    found = dict[Tried, Weight]()
+    weights = dict[Tried, Weight]()
     for column, (tried, _) in enumerate(other, 1):
         asked = [number for number in part.sensors if tried.sensor in ("", measured.sensors[number])]
         colour = sum(_colour(normalised[sensor == number, column]) for number in asked)
-        found[tried] = Weight(gain=float(gains[column]), colour=colour)
+        weights[tried] = Weight(gain=float(gains[column]), colour=colour)
     for column, (tried, move) in enumerate(moves.items(), 1 + len(other)):
         x = (normalised[:, column] - normalised[:, 0]) / move
         score, squares = float(x @ normalised[:, 0]), float(normalised[:, 0] @ normalised[:, 0])
-        found[tried] = Weight(score=score, information=float(x @ x), number=len(x), squares=squares)
+        weights[tried] = Weight(score=score, information=float(x @ x), number=len(x), squares=squares)
     for number in part.sensors:
         for share, times in _TAILS:
             gain = _heavy_tailed(normalised[sensor == number, 0], share, times)
-            found[Tried(Cause.OUTLIERS, measured.sensors[number], times)] = Weight(gain)
-    return found
+            weights[Tried(Cause.OUTLIERS, measured.sensors[number], times)] = Weight(gain)
+    return weights
 
 
 def _model(part: _Part) -> Model:
@@ -349,12 +353,12 @@ def _filtered(part: _Part, models: Sequence[Model], moved: FloatArray) -> tuple[
     values = np.concatenate([np.repeat(part.command[:, None], count, axis=1), value])[order]
     source = np.concatenate([np.full(len(acts), COMMAND, dtype=np.int16), measured.sensor])[order]
     outcome = np.concatenate([np.zeros(len(acts), dtype=np.uint8), measured.outcome])[order]
-    known = np.zeros(values.shape, dtype=np.uint8)
+    codes = np.zeros(values.shape, dtype=np.uint8)
     results = Results.room(*values.shape)
     results.outcome[:] = outcome[:, None]
-    axes, view = np.concatenate([one.axis for one in models]), np.hstack([one.view for one in models])
+    axes, view = np.concatenate([model.axis for model in models]), np.hstack([model.view for model in models])
     core = Filter(Model(axes, models[0].sensor, view), min(part.segment.origin, int(instants[0])))
-    events = Events(instants, source, instants, values, np.zeros((0, count)), known)
+    events = Events(instants, source, instants, values, np.zeros((0, count)), codes)
     core.run(events, results, np.zeros(0, dtype=np.int64), "repeated")
     fused = (source != COMMAND) & (outcome == int(Outcome.FUSED))
     return results.innovation[fused], results.innovation_sd[fused], source[fused]
@@ -366,7 +370,7 @@ def _colour(values: FloatArray) -> float:
     if len(values) <= _LAGS or power == 0.0:
         return 0.0
     products = [float(values[lag:] @ values[:-lag]) for lag in range(1, _LAGS + 1)]
-    return len(values) * sum(one**2 for one in products) / power**2 - _LAGS
+    return len(values) * sum(product**2 for product in products) / power**2 - _LAGS
 
 
 def _heavy_tailed(normalised: FloatArray, share: float, times: float) -> float:
@@ -437,18 +441,18 @@ def _shapes(part: _Part) -> Iterator[tuple[Tried, FloatArray]]:
     yield Tried(Cause.POSITION, only, 0), scale * middle
     if np.ptp(led) > 0.0:
         yield Tried(Cause.POSITION, only, 1), scale * middle**2 / np.ptp(led)
-    least = min(sd for one in part.config.sensors.values() if (sd := one.sd_of(part.axis)))
+    least = min(sd for sensor in part.config.sensors.values() if (sd := sensor.sd_of(part.axis)))
     for half_play in (times * least for times in _PLAYS):
         yield Tried(Cause.PLAY, which=2.0 * half_play), scale * (_with_play(led, half_play) - led)
     for share in _LIMITS:
         farthest = share * float(np.abs(lags[0.0]).max()) * np.diff(time, prepend=time[0]) / 1e9
         yield Tried(Cause.LIMIT, which=share), scale * (_limited(led, farthest) - led)
     for number in used if len(used) > 1 else ():
-        name, mine = measured.sensors[number], measured.sensor == number
+        name, rows = measured.sensors[number], measured.sensor == number
         for which, x in lags.items():
-            yield Tried(Cause.LATENCY, name, which), np.where(mine, scale * x, 0.0)
-        yield Tried(Cause.SCALE, name), np.where(mine, scale * middle, 0.0)
-        yield Tried(Cause.BIAS, name), mine.astype(np.float64)
+            yield Tried(Cause.LATENCY, name, which), np.where(rows, scale * x, 0.0)
+        yield Tried(Cause.SCALE, name), np.where(rows, scale * middle, 0.0)
+        yield Tried(Cause.BIAS, name), rows.astype(np.float64)
 
 
 def _slower(model: AxisModel, factor: float) -> AxisModel:
@@ -463,17 +467,17 @@ def _slower(model: AxisModel, factor: float) -> AxisModel:
 
 def _with_play(drive: FloatArray, half: float) -> FloatArray:
     """Where a tool is that its drive takes along at either end of its play, (m,)."""
-    place, found = float(drive[0]), list[float]()
+    position, driven = float(drive[0]), list[float]()
     for at in drive.tolist():
-        place = min(max(place, at - half), at + half)
-        found.append(place)
-    return np.array(found)
+        position = min(max(position, at - half), at + half)
+        driven.append(position)
+    return np.array(driven)
 
 
 def _limited(drive: FloatArray, farthest: FloatArray) -> FloatArray:
     """Where an axis is that follows, but in each interval no farther than that, (m,)."""
-    place, found = float(drive[0]), list[float]()
+    position, driven = float(drive[0]), list[float]()
     for at, step in zip(drive.tolist(), farthest.tolist(), strict=True):
-        place = min(max(at, place - step), place + step)
-        found.append(place)
-    return np.array(found)
+        position = min(max(at, position - step), position + step)
+        driven.append(position)
+    return np.array(driven)

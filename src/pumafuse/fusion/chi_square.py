@@ -29,15 +29,15 @@ def tail(degrees: int, x: float) -> float:
         return 1.0 - front * total
     b = y + 1.0 - a
     c, d = math.inf, 1.0 / b
-    found, k, ratio = d, 0.0, 0.0
+    share, k, ratio = d, 0.0, 0.0
     while abs(ratio - 1.0) > _ENOUGH:
         k += 1.0
         b += 2.0
         d = 1.0 / (b - k * (k - a) * d)
         c = b - k * (k - a) / c
         ratio = c * d
-        found *= ratio
-    return front * found
+        share *= ratio
+    return front * share
 
 
 @lru_cache(maxsize=1024)

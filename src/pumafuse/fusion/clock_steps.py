@@ -75,8 +75,8 @@ class _Side(NamedTuple):
         size = len(self.grid.time) - 2 * self.grid.margin
         part = np.arange(size) * _PARTS // size
         each = list[float]()
-        for one in range(_PARTS):
-            measured = {axis: np.where(part == one, np.nan, value) for axis, value in self.measured.items()}
+        for number in range(_PARTS):
+            measured = {axis: np.where(part == number, np.nan, value) for axis, value in self.measured.items()}
             each.append(best_shift(lateness(measured, self.led, self.grid), self.grid))
         return math.sqrt(_PARTS - 1) * float(np.std(each))
 
@@ -86,14 +86,14 @@ def clock_steps(segment: Segment, arm: ArmModel, valid: TimeArray, positions: Ma
 
     Its rows are ``valid`` at these instants, also those that measure nothing, ascending [ns], (n,).
     """
-    found, every, edges = list[ClockStep](), leaps(valid), list[int]()
+    steps, every, edges = list[ClockStep](), leaps(valid), list[int]()
     while every:
         likely = [step for leap in every if (step := _clock_step(segment, arm, positions, leap, edges))]
         if likely:  # near a clock that was set, an outage looks like another one until rows beyond are left out
-            found.append(max(likely, key=lambda step: abs(step.change) / step.error))
-            edges += [found[-1].leap.last, found[-1].leap.first]
-        every = [step.leap for step in likely if step is not found[-1]]
-    return sorted(found, key=lambda one: one.leap.first)
+            steps.append(max(likely, key=lambda step: abs(step.change) / step.error))
+            edges += [steps[-1].leap.last, steps[-1].leap.first]
+        every = [step.leap for step in likely if step is not steps[-1]]
+    return sorted(steps, key=lambda step: step.leap.first)
 
 
 def leaps(stamp: TimeArray) -> list[Leap]:
@@ -132,7 +132,7 @@ def _clock_step(
     if earlier is None or later is None:
         return None
     left = lateness(*earlier), lateness(*later)  # log of the share of motion that is left at each shift, (2m + 1,)
-    before, after = (best_shift(one, earlier.grid) for one in left)
+    before, after = (best_shift(unexplained, earlier.grid) for unexplained in left)
     if not all(map(_follows, left)):
         return None
     if _gain(left[0], before, after) < _BETTER or _gain(left[1], after, before) < _BETTER:
@@ -147,10 +147,10 @@ def _side(segment: Segment, arm: ArmModel, positions: Mapping[str, Rows], begin:
     """What is measured between two instants [ns]; None where that is too little."""
     rows = dict[str, Rows]()
     for axis, (valid, position) in positions.items():
-        mine = slice(*np.searchsorted(valid, (begin, end + 1)).tolist())
-        alike = without_spikes(position[mine])
+        rows_here = slice(*np.searchsorted(valid, (begin, end + 1)).tolist())
+        alike = without_spikes(position[rows_here])
         if np.count_nonzero(alike) >= _FEW:
-            rows[axis] = valid[mine][alike], position[mine][alike]
+            rows[axis] = valid[rows_here][alike], position[rows_here][alike]
     if not rows:
         return None
     first, last = min(int(valid[0]) for valid, _ in rows.values()), max(int(valid[-1]) for valid, _ in rows.values())
@@ -158,20 +158,20 @@ def _side(segment: Segment, arm: ArmModel, positions: Mapping[str, Rows], begin:
         return None
     grid = Grid.around(first, (last - first) / 1e9, _BIN, round(_REACH / _BIN))
     led = {axis: segment.led(arm, axis, grid.time) for axis in rows}
-    return _Side({axis: grid.mean(*one) for axis, one in rows.items()}, led, grid)
+    return _Side({axis: grid.mean(*row) for axis, row in rows.items()}, led, grid)
 
 
 def _follows(unexplained: FloatArray) -> bool:
     """Whether a sensor follows at the best shift and beside it: where little is commanded there may be no valley."""
-    place = int(np.argmin(unexplained))
-    return float(np.pad(unexplained, 1)[place : place + 3].max()) < _FOLLOWS
+    lag = int(np.argmin(unexplained))
+    return float(np.pad(unexplained, 1)[lag : lag + 3].max()) < _FOLLOWS
 
 
-def _gain(unexplained: FloatArray, own: float, other: float) -> float:
+def _gain(unexplained: FloatArray, gain_here: float, other: float) -> float:
     """By how much more is left about another lateness than at its own [s], log.
 
     About: within a third of the way, as a motion that repeats itself looks alike at another lateness.
     """
     shift = _BIN * np.arange(-(len(unexplained) // 2), len(unexplained) // 2 + 1)
-    about = np.abs(shift - other) <= max(abs(other - own) * _ABOUT, 0.5 * _BIN)
+    about = np.abs(shift - other) <= max(abs(other - gain_here) * _ABOUT, 0.5 * _BIN)
     return float(unexplained[about].min() - unexplained.min())

@@ -60,7 +60,7 @@ class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     def of_arm(self, arm: ArmModel) -> Start:
         """The same with a number for every axis: one, where it is the same for all."""
-        each = {axis: self.offset_sd_of(axis, one.kind) for axis, one in arm.axes.items()}
+        each = {axis: self.offset_sd_of(axis, axis_model.kind) for axis, axis_model in arm.axes.items()}
         return Start(offset_sd=each if len(set(each.values())) > 1 else next(iter(each.values())))
 
 
@@ -158,11 +158,11 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """The noise on one axis of the arm [m or rad]; None where the sensor has none and so is not used."""
         if not isinstance(self.sd, dict):
             return self.sd
-        mine = next((axes for axes in (CARTESIAN, TURNING) if axis in axes), None)
-        if self.frame is None or mine is None or not self.sd.keys() >= set(mine):
+        space = next((axes for axes in (CARTESIAN, TURNING) if axis in axes), None)
+        if self.frame is None or space is None or not self.sd.keys() >= set(space):
             return self.sd.get(axis)
-        along = rotations.matrix(np.array(self.frame.rotation))[mine.index(axis)]
-        return float(np.hypot.reduce(along * [self.sd[one] for one in mine]))
+        along = rotations.matrix(np.array(self.frame.rotation))[space.index(axis)]
+        return float(np.hypot.reduce(along * [self.sd[axis_in_space] for axis_in_space in space]))
 
     def bias_sd_of(self, axis: str) -> float:
         """The uncertainty of its constant bias on one axis [m or rad]; 0 where none is estimated."""
@@ -176,7 +176,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         """Whether one rejected axis rejects the whole row."""
         if self.gate_rows is not None:
             return self.gate_rows
-        return any(one.kind == "length" and self.sd_of(axis) is not None for axis, one in arm.axes.items())
+        return any(model.kind == "length" and self.sd_of(axis) is not None for axis, model in arm.axes.items())
 
     def is_biased(self, axis: str) -> bool:
         """Whether it has a bias on one axis, constant or drifting."""
@@ -228,7 +228,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 raise ConfigError(f"sensors.{name}.turn_deg: no axis of the arm is an angle")
             if not 1.0 / _LARGEST_SCALE <= abs(sensor.scale) <= _LARGEST_SCALE:
                 raise ConfigError(f"sensors.{name}.scale: {sensor.scale:g} is no sensor's: 1e-9 to 1e9")
-        complete = {axis: self.process.get(axis, PROCESS[one.kind]) for axis, one in self.arm.axes.items()}
+        complete = {axis: self.process.get(axis, PROCESS[model.kind]) for axis, model in self.arm.axes.items()}
         msgspec.structs.force_setattr(self, "process", complete)
         msgspec.structs.force_setattr(self, "start", self.start.of_arm(self.arm))
 
@@ -245,12 +245,12 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         """
         path = Path(path)
         tree, where = toml.read(path), str(path)
-        found = _config(tree, load_arm(tree, path), where)
-        if found.robot is None:
-            return found
-        robot = found.robot.beside(path.parent)
+        config = _config(tree, load_arm(tree, path), where)
+        if config.robot is None:
+            return config
+        robot = config.robot.beside(path.parent)
         chain_of(robot)  # what is wrong with it is said before anything begins
-        return msgspec.structs.replace(found, robot=robot)
+        return msgspec.structs.replace(config, robot=robot)
 
     @staticmethod
     def parse(source: str | Mapping[str, Any], arm: ArmModel | None = None) -> FusionConfig:
@@ -294,7 +294,9 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         tree["arm"] = ARM_FILE
         if self.robot is not None:
             tree["robot"]["urdf"] = ROBOT_FILE
-        tree["process"] = {axis: toml.builtins(one, self.arm.axes[axis].kind) for axis, one in self.process.items()}
+        tree["process"] = {
+            axis: toml.builtins(process, self.arm.axes[axis].kind) for axis, process in self.process.items()
+        }
         tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
         tree["sensors"] = {name: with_kinds(table, self.arm, _PER_AXIS) for name, table in tree["sensors"].items()}
         for sensor in tree["sensors"].values():
@@ -342,29 +344,29 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
     if not isinstance(name, str):
         raise ConfigError(f"{path}: 'arm' is missing; give a file beside this one, or a preset, as in arm = 'arm.toml'")
     beside = path.parent / name
-    there = os.path.isfile(beside)  # noqa: PTH113 - Path.is_file raises on a name that is too long
-    if name in PRESETS and not there:
+    is_file = os.path.isfile(beside)  # noqa: PTH113 - Path.is_file raises on a name that is too long
+    if name in PRESETS and not is_file:
         return ArmModel.load(name)
-    if not there:
-        known = ", ".join(PRESETS)
-        raise ConfigError(f"{path}: arm = '{shortened(name)}': no such file beside it, and not a preset ({known})")
+    if not is_file:
+        presets = ", ".join(PRESETS)
+        raise ConfigError(f"{path}: arm = '{shortened(name)}': no such file beside it, and not a preset ({presets})")
     return ArmModel.load(beside)
 
 
 def with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str, path: str = "") -> dict[str, Any]:
     """The tables of a ``fusion.toml`` (SI numbers) with the key names for lengths, where those of angles are."""
-    found = dict(tree)
-    if isinstance(found.get("process"), dict):
-        found["process"] = by_axis(found["process"], Process, arm, where, f"{path}process")
-    if "start" in found:
-        found["start"] = of_all_axes(found["start"], Start, arm, where, f"{path}start", ["offset_sd_mm"])
-    if isinstance(sensors := found.get("sensors"), dict):
+    lengths = dict(tree)
+    if isinstance(lengths.get("process"), dict):
+        lengths["process"] = by_axis(lengths["process"], Process, arm, where, f"{path}process")
+    if "start" in lengths:
+        lengths["start"] = of_all_axes(lengths["start"], Start, arm, where, f"{path}start", ["offset_sd_mm"])
+    if isinstance(sensors := lengths.get("sensors"), dict):
         named = cast(dict[str, Any], sensors)
-        found["sensors"] = {
+        lengths["sensors"] = {
             name: of_all_axes(table, Sensor, arm, where, f"{path}sensors.{name}", _PER_AXIS)
             for name, table in named.items()
         }
-    return found
+    return lengths
 
 
 def by_axis(
@@ -376,11 +378,11 @@ def by_axis(
     """
     names = {of: {of_kind(field.encode_name, of) for field in msgspec.structs.fields(kind)} for of in KINDS}
     keys = names["length"] | names["angle"]
-    own: dict[str, dict[str, Any]] = {
+    numbers_of_axis: dict[str, dict[str, Any]] = {
         key: value for key, value in table.items() if isinstance(value, dict) and key not in keys
     }
-    _known_axes(f"{where}: {path}", own, arm)
-    common = {key: value for key, value in table.items() if key not in own}
+    _known_axes(f"{where}: {path}", numbers_of_axis, arm)
+    common = {key: value for key, value in table.items() if key not in numbers_of_axis}
     needless = {key: value for key, value in common.items() if not any(key in names[of] for of in arm.kinds)}
     toml.struct(needless, kind, where, path, arm.kinds[0])
     of_kinds: dict[Kind, dict[str, Any]] = {
@@ -388,12 +390,12 @@ def by_axis(
     }
     for of, shared in of_kinds.items():
         toml.struct(shared, kind, where, path, of)
-    found: dict[str, dict[str, Any]] = {}
-    for axis, one in arm.axes.items():
-        mine = {**of_kinds[one.kind], **own.get(axis, {})}
-        toml.struct(mine, kind, where, f"{path}.{axis}", one.kind)
-        found[axis] = toml.as_lengths(mine, kind)
-    return found
+    numbers_by_axis: dict[str, dict[str, Any]] = {}
+    for axis, model in arm.axes.items():
+        numbers = {**of_kinds[model.kind], **numbers_of_axis.get(axis, {})}
+        toml.struct(numbers, kind, where, f"{path}.{axis}", model.kind)
+        numbers_by_axis[axis] = toml.as_lengths(numbers, kind)
+    return numbers_by_axis
 
 
 def of_all_axes(
@@ -402,32 +404,32 @@ def of_all_axes(
     """A table for all axes of the arm as one of lengths; where axes are of both kinds, with a number for each axis."""
     if not isinstance(table, dict):
         return table
-    found, types = (
+    of_all_axes, types = (
         cast(dict[str, Any], table).copy(),
-        {one.encode_name: one.type for one in msgspec.structs.fields(kind)},
+        {field.encode_name: field.type for field in msgspec.structs.fields(kind)},
     )
     for key in per_axis:
         each: dict[str, Any] = {}
         for of in KINDS:
             name = of_kind(key, of)
-            if name not in found:
+            if name not in of_all_axes:
                 continue
-            value = _by_axis_of_sensor(found.pop(name), of, arm)
+            value = _by_axis_of_sensor(of_all_axes.pop(name), of, arm)
             if of not in arm.kinds:
                 right = of_kind(key, arm.kinds[0])
                 raise ConfigError(f"{where}: {path}.{name}: no axis of the arm is {AN[of]}; give {right}")
             toml.check(value, types[key], where, f"{path}.{name}")
             if len(arm.kinds) == 1:
-                found[key] = value
+                of_all_axes[key] = value
             else:
-                mine = [axis for axis, one in arm.axes.items() if one.kind == of]
-                each |= cast(dict[str, Any], value) if isinstance(value, dict) else dict.fromkeys(mine, value)
+                axes_of_kind = [axis for axis, model in arm.axes.items() if model.kind == of]
+                each |= cast(dict[str, Any], value) if isinstance(value, dict) else dict.fromkeys(axes_of_kind, value)
         if each:
             same = len(each) == len(arm.axes) and len(set(each.values())) == 1
-            found[key] = next(iter(each.values())) if same else each
-    for key in found.keys() - types.keys():
+            of_all_axes[key] = next(iter(each.values())) if same else each
+    for key in of_all_axes.keys() - types.keys():
         raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, _accepted(kind, arm, per_axis))}")
-    return found
+    return of_all_axes
 
 
 def _by_axis_of_sensor(value: Any, kind: Kind, arm: ArmModel) -> Any:
@@ -451,18 +453,20 @@ def with_defaults(process: Mapping[str, Mapping[str, Any]], arm: ArmModel) -> di
 
 def with_kinds(table: Mapping[str, Any], arm: ArmModel, per_axis: Sequence[str]) -> dict[str, Any]:
     """The inverse of :func:`of_all_axes`: a table of lengths with a key for each kind of the arm's axes."""
-    found: dict[str, Any] = {}
+    with_kinds: dict[str, Any] = {}
     for key, value in table.items():
         if key not in per_axis:
-            found[key] = value
+            with_kinds[key] = value
         elif not isinstance(value, dict):
-            found.update((of_kind(key, of), value) for of in arm.kinds)
+            with_kinds.update((of_kind(key, of), value) for of in arm.kinds)
         else:
             each = cast(dict[str, Any], value)
             for of in KINDS:
-                if mine := {axis: one for axis, one in each.items() if arm.kind_of.get(axis, "length") == of}:
-                    found[of_kind(key, of)] = mine
-    return found
+                if axes_of_kind := {
+                    axis: value for axis, value in each.items() if arm.kind_of.get(axis, "length") == of
+                }:
+                    with_kinds[of_kind(key, of)] = axes_of_kind
+    return with_kinds
 
 
 def _known_axes(where: str, named: Mapping[str, object], arm: ArmModel) -> None:

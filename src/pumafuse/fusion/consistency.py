@@ -153,7 +153,7 @@ def consistency(
     count = len(fused.value)
     if not count:
         return None
-    known = est.config.sensors[sensor]
+    configured = est.config.sensors[sensor]
     return Consistency(
         count,
         float(np.mean(fused.nis)),
@@ -162,7 +162,7 @@ def consistency(
         rejected=1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED),
         sensor=sensor,
         kind=est.config.arm.axes[axis].kind,
-        at_bound=known.is_at_bound(axis),
+        at_bound=configured.is_at_bound(axis),
         untested=est.fitted and _is_told_by_one(est, sensor, axis),
         evidence=evidence or (lambda: evidence_of(est, axis)),
     )

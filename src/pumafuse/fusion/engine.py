@@ -46,26 +46,26 @@ def filter_segment(
         from ..filter import reference
 
         plants = [config.arm.axes[axis].plant for axis in segment.axes]
-        found = reference.Filter(plants, model, segment.origin, events)
-        outputs = found.run(results, times, progress)
-        return _filtered(segment, outputs, events, results, found.bias)
+        slow_core = reference.Filter(plants, model, segment.origin, events)
+        outputs = slow_core.run(results, times, progress)
+        return _filtered(segment, outputs, events, results, slow_core.bias)
     core = Filter(model, segment.origin)
     return _filtered(segment, core.run(events, results, times, mode), events, results, core.bias)
 
 
 def filter_piece(
-    segment: Segment, core: Filter, config: FusionConfig, times: TimeArray, own: tuple[int, int]
+    segment: Segment, core: Filter, config: FusionConfig, times: TimeArray, span: tuple[int, int]
 ) -> Filtered:
     """Filter a piece of a segment as the whole of it would be, with the filter as the pieces before have left it.
 
-    Events after and until the instants ``own`` [int ns] are the piece's own; those without a stamp come first.
+    Events after and until the instants ``span`` [int ns] are the piece's own; those without a stamp come first.
     """
     events = segment.events_once(config)
-    begin, end = np.searchsorted(events.time, own, side="right").tolist()
+    begin, end = np.searchsorted(events.time, span, side="right").tolist()
     results = _undecided(events)
     outputs = core.run(events, results, times, span=(begin, end))
-    mine = np.r_[: np.searchsorted(events.time, NO_STAMP, side="right"), begin:end]
-    return _filtered(segment, outputs, events.rows(mine), results.rows(mine), core.bias)
+    rows = np.r_[: np.searchsorted(events.time, NO_STAMP, side="right"), begin:end]
+    return _filtered(segment, outputs, events.rows(rows), results.rows(rows), core.bias)
 
 
 def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | None = None) -> Results:
@@ -73,13 +73,13 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
 
     With outcomes of an earlier fusion, (m, A), these are repeated whatever the gates would say.
     """
-    events, place = segment.events(config)
+    events, index = segment.events(config)
     results = _undecided(events)
     if outcome is not None:
-        results.outcome[place] = outcome
+        results.outcome[index] = outcome
     core = Filter(_certain(model_of(segment, config)), segment.origin)
     core.run(events, results, _NO_TIMES, "filtered" if outcome is None else "repeated")
-    return results.rows(place)
+    return results.rows(index)
 
 
 def linearised(
@@ -92,13 +92,13 @@ def linearised(
 
     ``beside`` has, for each, the configuration a little below and above, and how far these are apart.
     """
-    events, place = segment.events(config)
+    events, index = segment.events(config)
     results = _undecided(events)
-    results.outcome[place] = outcome
+    results.outcome[index] = outcome
     model = _certain(model_of(segment, config))
     tangents = [_slope(segment, config, model, *each) for each in beside]
     d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
-    return results.rows(place), d_nu[:, place], d_s[:, place]
+    return results.rows(index), d_nu[:, index], d_s[:, index]
 
 
 def _slope(
@@ -144,9 +144,9 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
             for number, name in enumerate(segment.sensors)
             if name in config.sensors
             and config.sensors[name].is_biased(axis)
-            and (known[rows.source == number] == int(Outcome.FUSED)).any()
+            and (codes[rows.source == number] == int(Outcome.FUSED)).any()
         ]
-        for axis, known in zip(segment.axes, rows.known.T, strict=True)
+        for axis, codes in zip(segment.axes, rows.known.T, strict=True)
     ]
 
 
@@ -167,7 +167,7 @@ def _filtered(
     axes, biases = dict[str, AxisEstimate](), dict[str, dict[str, Bias]]()
     for number, axis in enumerate(segment.axes):
         axes[axis] = AxisEstimate(segment.start[axis] + outputs[0, number], *outputs[1:, number])
-        for place, name in enumerate(segment.sensors):
-            if (known := bias(place, number)) is not None:
-                biases.setdefault(name, {})[axis] = Bias(*known)
+        for index, name in enumerate(segment.sensors):
+            if (state_of_bias := bias(index, number)) is not None:
+                biases.setdefault(name, {})[axis] = Bias(*state_of_bias)
     return Filtered(axes, events, results, biases)

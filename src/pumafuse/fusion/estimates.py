@@ -130,8 +130,8 @@ class Measurements:
 
     def counts(self) -> dict[str, int]:
         """The number of components with each outcome, without those that do not occur."""
-        found = np.bincount(self.outcome, minlength=len(Outcome)).tolist()
-        return {outcome.word: found[outcome] for outcome in Outcome if found[outcome]}
+        numbers = np.bincount(self.outcome, minlength=len(Outcome)).tolist()
+        return {outcome.word: numbers[outcome] for outcome in Outcome if numbers[outcome]}
 
 
 @dataclass(frozen=True, repr=False)
@@ -209,7 +209,7 @@ class Estimates:
     @property
     def positions(self) -> dict[str, FloatArray]:
         """Of each axis [m or rad], (n,)."""
-        return {axis: one.position for axis, one in self.axes.items()}
+        return {axis: estimate.position for axis, estimate in self.axes.items()}
 
     @property
     def orientation(self) -> FloatArray | None:
@@ -219,8 +219,8 @@ class Estimates:
     @property
     def turns(self) -> bool:
         """Whether there is a :attr:`pose`."""
-        there = self.axes if self.cartesian is None else self.cartesian
-        return set(CARTESIAN) <= there.keys() and self.orientation is not None
+        axes = self.axes if self.cartesian is None else self.cartesian
+        return set(CARTESIAN) <= axes.keys() and self.orientation is not None
 
     @cached_property
     def pose(self) -> Pose:
@@ -236,7 +236,7 @@ class Estimates:
                 f"{where}: a pose needs an orientation: commands that have one, and axes rx, ry, rz of the arm; it has"
                 f" {', '.join(self.axes)}"
             )
-        sd = {axis: one.position_sd for axis, one in self.axes.items()}
+        sd = {axis: estimate.position_sd for axis, estimate in self.axes.items()}
         covariance = np.zeros((len(self.time), 6, 6))
         covariance[:, :3, :3] = covariance_in_log(self.placed, self.positions, sd)
         covariance[:, 3:, 3:] = turning_covariance(self.positions, sd)
@@ -308,10 +308,10 @@ class Estimates:
             return measurements.where(np.zeros(len(measurements.value), dtype=bool))
         bias = self.biases.get(sensor, {}).get(axis)
         position = measurements.value if bias is None else measurements.value - bias.value
-        known, turn = self.config.sensors[sensor], turn_of(self.config, sensor, axis)
-        position = position / known.scale
+        configured, turn = self.config.sensors[sensor], turn_of(self.config, sensor, axis)
+        position = position / configured.scale
         if turn:  # the nearest to the estimate
-            turn /= abs(known.scale)
+            turn /= abs(configured.scale)
             away = position - np.interp(measurements.time, self.time, self[axis].position)
             position = position - turn * np.round(away / turn)
         return replace(measurements, value=position)
@@ -331,13 +331,13 @@ def points(
     position: Mapping[str, FloatArray], cartesian: Mapping[str, FloatArray] | None, arm: ArmModel, where: str, what: str
 ) -> FloatArray:
     """Positions in space [m], (n, 3), of axes x, y, z or of a frame's x, y and z; errors say ``where`` and ``what``."""
-    found = position if cartesian is None and in_space(arm) == CARTESIAN else cartesian or {}
-    if not all(name in found for name in CARTESIAN):
+    tool = position if cartesian is None and in_space(arm) == CARTESIAN else cartesian or {}
+    if not all(name in tool for name in CARTESIAN):
         raise RunError(
             f"{where}: {what} needs x, y and z, as axes of the arm or by a [frame]; there are only"
-            f" {', '.join(found or position)}"
+            f" {', '.join(tool or position)}"
         )
-    return np.column_stack([found[name] for name in CARTESIAN])
+    return np.column_stack([tool[name] for name in CARTESIAN])
 
 
 def write_tum(track: ReferenceTrack, config: FusionConfig, origin: int, where: str, path: Path) -> None:

@@ -78,9 +78,9 @@ class Fault:
 def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
     """A sentence on each fault of a configured sensor, or of the commands."""
     faults = faults_of(segment, config)
-    if refused := [one.sentence for one in faults if one.refused]:
+    if refused := [fault.sentence for fault in faults if fault.refused]:
         raise RunError(refused[0])
-    return [one.sentence for one in faults]
+    return [fault.sentence for fault in faults]
 
 
 def faults_of(segment: Segment, config: FusionConfig, origin: int | None = None) -> list[Fault]:
@@ -91,15 +91,15 @@ def faults_of(segment: Segment, config: FusionConfig, origin: int | None = None)
     positions = _positions(segment, config)
     trackings = _trackings(segment, config, positions)
     clocks = _clocks_set(segment, config, positions, segment.origin if origin is None else origin)
-    named = {name for one in clocks for name in one.sensors}
+    named = {name for clock in clocks for name in clock.sensors}
     faults = [
-        one
-        for one in _not_following(segment, config, positions, trackings)
-        if one.cause not in _OF_CLOCKS or named.isdisjoint(one.sensors)
+        fault
+        for fault in _not_following(segment, config, positions, trackings)
+        if fault.cause not in _OF_CLOCKS or named.isdisjoint(fault.sensors)
     ]
     faults = [*clocks, *faults]
-    named = {name for one in faults for name in one.sensors}
-    quiet = {name: mine for name, mine in trackings.items() if name not in named}
+    named = {name for fault in faults for name in fault.sensors}
+    quiet = {name: tracking for name, tracking in trackings.items() if name not in named}
     return [*within_a_turn(segment, config), *faults, *_moving_alone(config, quiet), *_off(segment, config, quiet)]
 
 
@@ -118,7 +118,7 @@ def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
     speeds = {axis: speed for axis in segment.axes if (speed := _first_speed(segment, axis))}
     positions: _Positions = _positions(segment, config) if speeds else {}
     evidence = [_evidence(segment, config, axis, speed, positions) for axis, speed in speeds.items()]
-    score, information = sum(one[0] for one in evidence), sum(one[1] for one in evidence)
+    score, information = sum(pair[0] for pair in evidence), sum(pair[1] for pair in evidence)
     if score <= _MOVED * information + 3.0 * math.sqrt(information):  # three standard deviations
         return []
     off = {axis: abs(speed) * config.arm.lag_of(axis, abs(speed)) for axis, speed in speeds.items()}
@@ -150,7 +150,7 @@ _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
 
 def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
     """A fault for each angle of the commands or of a sensor that begins anew after each turn."""
-    found, angles = list[Fault](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
+    sentences, angles = list[Fault](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
     positions: _Positions = _positions(segment, config) if angles else {}
     for axis in angles:
         if times := len(wraps(segment.given(axis)[1])):
@@ -158,29 +158,29 @@ def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
                 f"the commands: an angle that begins anew on {axis} after each turn, {times} times: the model goes back"
                 " by a turn then; turn_deg = 360 beside their column in run.toml makes them go on"
             )
-            found.append(Fault((), (axis,), "turns", times, words))
+            sentences.append(Fault((), (axis,), "turns", times, words))
         for name, axes in positions.items():
             if axis in axes and (times := len(wraps(config.sensors[name].scale * axes[axis][1]))):
                 words = (
                     f"sensor '{name}': an angle that begins anew on {axis} after each turn, {times} times: turn_deg ="
                     " 360 in its table makes it go on"
                 )
-                found.append(Fault((name,), (axis,), "turns", times, words))
-    return found
+                sentences.append(Fault((name,), (axis,), "turns", times, words))
+    return sentences
 
 
 def _positions(segment: Segment, config: FusionConfig) -> _Positions:
     """What the filter is given of each configured sensor, by stamp."""
-    found: dict[str, dict[str, Rows]] = {}
+    positions: dict[str, dict[str, Rows]] = {}
     for name, rows in segment.rows_by_sensor().items():
         if (sensor := config.sensors.get(name)) is not None:
             valid, fused = rows.stamp - round(sensor.latency * 1e9), rows.known == int(Outcome.FUSED)
-            found[name] = {
-                axis: (valid[mine], rows.value[mine, number] / sensor.scale)
+            positions[name] = {
+                axis: (valid[here], rows.value[here, number] / sensor.scale)
                 for number, axis in enumerate(segment.axes)
-                if (mine := fused[:, number]).any()
+                if (here := fused[:, number]).any()
             }
-    return found
+    return positions
 
 
 def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) -> _Trackings:
@@ -188,7 +188,7 @@ def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) ->
 
     Where most of it lies outside of the commands it is the clock that is wrong: the rest would tell of anything.
     """
-    found: dict[str, dict[str, Tracking]] = {name: {} for name in positions}
+    trackings: dict[str, dict[str, Tracking]] = {name: {} for name in positions}
     every, until = segment.rows_by_sensor(), int(segment.commands[-1]) + _TAIL_NS
     for number, axis in enumerate(segment.axes):
         some: dict[str, Rows] = {}
@@ -200,8 +200,8 @@ def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) ->
                 some[name] = valid[chosen][alike], position[chosen][alike]
         led = _led_at(segment, config, axis, [valid for valid, _ in some.values()])
         for (name, rows), ends in zip(some.items(), led, strict=True):
-            found[name][axis] = _tracking(segment, config, name, axis, *rows, *ends)
-    return found
+            trackings[name][axis] = _tracking(segment, config, name, axis, *rows, *ends)
+    return trackings
 
 
 def _led_at(
@@ -210,10 +210,10 @@ def _led_at(
     """Where the commands lead an axis at the instants of several sensors, and where they had led shortly before."""
     if not valid:
         return []
-    every = np.concatenate([part for one in valid for part in (one, one - round(SMALL_SHIFT * 1e9))])
+    every = np.concatenate([part for stamps in valid for part in (stamps, stamps - round(SMALL_SHIFT * 1e9))])
     order, position = np.argsort(every, kind="stable"), np.empty(len(every))  # which merges what is in order
     position[order] = segment.led(config.arm, axis, every[order])
-    parts = iter(np.split(position, np.cumsum([len(one) for one in valid for _ in range(2)])[:-1]))
+    parts = iter(np.split(position, np.cumsum([len(stamps) for stamps in valid for _ in range(2)])[:-1]))
     return list(zip(parts, parts, strict=True))
 
 
@@ -239,24 +239,29 @@ def _tracking(
 
 def _off(segment: Segment, config: FusionConfig, trackings: _Trackings) -> list[Fault]:
     """A fault for each sensor that is off by a constant; of all sensors of an axis one, on the commands."""
-    off = {name: {axis: one.zero for axis, one in mine.items() if one.zero} for name, mine in trackings.items()}
-    found = list[Fault]()
-    for name, mine in off.items():
+    off = {
+        name: {axis: tracking.zero for axis, tracking in tracking.items() if tracking.zero}
+        for name, tracking in trackings.items()
+    }
+    faults = list[Fault]()
+    for name, zeros in off.items():
         alone: dict[str, float] = {}
-        for axis, zero in mine.items():
+        for axis, zero in zeros.items():
             measuring = [other for other, axes in trackings.items() if axis in axes and axes[axis].excludes(zero)]
-            alike = [one for one in measuring if math.isclose(off[one].get(axis, 0.0), zero, rel_tol=_ALIKE_SIZE)]
+            alike = [name for name in measuring if math.isclose(off[name].get(axis, 0.0), zero, rel_tol=_ALIKE_SIZE)]
             if len(alike) < len(measuring) or len(alike) == 1:
                 alone[axis] = zero
             elif name == alike[0]:
-                found.append(Fault(tuple(alike), (axis,), "zero", zero, _zero_of_commands(config, axis, zero, alike)))
+                faults.append(Fault(tuple(alike), (axis,), "zero", zero, _zero_of_commands(config, axis, zero, alike)))
         if scaled := [axis for axis in alone if _is_scaled(trackings[name][axis], segment.start[axis])]:
             scale = median(np.array([trackings[name][axis].slope for axis in scaled]))
-            found.append(Fault((name,), tuple(scaled), "unit", scale, _scaled(config, name, scaled, scale)))
-        if rest := {axis: zero for axis, zero in alone.items() if axis not in scaled}:
-            largest = max(rest.values(), key=abs)
-            found.append(Fault((name,), tuple(rest), "zero", largest, _zero(config, name, rest, trackings[name])))
-    return found
+            faults.append(Fault((name,), tuple(scaled), "unit", scale, _scaled(config, name, scaled, scale)))
+        if unscaled := {axis: zero for axis, zero in alone.items() if axis not in scaled}:
+            largest = max(unscaled.values(), key=abs)
+            faults.append(
+                Fault((name,), tuple(unscaled), "zero", largest, _zero(config, name, unscaled, trackings[name]))
+            )
+    return faults
 
 
 def _is_scaled(tracking: Tracking, start: float) -> bool:
@@ -274,7 +279,7 @@ def _scaled(config: FusionConfig, name: str, axes: Sequence[str], factor: float)
 
 
 def _zero_of_commands(config: FusionConfig, axis: str, zero: float, sensors: Sequence[str]) -> str:
-    names, width = ", ".join(f"'{one}'" for one in sensors), _width(config, "offset_sd", {axis: zero})
+    names, width = ", ".join(f"'{sensor}'" for sensor in sensors), _width(config, "offset_sd", {axis: zero})
     return (
         f"sensors {names} are {_length(config, axis, zero)} from where the commands lead {axis}, all the time: is the"
         f" zero of the commands another? Then give [start] {width}"
@@ -302,12 +307,12 @@ def _length(config: FusionConfig, axis: str, size: float, digits: str = "+.4g") 
 
 def _width(config: FusionConfig, key: str, zeros: Mapping[str, float]) -> str:
     """The lines that give axes a prior as wide as their zeros, a key for each kind."""
-    found: dict[str, list[str]] = {}
+    by_kind: dict[str, list[str]] = {}
     for axis, zero in zeros.items():
         screen = config.arm.screen_of(axis)
         width = f"{axis} = {_digits(abs(zero) * screen.scale, 1)}"
-        found.setdefault(f"{key}_{screen.unit}", []).append(width)
-    return ", ".join(f"{one} = {{ {', '.join(widths)} }}" for one, widths in found.items())
+        by_kind.setdefault(f"{key}_{screen.unit}", []).append(width)
+    return ", ".join(f"{key} = {{ {', '.join(widths)} }}" for key, widths in by_kind.items())
 
 
 def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
@@ -317,13 +322,13 @@ def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
             (name,),
             (axis,),
             "motion",
-            one.own_motion,
-            f"sensor '{name}' moves over {_length(config, axis, one.own_motion, '.3g')} on {axis}, whose commands rest:"
-            " is it the right column of the commands?",
+            track.own_motion,
+            f"sensor '{name}' moves over {_length(config, axis, track.own_motion, '.3g')} on {axis}, whose commands"
+            " rest: is it the right column of the commands?",
         )
-        for name, mine in trackings.items()
-        for axis, one in mine.items()
-        if one.own_motion
+        for name, tracking in trackings.items()
+        for axis, track in tracking.items()
+        if track.own_motion
     ]
 
 
@@ -332,13 +337,15 @@ def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
 
 def _clocks_set(segment: Segment, config: FusionConfig, positions: _Positions, origin: int) -> list[Fault]:
     """A fault for each time that the clock of a sensor was set; ``origin`` [ns] is time 0."""
-    found, rows = list[Fault](), segment.rows_by_sensor()
-    for name, mine in positions.items():
+    clocks_set, rows = list[Fault](), segment.rows_by_sensor()
+    for name, position in positions.items():
         latency = round(config.sensors[name].latency * 1e9)
-        for step in clock_steps(segment, config.arm, rows[name].stamp - latency, mine):
+        for step in clock_steps(segment, config.arm, rows[name].stamp - latency, position):
             at = step.leap.first + latency
-            found.append(Fault((name,), tuple(mine), "set", step.by, _set(name, step, (at - origin) / 1e9), at=at))
-    return found
+            clocks_set.append(
+                Fault((name,), tuple(position), "set", step.by, _set(name, step, (at - origin) / 1e9), at=at)
+            )
+    return clocks_set
 
 
 def _set(name: str, step: ClockStep, at: float) -> str:
@@ -358,16 +365,18 @@ def _set(name: str, step: ClockStep, at: float) -> str:
 
 
 def _not_following(segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings) -> list[Fault]:
-    found = _turned_frames(segment, config, positions, trackings)
-    turned = {name for one in found for name in one.sensors}
-    for name, mine in trackings.items():
+    turned_frames = _turned_frames(segment, config, positions, trackings)
+    turned = {name for fault in turned_frames for name in fault.sensors}
+    for name, of_sensor in trackings.items():
         if name in turned:
             continue
-        if odd := [axis for axis, tracking in mine.items() if not tracking.follows]:
+        if odd := [axis for axis, tracking in of_sensor.items() if not tracking.follows]:
             grid = _busiest(segment, config.arm.update_period)
-            causes = _matches(segment, config, {axis: positions[name][axis] for axis in mine}, grid)
-            found += _faults(config, name, mine, {axis: causes[axis] for axis in odd}, grid.margin * grid.step)
-    return _of_commands(found, trackings)
+            causes = _matches(segment, config, {axis: positions[name][axis] for axis in of_sensor}, grid)
+            turned_frames += _faults(
+                config, name, of_sensor, {axis: causes[axis] for axis in odd}, grid.margin * grid.step
+            )
+    return _of_commands(turned_frames, trackings)
 
 
 def _matches(segment: Segment, config: FusionConfig, positions: Mapping[str, Rows], grid: Grid) -> dict[str, Match]:
@@ -401,36 +410,36 @@ def _faults(
 
     Shifts were ``searched`` up to so many seconds.
     """
-    found: list[Fault] = []
+    faults: list[Fault] = []
 
     def fault(axes: Sequence[str], cause: _Cause, size: float, words: str, refused: bool = False) -> None:
         lost = cause == "nothing" or any(trackings[axis].correlation < _LOST for axis in axes)
         lost |= cause == "unit" and not 1.0 / _SCALE < size < _SCALE
-        found.append(Fault((name,), tuple(axes), cause, size, f"sensor '{name}' {words}", refused, lost))
+        faults.append(Fault((name,), tuple(axes), cause, size, f"sensor '{name}' {words}", refused, lost))
 
-    clear = {axis: one for axis, one in causes.items() if _is_clear(axis, one, trackings[axis])}
-    if late := [axis for axis, one in clear.items() if one.shift != 0.0]:
+    clear = {axis: cause for axis, cause in causes.items() if _is_clear(axis, cause, trackings[axis])}
+    if late := [axis for axis, cause in clear.items() if cause.shift != 0.0]:
         best = max(late, key=lambda axis: clear[axis].correlation)
         fault(list(trackings), "clock", clear[best].shift, _late(config, name, best, trackings[best], clear[best]))
-    if exchanged := [axis for axis, one in clear.items() if one.axis != axis]:
+    if exchanged := [axis for axis, cause in clear.items() if cause.axis != axis]:
         others = [clear[axis].axis for axis in exchanged if clear[axis].axis in trackings]
         both = list(dict.fromkeys([*exchanged, *others]))
         fault(both, "columns", 1.0, _exchanged({axis: (trackings[axis], clear[axis]) for axis in exchanged}))
-    own = {axis: one for axis, one in clear.items() if one.axis == axis}
-    if turned := [axis for axis, one in own.items() if one.slope < 0.0]:
-        fault(turned, "sign", -1.0, _turned(config, name, turned, own, len(trackings)))
-    for axis, one in own.items():
-        size = abs(one.slope)
+    on_axis = {axis: cause for axis, cause in clear.items() if cause.axis == axis}
+    if turned := [axis for axis, cause in on_axis.items() if cause.slope < 0.0]:
+        fault(turned, "sign", -1.0, _turned(config, name, turned, on_axis, len(trackings)))
+    for axis, suspect_match in on_axis.items():
+        size = abs(suspect_match.slope)
         if not 1.0 / GAIN < size < GAIN:
             refused, words = _unit(config.arm.axes[axis].kind, size)
-            times, correlation = _digits(size, 3), f"{one.correlation:+.3f}"
+            times, correlation = _digits(size, 3), f"{suspect_match.correlation:+.3f}"
             moves = f"moves {times} times as far as the commands of {axis} (correlation {correlation}): {words}"
             fault([axis], "unit", size, moves, refused)
-    faulty = {axis for one in found for axis in one.axes}
+    faulty = {axis for fault in faults for axis in fault.axes}
     odd = {axis: trackings[axis] for axis in causes if axis not in faulty and abs(causes[axis].correlation) < _LOST}
-    if lost := {axis: one for axis, one in odd.items() if one.lacks_motion}:
+    if lost := {axis: cause for axis, cause in odd.items() if cause.lacks_motion}:
         fault(list(lost), "nothing", 1.0, _nothing(lost, searched))
-    return found
+    return faults
 
 
 def _is_clear(axis: str, cause: Match, tracking: Tracking) -> bool:
@@ -450,11 +459,11 @@ def _late(config: FusionConfig, name: str, axis: str, tracking: Tracking, cause:
     )
 
 
-def _exchanged(found: Mapping[str, tuple[Tracking, Match]]) -> str:
+def _exchanged(matches: Mapping[str, tuple[Tracking, Match]]) -> str:
     follows = [
         f"on {axis} the commands of {cause.axis} (correlation {cause.correlation:+.3f}, with those of {axis}"
         f" {tracking.correlation:+.2f})"
-        for axis, (tracking, cause) in found.items()
+        for axis, (tracking, cause) in matches.items()
     ]
     return f"follows {' and '.join(follows)}: are its columns exchanged in run.toml?"
 
@@ -485,8 +494,10 @@ def _digits(number: float, count: int) -> str:
 
 
 def _nothing(trackings: Mapping[str, Tracking], searched: float) -> str:
-    rests = "rests and " if all(one.rests for one in trackings.values()) else ""
-    axes = ", ".join(f"{axis} (correlation {one.correlation:+.2f} with the model)" for axis, one in trackings.items())
+    rests = "rests and " if all(tracking.rests for tracking in trackings.values()) else ""
+    axes = ", ".join(
+        f"{axis} (correlation {tracking.correlation:+.2f} with the model)" for axis, tracking in trackings.items()
+    )
     return (
         f"{rests}does not follow the commands of {axes}, nor those of other axes or of up to {searched:.2g} s before or"
         " after: is it that axis of this run, are both stamped by one clock, is arm.toml of this arm?"
@@ -495,18 +506,18 @@ def _nothing(trackings: Mapping[str, Tracking], searched: float) -> str:
 
 def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
     """The faults; one that all of several sensors of its axes have is reported once, as one of the commands."""
-    found: list[Fault] = []
-    for one in faults:
-        alike = [other for other in faults if one.is_like(other)]
-        measuring = [name for name, mine in trackings.items() if not mine.keys().isdisjoint(one.axes)]
-        if len(alike) < max(len(measuring), 2) or one.cause == "nothing":
-            found.append(one)
-        elif one is alike[0]:
+    of_commands: list[Fault] = []
+    for fault in faults:
+        alike = [other for other in faults if fault.is_like(other)]
+        measuring = [name for name, tracking in trackings.items() if not tracking.keys().isdisjoint(fault.axes)]
+        if len(alike) < max(len(measuring), 2) or fault.cause == "nothing":
+            of_commands.append(fault)
+        elif fault is alike[0]:
             names = [name for other in alike for name in other.sensors]
             others = ", ".join(f"'{name}'" for name in names[1:])
-            sentence = f"{one.sentence} ({others} too: is it the {one.cause} of the commands? Else mend each)"
-            found.append(replace(one, sensors=tuple(names), sentence=sentence))
-    return found
+            sentence = f"{fault.sentence} ({others} too: is it the {fault.cause} of the commands? Else mend each)"
+            of_commands.append(replace(fault, sensors=tuple(names), sentence=sentence))
+    return of_commands
 
 
 # ---- a sensor that is turned against its axes ------------------------------------------------------------------------
@@ -514,9 +525,9 @@ def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
 
 def _turned_frames(segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings) -> list[Fault]:
     """The faults of sensors that see the commanded motion turned, by 3° or more."""
-    found = list[Fault]()
-    for name, mine in trackings.items():
-        axes = [axis for axis in (CARTESIAN if "x" in mine else CANONICAL_AXES) if axis in mine]
+    faults = list[Fault]()
+    for name, tracking in trackings.items():
+        axes = [axis for axis in (CARTESIAN if "x" in tracking else CANONICAL_AXES) if axis in tracking]
         if len(axes) < 2 or (turned := _turned_frame(segment, config, positions[name], axes)) is None:
             continue
         angle, along, back = turned
@@ -526,8 +537,8 @@ def _turned_frames(segment: Segment, config: FusionConfig, positions: _Positions
             f" second are within {lengths} of those commanded; `pumafuse register` finds how it stands, which is its"
             " frame in fusion.toml"
         )
-        found.append(Fault((name,), tuple(axes), "frame", angle, sentence, False, math.cos(angle) < _ALIGNED))
-    return found
+        faults.append(Fault((name,), tuple(axes), "frame", angle, sentence, False, math.cos(angle) < _ALIGNED))
+    return faults
 
 
 def _turned_frame(
@@ -544,7 +555,7 @@ def _turned_frame(
         return None
     each = (positions[axis] for axis in axes)
     value = np.column_stack([position[np.searchsorted(every, valid)] for every, position in each])
-    alike = np.all([without_spikes(one) for one in value.T], axis=0)
+    alike = np.all([without_spikes(column) for column in value.T], axis=0)
     valid, value = valid[alike], value[alike]
     if len(valid) < _FEW:
         return None
@@ -553,7 +564,7 @@ def _turned_frame(
     over = round(_MOVE / max(float(np.median(np.diff(valid))), 1.0))
     if not 1 <= over < len(valid) // _PARTS:
         return None
-    value, led, before = (one[over:] - one[:-over] for one in (value, led, before))
+    value, led, before = (rows[over:] - rows[:-over] for rows in (value, led, before))
     parts = np.arange(len(value)) * _PARTS // len(value)
     turn, along, back = _turn(value, led, led - before)
     angle = angle_of(turn)
@@ -562,7 +573,7 @@ def _turned_frame(
         return None
     others = np.array(
         [
-            angle_of(turn.T @ _turn(*(one[parts != part] for one in (value, led, led - before)))[0])
+            angle_of(turn.T @ _turn(*(rows[parts != part] for rows in (value, led, led - before)))[0])
             for part in range(_PARTS)
         ]
     )
@@ -581,9 +592,9 @@ def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatAr
 
     Where a response does not go, nothing tells of a turn: there it is none.
     """
-    value, led, step = (np.asarray(one - one.mean(axis=0), dtype=np.float64) for one in (value, led, step))
-    known = np.hstack([led, step])
-    seen = np.asarray(np.linalg.lstsq(known, value)[0], dtype=np.float64)[: led.shape[1]]  # value ≈ led · seen + …
+    value, led, step = (np.asarray(rows - rows.mean(axis=0), dtype=np.float64) for rows in (value, led, step))
+    regressors = np.hstack([led, step])
+    seen = np.asarray(np.linalg.lstsq(regressors, value)[0], dtype=np.float64)[: led.shape[1]]  # value ≈ led · seen + …
     moved = led.T @ led
     turn = nearest(seen.T @ moved + _HARDLY * float(np.linalg.norm(moved, 2)) * np.eye(len(moved)))
 
@@ -600,13 +611,13 @@ def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatAr
 
 def _first_speed(segment: Segment, axis: str) -> float:
     """The commanded speed [m/s] that a segment begins with; 0 where its first steps are not alike."""
-    given, command = (part[: _ALIKE + 1] for part in segment.given(axis))
+    told_at, command = (part[: _ALIKE + 1] for part in segment.given(axis))
     steps = np.diff(command)
     if len(steps) < _ALIKE or command[0] != segment.start[axis]:
         return 0.0
     if np.abs(steps - steps.mean()).max() > _UNEQUAL * abs(steps.mean()):
         return 0.0
-    return float(command[-1] - command[0]) / (int(given[-1] - given[0]) / 1e9)
+    return float(command[-1] - command[0]) / (int(told_at[-1] - told_at[0]) / 1e9)
 
 
 def settled(config: FusionConfig, axis: str) -> float:
@@ -624,19 +635,19 @@ def _evidence(
     """
     model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
     until, score, information = settled(config, axis), 0.0, 0.0
-    (given, command), start = segment.given(axis), segment.start[axis]
+    (told_at, command), start = segment.given(axis), segment.start[axis]
     before = np.arange(-min(int(until / period) + 1, _MOST), 0.0)
-    earlier = np.concatenate([given[0] + np.rint(before * (period * 1e9)).astype(np.int64), given])
+    earlier = np.concatenate([told_at[0] + np.rint(before * (period * 1e9)).astype(np.int64), told_at])
     moving = np.concatenate([start + before * (period * speed), command])
     for name, (valid, position) in ((name, axes[axis]) for name, axes in positions.items() if axis in axes):
-        count = int(np.searchsorted(valid, int(given[0]) + round(until * 1e9), side="right"))
+        count = int(np.searchsorted(valid, int(told_at[0]) + round(until * 1e9), side="right"))
         if count < _FEWEST:
             continue
         sensor, valid = config.sensors[name], valid[:count]
-        rest = start + response(model, period, delay, given, command, start, valid)
-        added = moving[0] + response(model, period, delay, earlier, moving, float(moving[0]), valid) - rest
+        residual = start + response(model, period, delay, told_at, command, start, valid)
+        added = moving[0] + response(model, period, delay, earlier, moving, float(moving[0]), valid) - residual
         added -= added.mean()
-        left = position[:count] - rest
+        left = position[:count] - residual
         left -= left.mean()
         along, size = float(added @ left), max(float(added @ added), 1e-30)
         noise = max((sensor.sd_of(axis) or 0.0) / abs(sensor.scale), float(np.std(left - added * (along / size))))

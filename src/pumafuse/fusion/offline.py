@@ -93,8 +93,8 @@ def fuse(
         moving.extend(starts_in_motion(segment, config))
         times = output_times(segment, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
-        found = filter_segment(segment, config, times, mode, engine, share)
-        return Part(part, segment.without_measurements(), times, found)  # found has them
+        segment_result = filter_segment(segment, config, times, mode, engine, share)
+        return Part(part, segment.without_measurements(), times, segment_result)  # found has them
 
     parts += [filtered(number, part) for number, part in enumerate(logged)]
     est = estimates_of(run, in_place, placed, config, parts, mode, engine)
@@ -139,7 +139,7 @@ def estimates_of(
         run=run.name,
         time=seconds(_joined(times), origin),
         axes=axes,
-        cartesian=_cartesian(placed, {axis: one.position for axis, one in axes.items()}),
+        cartesian=_cartesian(placed, {axis: estimate.position for axis, estimate in axes.items()}),
         measurements=_measurements(cut, filtered),
         biases=filtered[-1].biases,
         reference=track and replace(track, cartesian=_cartesian(placed, track.position)),
@@ -165,13 +165,17 @@ def estimates_of(
 
 def found_by(est: Estimates, parts: Sequence[Part]) -> list[str]:
     """A sentence on each thing that is wrong with rows, and on sensors that contradict each other."""
-    found = [note for part in parts for note in part.segment.notes]
-    found += [note for part in parts for note in _contradictions(part.segment, est.config, part.filtered, est.origin)]
+    sentences = [note for part in parts for note in part.segment.notes]
+    sentences += [
+        note for part in parts for note in _contradictions(part.segment, est.config, part.filtered, est.origin)
+    ]
     references = _references(parts, est.origin)
     late = sum(int(np.count_nonzero(late_rows(source.stamp))) for source in references)
     if late:
-        found.append(f"{references[0].label}: {late} rows are stamped more than 1 s behind an earlier one: not used")
-    return found
+        sentences.append(
+            f"{references[0].label}: {late} rows are stamped more than 1 s behind an earlier one: not used"
+        )
+    return sentences
 
 
 def _share(progress: Callable[[float], None], number: int, count: int) -> Callable[[float], None]:
@@ -197,8 +201,8 @@ def _uncovered(est: Estimates) -> list[str]:
     """A sentence if the reference has no row at the time of any estimate."""
     if est.reference is None:
         return []
-    given = [np.isfinite(value) for axis, value in est.reference.position.items() if axis in est.axes]
-    time = est.reference.time[np.any(given, axis=0)] if given else np.empty(0)
+    is_known = [np.isfinite(value) for axis, value in est.reference.position.items() if axis in est.axes]
+    time = est.reference.time[np.any(is_known, axis=0)] if is_known else np.empty(0)
     apart = not len(time) or time.max() < est.time.min() or time.min() > est.time.max()
     return [UNCOVERED] if apart else []
 
@@ -207,21 +211,21 @@ def _cartesian(placed: Placed | None, position: Mapping[str, FloatArray]) -> dic
     """The log's x, y and z [m] of positions of axes, those that these give; None without a frame."""
     if placed is None:
         return None
-    found: dict[str, FloatArray] = {}
+    cartesian: dict[str, FloatArray] = {}
     if "tangential" in position and "radial" in position:
-        found["x"], found["y"] = placed.to_log(position["tangential"], position["radial"])
+        cartesian["x"], cartesian["y"] = placed.to_log(position["tangential"], position["radial"])
     if "vertical" in position:
-        found["z"] = position["vertical"].copy()
-    return found
+        cartesian["z"] = position["vertical"].copy()
+    return cartesian
 
 
 def _highest_speeds(cut: Sequence[Segment], arm: ArmModel) -> dict[Kind, float]:
     """The highest commanded speed of the axes of each kind [m/s or rad/s]."""
-    found: dict[Kind, float] = {}
+    highest_speeds: dict[Kind, float] = {}
     for axis in cut[0].axes:
         fastest = max(part.highest_speed(axis, arm.update_period) for part in cut)
-        found[arm.axes[axis].kind] = max(found.get(arm.axes[axis].kind, 0.0), fastest)
-    return found
+        highest_speeds[arm.axes[axis].kind] = max(highest_speeds.get(arm.axes[axis].kind, 0.0), fastest)
+    return highest_speeds
 
 
 def _highest_radius(run: Run, placed: Placed | None) -> float | None:
@@ -234,47 +238,47 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
 
 def _contradictions(segment: Segment, config: FusionConfig, filtered: Filtered, origin: int) -> list[str]:
     """A sentence on each pair of sensors of which one contradicts the other time after time."""
-    events, results, found = filtered.events, filtered.results, list[str]()
+    events, results, contradictions = filtered.events, filtered.results, list[str]()
     rows = np.flatnonzero(results.contradicts >= 0)
     pairs = events.source[rows].astype(np.int64) * len(segment.sensors) + results.contradicts[rows]
     for pair in sorted(set(pairs.tolist())):
         sensor, other = divmod(pair, len(segment.sensors))
-        mine = rows[pairs == pair]
-        first, count = mine[0], len(mine)
+        rows_of_pair = rows[pairs == pair]
+        first, count = rows_of_pair[0], len(rows_of_pair)
         rejected = np.flatnonzero(results.outcome[first] == Outcome.REJECTED)
         off = [
             f"{name} by {screen.scale * results.innovation[first, axis]:+.4g} {screen.unit}"
             for axis in rejected.tolist()
             if (screen := config.arm.screen_of(name := segment.axes[axis]))
         ]
-        found.append(
+        contradictions.append(
             f"sensor '{segment.sensors[sensor]}' contradicts '{segment.sensors[other]}' since"
             f" {(int(events.time[first]) - origin) / 1e9:.2f} s ({', '.join(off)}), {count} times:"
             " its measurements are rejected; which of the two is wrong?"
         )
-    return found
+    return contradictions
 
 
 def _row_counts(segment: Segment, filtered: Filtered) -> dict[str, dict[str, int]]:
     """What became of the rows of each sensor in one segment, those included that the filter decided on."""
-    source, known = filtered.events.source, filtered.events.known
-    decided = np.flatnonzero((source != COMMAND) & on_any_axis(known, Outcome.FUSED))
+    source, codes = filtered.events.source, filtered.events.known
+    decided = np.flatnonzero((source != COMMAND) & on_any_axis(codes, Outcome.FUSED))
     best = best_of(filtered.results.outcome)[decided]
-    place, size = source[decided].astype(np.int64) * len(Outcome) + best, len(segment.sensors) * len(Outcome)
-    table = np.bincount(place, minlength=size).reshape(-1, len(Outcome)).tolist()
-    found = {name: dict(counts) for name, counts in segment.counts.items()}
+    cell, size = source[decided].astype(np.int64) * len(Outcome) + best, len(segment.sensors) * len(Outcome)
+    table = np.bincount(cell, minlength=size).reshape(-1, len(Outcome)).tolist()
+    counts_of = {name: dict(counts) for name, counts in segment.counts.items()}
     for name, row in zip(segment.sensors, table, strict=True):
-        if found[name].pop(Outcome.FUSED.word, 0):
-            found[name] |= {outcome.word: row[outcome] for outcome in Outcome if row[outcome]}
-    return found
+        if counts_of[name].pop(Outcome.FUSED.word, 0):
+            counts_of[name] |= {outcome.word: row[outcome] for outcome in Outcome if row[outcome]}
+    return counts_of
 
 
 def _without_strays(parts: Sequence[Mapping[str, int]], logged: Source, mended: Source) -> dict[str, int]:
     """The sum of the segments' counts of a source, stray stamps apart from none."""
-    found = added(parts)
-    unstamped, word = found.get(NO_STAMP_WORD, 0), Outcome.STRAY.word
+    total = added(parts)
+    unstamped, word = total.get(NO_STAMP_WORD, 0), Outcome.STRAY.word
     stray = min(int(np.count_nonzero(logged.stamp != mended.stamp)), unstamped)
-    return counted(found | {NO_STAMP_WORD: unstamped - stray, word: found.get(word, 0) + stray})
+    return counted(total | {NO_STAMP_WORD: unstamped - stray, word: total.get(word, 0) + stray})
 
 
 def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measurements:
@@ -282,12 +286,12 @@ def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measu
     first, columns = cut[0], list[tuple[npt.NDArray[Any], ...]]()
     for number, (events, results) in enumerate((part.events, part.results) for part in filtered):
         measured = np.repeat(events.source != COMMAND, len(first.axes))  # (n, 1) & (n, A) is slow
-        given = np.flatnonzero(measured & (events.known != ABSENT).ravel())
-        row = given // len(first.axes)
+        rows = np.flatnonzero(measured & (events.known != ABSENT).ravel())
+        row = rows // len(first.axes)
         time, stamp = (seconds(part, first.origin).take(row) for part in (events.time, events.stamp))
-        sensor, axis = events.source.take(row), (given - row * len(first.axes)).astype(np.int16)
+        sensor, axis = events.source.take(row), (rows - row * len(first.axes)).astype(np.int16)
         del row, measured  # of a long run each array counts
-        segment = np.full(len(given), number, dtype=np.int16)
+        segment = np.full(len(rows), number, dtype=np.int16)
         values = (events.value, results.innovation, results.innovation_sd, results.outcome)
-        columns.append((time, stamp, sensor, axis, segment, *(part.take(given) for part in values)))
+        columns.append((time, stamp, sensor, axis, segment, *(part.take(rows) for part in values)))
     return Measurements(*map(_joined, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)

@@ -44,10 +44,10 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
         for name, source in run.sensors.items()
         if name in config.sensors and config.sensors[name].is_placed
     }
-    found, placed = in_axes(replace(run, sensors={**run.sensors, **of_tool}), config.frame, tool)
-    if found.tool is not None and not set(TURNING) & set(config.arm.axes):
-        found = found.each(_still)
-    return found, placed, config
+    in_axes_of_arm, placed = in_axes(replace(run, sensors={**run.sensors, **of_tool}), config.frame, tool)
+    if in_axes_of_arm.tool is not None and not set(TURNING) & set(config.arm.axes):
+        in_axes_of_arm = in_axes_of_arm.each(_still)
+    return in_axes_of_arm, placed, config
 
 
 def with_tool(config: FusionConfig, run: Run) -> FusionConfig:
@@ -133,11 +133,11 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
 def _check_turned(name: str, source: Source, oriented: FloatArray, run: Run) -> None:
     """Whether a sensor tells the tool to be turned about as it is commanded to be."""
     assert run.command.orientation is not None
-    given, commanded = known_rows(run.command.stamp, run.command.orientation)
+    told_at, commanded = known_rows(run.command.stamp, run.command.orientation)
     stamp, seen = known_rows(source.stamp, oriented)
-    if not len(given) or not len(stamp):
+    if not len(told_at) or not len(stamp):
         return
-    last = np.clip(np.searchsorted(given, stamp, side="right") - 1, 0, None)
+    last = np.clip(np.searchsorted(told_at, stamp, side="right") - 1, 0, None)
     off = float(np.median(rotations.angle_between(seen, commanded[last])))
     if off > _ELSEWHERE:
         raise RunError(
@@ -159,23 +159,23 @@ def _commanded(name: str, stamp: TimeArray, run: Run, config: FusionConfig) -> F
         raise ConfigError(f"{where}: nothing tells how the tool is turned: neither the sensor nor the commands")
     if not set(TURNING) <= set(arm.axes):
         raise ConfigError(f"{where}: the sensor tells no orientation, and the arm '{arm.name}' has no axes rx, ry, rz")
-    reference, given = np.array(config.tool.reference), run.command.stamp
+    reference, told_at = np.array(config.tool.reference), run.command.stamp
     vector = rotations.vectors(commanded, reference)
-    told = np.isfinite(vector[:, 0]) & (given != NO_STAMP)
-    given, vector = given[told], vector[told]
-    if (np.diff(given) < -TOLERATED_STEP_BACK_NS).any():
+    told = np.isfinite(vector[:, 0]) & (told_at != NO_STAMP)
+    told_at, vector = told_at[told], vector[told]
+    if (np.diff(told_at) < -TOLERATED_STEP_BACK_NS).any():
         raise RunError(f"{run.command.label}: the clock is set back; sensor '{name}' needs one time: cut the log there")
-    order = np.argsort(given, kind="stable")
-    given, vector = given[order], vector[order]
-    last = np.append(np.diff(given) > 0, True)  # of a stamp the last command counts
-    given, vector = given[last], vector[last]
-    asked = np.where(stamp == NO_STAMP, given[0], stamp - round(config.sensors[name].latency * 1e9))
+    order = np.argsort(told_at, kind="stable")
+    told_at, vector = told_at[order], vector[order]
+    last = np.append(np.diff(told_at) > 0, True)  # of a stamp the last command counts
+    told_at, vector = told_at[last], vector[last]
+    asked = np.where(stamp == NO_STAMP, told_at[0], stamp - round(config.sensors[name].latency * 1e9))
     order = np.argsort(asked, kind="stable")
-    found = np.empty((len(asked), 3))
+    vectors = np.empty((len(asked), 3))
     for column, record in enumerate(turning_axes(arm)):
         relative = vector[:, column] - vector[0, column]
-        found[order, column] = vector[0, column] + follow(record, at_rest(), given, relative, asked[order])
-    return rotations.quaternions(found, reference)
+        vectors[order, column] = vector[0, column] + follow(record, at_rest(), told_at, relative, asked[order])
+    return rotations.quaternions(vectors, reference)
 
 
 def turning_axes(arm: ArmModel) -> list[Record]:

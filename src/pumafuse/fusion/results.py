@@ -57,7 +57,7 @@ class Result:
 
     def positions(self, config: FusionConfig) -> dict[str, FloatArray]:
         """Of each axis [m or rad], (n,); rx, ry, rz relative to the orientation at which they are 0 by ``config``."""
-        position = {axis: one.position for axis, one in self.axes.items()}
+        position = {axis: estimate.position for axis, estimate in self.axes.items()}
         turned = orientation(position, self.config) if config.tool != self.config.tool else None
         return position if turned is None else position | relative_to(turned, config)
 
@@ -69,15 +69,15 @@ class Result:
     def scores(self, reference: ReferenceTrack) -> dict[str, ScoreSummary]:
         """The score of each axis that the reference has."""
         period = self.config.arm.update_period
-        found = {
+        by_axis = {
             axis: score_axis(self.time, self.segment, estimate, reference, axis, period)
             for axis, estimate in self.axes.items()
         }
-        return {axis: value for axis, value in found.items() if value is not None}
+        return {axis: value for axis, value in by_axis.items() if value is not None}
 
     def orientation_score(self, reference: ReferenceTrack) -> OrientationScore | None:
         """The score of the axes rx, ry, rz together, where the reference has them."""
-        sd = {axis: one.position_sd for axis, one in self.axes.items()}
+        sd = {axis: estimate.position_sd for axis, estimate in self.axes.items()}
         return score_orientation(self.time, self.segment, self.positions(self.config), sd, reference)
 
 
@@ -142,11 +142,11 @@ def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
 
 def check_fused(counts: Mapping[str, Mapping[str, int]], config: FusionConfig) -> None:
     """Refuse a fusion of nothing, with what became of all rows."""
-    if any(mine.get(one.word) for mine in counts.values() for one in (Outcome.FUSED, Outcome.REACQUIRED)):
+    if any(count.get(outcome.word) for count in counts.values() for outcome in (Outcome.FUSED, Outcome.REACQUIRED)):
         return
     rows = [
-        f"'{name}' has {', '.join(f'{count} {word}' for word, count in mine.items()) or 'no rows'}"
-        for name, mine in counts.items()
+        f"'{name}' has {', '.join(f'{count} {word}' for word, count in of_sensor.items()) or 'no rows'}"
+        for name, of_sensor in counts.items()
     ]
     absent = [f"'{name}' of fusion.toml is not in the run" for name in config.sensors if name not in counts]
     why = "; ".join([*rows, *absent]) or "neither the run nor fusion.toml has a sensor"
@@ -207,8 +207,8 @@ def _check_read(path: Path, time: FloatArray, segment: IntArray, axes: Mapping[s
     within = np.diff(segment) == 0
     if not np.isfinite(time).all() or (np.diff(time)[within] < 0.0).any() or (np.diff(segment) < 0).any():
         raise FolderError(f"{path}: time_s is not ascending; the file was changed")
-    for axis, one in axes.items():
-        if not np.isfinite([one.position, one.position_sd]).all():
+    for axis, estimate in axes.items():
+        if not np.isfinite([estimate.position, estimate.position_sd]).all():
             raise FolderError(f"{path}: positions of '{axis}' are missing; the file was changed")
 
 
@@ -254,11 +254,11 @@ def measurements_table(est: Estimates) -> pa.Table:
     """Every component of every measurement as a table, in the units of files."""
     r, positions = est.measurements, dict[str, pa.Array]()
     kinds = est.config.arm.kind_of
-    known: dict[Kind, None] = {kinds[axis]: None for axis in r.axes}
-    for kind in known:  # columns for each: null on axes of the other
-        mine, screen = np.array([kinds[axis] == kind for axis in r.axes])[r.axis], SCREEN[kind]
+    kinds_seen: dict[Kind, None] = {kinds[axis]: None for axis in r.axes}
+    for kind in kinds_seen:  # columns for each: null on axes of the other
+        of_kind, screen = np.array([kinds[axis] == kind for axis in r.axes])[r.axis], SCREEN[kind]
         for name in ("value", "innovation", "innovation_sd"):
-            positions[f"{name}_{screen.unit}"] = _column_of(np.where(mine, getattr(r, name) * screen.scale, np.nan))
+            positions[f"{name}_{screen.unit}"] = _column_of(np.where(of_kind, getattr(r, name) * screen.scale, np.nan))
     return pa.table(
         {
             "time_s": _column_of(r.time),
@@ -322,10 +322,10 @@ def _own_reference(table: Table, config: FusionConfig) -> ReferenceTrack:
 
 def _numbers(table: Table, axis: str, column: str, arm: ArmModel) -> FloatArray:
     """A column of positions of an axis [m or rad]."""
-    found = table.numbers(column)[0]
+    numbers = table.numbers(column)[0]
     if axis in arm.axes:
         _check_kind(table.path, axis, kind_of(column) or "length", arm)
-    return found
+    return numbers
 
 
 def _check_kind(path: Path, axis: str, kind: Kind, arm: ArmModel) -> None:
@@ -371,8 +371,8 @@ def _column_of(values: npt.NDArray[Any]) -> pa.Array:
 
     ``pa.array`` would import pandas wherever there is one, which takes longer than to fuse.
     """
-    known = ~np.isnan(values)
-    bits = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
+    is_known = ~np.isnan(values)
+    bits = None if is_known.all() else pa.py_buffer(np.packbits(is_known, bitorder="little"))
     return pa.Array.from_buffers(
         pa.from_numpy_dtype(values.dtype), len(values), [bits, pa.py_buffer(np.ascontiguousarray(values))]
     )

@@ -41,13 +41,13 @@ class ReferenceTrack:
 
     def between(self, after: float, until: float) -> ReferenceTrack:
         """The rows after one instant and until another [s]."""
-        mine = (self.time > after) & (self.time <= until)
+        rows = (self.time > after) & (self.time <= until)
         return ReferenceTrack(
-            self.time[mine],
-            {axis: position[mine] for axis, position in self.position.items()},
-            {axis: sd[mine] for axis, sd in self.sd.items()},
-            self.segment[mine],
-            None if self.cartesian is None else {name: x[mine] for name, x in self.cartesian.items()},
+            self.time[rows],
+            {axis: position[rows] for axis, position in self.position.items()},
+            {axis: sd[rows] for axis, sd in self.sd.items()},
+            self.segment[rows],
+            None if self.cartesian is None else {name: x[rows] for name, x in self.cartesian.items()},
         )
 
     def __repr__(self) -> str:
@@ -61,8 +61,8 @@ def late_rows(stamp: TimeArray) -> BoolArray:
 
 def reference_track(parts: Sequence[Source], origin: int) -> ReferenceTrack:
     """The reference of a run's segments in order, in seconds since ``origin`` (int ns), without late rows."""
-    known = [part.rows((part.stamp != NO_STAMP) & ~late_rows(part.stamp)) for part in parts]
-    used = [part.rows(in_order(part.stamp)) for part in known]
+    parts_known = [part.rows((part.stamp != NO_STAMP) & ~late_rows(part.stamp)) for part in parts]
+    used = [part.rows(in_order(part.stamp)) for part in parts_known]
     return ReferenceTrack(
         seconds(np.concatenate([part.stamp for part in used]), origin),
         {axis: np.concatenate([part.values[axis] for part in used]) for axis in used[0].values},
@@ -165,19 +165,19 @@ def score_orientation(
     if not (set(TURNING) <= position.keys() and set(TURNING) <= reference.position.keys()):
         return None
     true = {axis: _true(time, segment, reference, axis) for axis in TURNING}
-    known = np.isfinite([value for value, _ in true.values()]).all(axis=0)
-    if not known.any():
+    is_known = np.isfinite([value for value, _ in true.values()]).all(axis=0)
+    if not is_known.any():
         return None
-    mine = {axis: position[axis][known] for axis in TURNING}
-    noise = {axis: np.sqrt(sd[axis] ** 2 + variance)[known] for axis, (_, variance) in true.items()}
-    vectors = np.column_stack([*mine.values()]), np.column_stack([value[known] for value, _ in true.values()])
+    turned = {axis: position[axis][is_known] for axis in TURNING}
+    noise = {axis: np.sqrt(sd[axis] ** 2 + variance)[is_known] for axis, (_, variance) in true.items()}
+    vectors = np.column_stack([*turned.values()]), np.column_stack([value[is_known] for value, _ in true.values()])
     angle = rotations.angle_between(*map(rotations.of_vectors, vectors))
-    variance: FloatArray = np.einsum("nii->n", turning_covariance(mine, noise))
+    variance: FloatArray = np.einsum("nii->n", turning_covariance(turned, noise))
     return OrientationScore(
         rms=float(np.sqrt(np.mean(angle**2))),
         expected=float(np.sqrt(np.mean(variance))),
-        rows=int(known.sum()),
-        left_out=int((~known).sum()),
+        rows=int(is_known.sum()),
+        left_out=int((~is_known).sum()),
     )
 
 
@@ -186,21 +186,21 @@ def interpolated(time: FloatArray, segment: IntArray | IndexArray, reference: Re
 
     A gap is an interval longer than twice the reference's median interval and longer than 50 ms.
     """
-    found = np.full(len(time), np.nan)
+    values_there = np.full(len(time), np.nan)
     for number in set(segment.tolist()):
         here = segment == number
         rows = (reference.segment == number) & np.isfinite(reference.position[axis])
-        found[here] = _between(time[here], reference.time[rows], reference.position[axis][rows])
-    return found
+        values_there[here] = _between(time[here], reference.time[rows], reference.position[axis][rows])
+    return values_there
 
 
 def _score(error: FloatArray, variance: FloatArray) -> Score | None:
     """The score of errors, NaN where there is no reference, with the variance that they should have."""
-    known = np.isfinite(error)
-    if not known.any():
+    is_known = np.isfinite(error)
+    if not is_known.any():
         return None
-    left_out = int((~known).sum())
-    error, variance = error[known], variance[known]
+    left_out = int((~is_known).sum())
+    error, variance = error[is_known], variance[is_known]
     counted = (variance > 0.0) | (error != 0.0)  # what is known exactly and right says nothing about the error bars
     with np.errstate(divide="ignore"):
         nees = error[counted] ** 2 / variance[counted]
@@ -220,13 +220,13 @@ def _true(time: FloatArray, segment: IntArray, reference: ReferenceTrack, axis: 
     return interpolated(time, segment, reference, axis), sd**2
 
 
-def _between(time: FloatArray, known: FloatArray, value: FloatArray) -> FloatArray:
-    if not len(known):
+def _between(time: FloatArray, at: FloatArray, value: FloatArray) -> FloatArray:
+    if not len(at):
         return np.full(len(time), np.nan)
-    known, first = np.unique(known, return_index=True)
-    longest = max(2.0 * median(np.diff(known)) if len(known) > 1 else 0.0, _SHORTEST_GAP)
-    after = np.searchsorted(known, time, side="right")
-    right, left = np.minimum(after, len(known) - 1), np.maximum(after - 1, 0)
-    inside = (time >= known[0]) & (time <= known[-1])
-    near = (known[right] - known[left] <= longest) | (known[left] == time)
-    return np.where(inside & near, np.interp(time, known, value[first]), np.nan)
+    at, first = np.unique(at, return_index=True)
+    longest = max(2.0 * median(np.diff(at)) if len(at) > 1 else 0.0, _SHORTEST_GAP)
+    after = np.searchsorted(at, time, side="right")
+    right, left = np.minimum(after, len(at) - 1), np.maximum(after - 1, 0)
+    inside = (time >= at[0]) & (time <= at[-1])
+    near = (at[right] - at[left] <= longest) | (at[left] == time)
+    return np.where(inside & near, np.interp(time, at, value[first]), np.nan)

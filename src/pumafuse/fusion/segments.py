@@ -91,20 +91,20 @@ class Segment:
             The events; and where among them each of ``measurement_rows`` is.
         """
         times = (*self._delay(config), *self._latency(config).tolist())
-        found = self._latest.get(times)  # a search asks for many configurations of the same times
-        if found is None:
+        cached = self._latest.get(times)  # a search asks for many configurations of the same times
+        if cached is None:
             groups = self._groups(config)
             table = self._tables.get(groups)
             if table is None:
                 self._tables.clear()  # threads share it
                 table = self._tables[groups] = self._joined(groups)
             events, order = self._ordered(config, *table)
-            place = np.empty(len(order), dtype=np.int64)
-            place[order] = np.arange(len(order))
-            found = self._latest[times] = events, place[len(order) - len(self.measurement_rows.time) :]
+            index = np.empty(len(order), dtype=np.int64)
+            index[order] = np.arange(len(order))
+            cached = self._latest[times] = events, index[len(order) - len(self.measurement_rows.time) :]
             for oldest in list(self._latest)[:-_KEPT]:
                 self._latest.pop(oldest, None)  # threads share it
-        return found
+        return cached
 
     def events_once(self, config: FusionConfig) -> Events:
         """The events in their order where nobody will ask again: nothing of them is kept here."""
@@ -117,7 +117,7 @@ class Segment:
     def _groups(self, config: FusionConfig) -> tuple[int, ...]:
         """Which of the distinct delays each axis has."""
         distinct = sorted(set(self._delay(config)))
-        return tuple(distinct.index(one) for one in self._delay(config))
+        return tuple(distinct.index(group) for group in self._delay(config))
 
     def _ordered(self, config: FusionConfig, unordered: Events, moves: IntArray) -> tuple[Events, IntArray]:
         """Events in their order, and that."""
@@ -131,8 +131,8 @@ class Segment:
         """Commands, one event for each group of axes that share a delay, then measurements; which time moves each."""
         rows, measured, parts, moves = self.command_rows, self.measurement_rows, list[Events](), list[IntArray]()
         for group in sorted(set(groups)):
-            known = np.where(np.array(groups) == group, rows.known, np.uint8(ABSENT))
-            parts.append(rows._replace(known=known).where(on_any_axis(known, Outcome.FUSED)))
+            codes = np.where(np.array(groups) == group, rows.known, np.uint8(ABSENT))
+            parts.append(rows._replace(known=codes).where(on_any_axis(codes, Outcome.FUSED)))
             moves.append(np.full(len(parts[-1].time), group))
         sensors = max(groups) + 1 + measured.source.astype(np.int64)
         return joined([*parts, measured]), np.concatenate([*moves, sensors])
@@ -159,8 +159,8 @@ class Segment:
         """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
         rows = self.measurement_rows._replace(value=self.unwrapped())  # one sensor after the other
         begin = np.searchsorted(rows.source, np.arange(len(self.sensors) + 1)).tolist()
-        found = {name: rows.rows(slice(*ends)) for name, ends in zip(self.sensors, pairwise(begin), strict=True)}
-        return {name: part for name, part in found.items() if len(part.time)}
+        by_sensor = {name: rows.rows(slice(*ends)) for name, ends in zip(self.sensors, pairwise(begin), strict=True)}
+        return {name: part for name, part in by_sensor.items() if len(part.time)}
 
     def unwrapped(self) -> FloatArray:
         """Values of ``measurement_rows`` without the jumps of a sensor that measures within a turn, (rows, A)."""
@@ -169,8 +169,8 @@ class Segment:
             return rows.value
         value = rows.value.copy()
         for sensor, axis in np.argwhere(self.turn > 0.0).tolist():
-            mine = (rows.source == sensor) & np.isfinite(value[:, axis])
-            value[mine, axis] = np.unwrap(value[mine, axis], period=float(self.turn[sensor, axis]))
+            rows_of_sensor = (rows.source == sensor) & np.isfinite(value[:, axis])
+            value[rows_of_sensor, axis] = np.unwrap(value[rows_of_sensor, axis], period=float(self.turn[sensor, axis]))
         return value
 
     def of_axis(self, axis: str, rows: IntArray) -> Segment:
@@ -213,12 +213,12 @@ def build(
     config: FusionConfig,
     sensors: Iterable[str] | None = None,
     begun: Segment | None = None,
-    own: tuple[int, int] = WHOLE,
+    span: tuple[int, int] = WHOLE,
 ) -> Segment:
     """Put a segment of a recorded run into a table of events.
 
     A piece of a run has the origin and the start levels of the one that has ``begun`` it; of its rows those after and
-    until the instants ``own`` [int ns] are counted, the others are there to be compared with them.
+    until the instants ``span`` [int ns] are counted, the others are there to be compared with them.
     """
     _check_axes(run, config.arm)
     label, notes = run.command.label, list(run.notes)
@@ -228,29 +228,31 @@ def build(
     policy = _policy(config, run.axes, used)
     rows = _command_rows(run, policy, notes)
     unstamped = len(run.command.stamp) - len(rows.stamp)
-    command_counts = _command_counts(rows.rows(_owned(rows.stamp, own)), unstamped)
+    command_counts = _command_counts(rows.rows(_owned(rows.stamp, span)), unstamped)
     rows = _on_ticks(run, config, rows, notes)
     used_rows = on_any_axis(rows.known, Outcome.FUSED)
     origin = begun.origin if begun else int(rows.stamp[used_rows][0])
     ends = run.ends(origin)
     within = rows.stamp <= ends[1]
-    outside = int(np.count_nonzero((used_rows & ~within)[_owned(rows.stamp, own)]))
+    outside = int(np.count_nonzero((used_rows & ~within)[_owned(rows.stamp, span)]))
     command_counts = counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
     commands, rows = rows.stamp[used_rows & within], rows.where(within)
     notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
-    late = [axis for axis, known in zip(run.axes, rows.known.T, strict=True) if _FUSED not in known]
+    late = [axis for axis, codes in zip(run.axes, rows.known.T, strict=True) if _FUSED not in codes]
     if late and not begun:
         raise RunError(f"{label}: no command for axis '{late[0]}' {run.interval} after the first command")
-    given = {axis: (rows.known[:, number] == _FUSED).argmax() for number, axis in enumerate(run.axes)}
-    first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
+    first_fused = {axis: (rows.known[:, number] == _FUSED).argmax() for number, axis in enumerate(run.axes)}
+    first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(first_fused.items())}
     parts = [
-        _measurement_rows(run, config, number, used, policy, rows, origin, own, notes) for number in range(len(used))
+        _measurement_rows(run, config, number, used, policy, rows, origin, span, notes) for number in range(len(used))
     ]
     measured = joined([Events.empty(len(run.axes)), *(part for part, _ in parts)])
-    counts = {name: {NOT_SELECTED: len(one.stamp[_owned(one.stamp, own)])} for name, one in run.sensors.items()}
-    counts |= {name: found for name, (_, found) in zip(used, parts, strict=True)}
-    if run.interval and own == WHOLE and not (measured.known == _FUSED).any():
+    counts = {
+        name: {NOT_SELECTED: len(sensor.stamp[_owned(sensor.stamp, span)])} for name, sensor in run.sensors.items()
+    }
+    counts |= {name: held for name, (_, held) in zip(used, parts, strict=True)}
+    if run.interval and span == WHOLE and not (measured.known == _FUSED).any():
         raise RunError(f"run '{run.name}': no measurement to use is stamped {run.interval} after the first command")
     return Segment(
         axes=run.axes,
@@ -268,15 +270,17 @@ def build(
     )
 
 
-def output_times(segment: Segment, config: FusionConfig, rate: float | None, own: tuple[int, int] = WHOLE) -> TimeArray:
+def output_times(
+    segment: Segment, config: FusionConfig, rate: float | None, span: tuple[int, int] = WHOLE
+) -> TimeArray:
     """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on."""
-    since, until = max(segment.ends[0], own[0] + 1), min(segment.ends[1], own[1])
+    since, until = max(segment.ends[0], span[0] + 1), min(segment.ends[1], span[1])
     if rate is None:
         times = segment.commands[(segment.commands >= since) & (segment.commands <= until)]
     else:
-        last = min(until, segment.end(config)) if own[1] >= segment.ends[1] else until
+        last = min(until, segment.end(config)) if span[1] >= segment.ends[1] else until
         times = _grid(segment.origin, max(since, segment.origin), last, rate)
-    if not len(times) and own == WHOLE:
+    if not len(times) and span == WHOLE:
         raise no_estimates(rate)
     return times
 
@@ -340,12 +344,14 @@ def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -
 
 def _unmatched(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:
     """A sentence on each configured sensor that the run does not have: one of another name may be the same."""
-    found: list[str] = []
+    unmatched: list[str] = []
     for name in silent:
         close = strangers if len(silent) == len(strangers) == 1 else get_close_matches(name, strangers, n=1)
-        like = f"; is '{close[0]}', which the configuration does not have, the same? One name for both" if close else ""
-        found.append(f"sensor '{name}' of the configuration has no measurements in this run{like}")
-    return found
+        similar = (
+            f"; is '{close[0]}', which the configuration does not have, the same? One name for both" if close else ""
+        )
+        unmatched.append(f"sensor '{name}' of the configuration has no measurements in this run{similar}")
+    return unmatched
 
 
 def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
@@ -361,10 +367,10 @@ def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
         rows.known[source.stray[order][:, None] & (rows.known == int(Outcome.INVALID))] = int(Outcome.STRAY)
     note_rows(notes, label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
     for number, axis in enumerate(run.axes):
-        known, hollow = rows.known[:, number], np.zeros(len(missing), dtype=np.bool_)
-        hollow[order] = known == int(Outcome.INVALID)
+        codes, hollow = rows.known[:, number], np.zeros(len(missing), dtype=np.bool_)
+        hollow[order] = codes == int(Outcome.INVALID)
         note_rows(notes, label, hollow, f"no finite {axis} command: not used")
-        if not (known == _FUSED).any():
+        if not (codes == _FUSED).any():
             raise RunError(f"{label}: no command for axis '{axis}' is a number below 1e6 m or rad")
     return rows
 
@@ -377,7 +383,7 @@ def _command_counts(rows: Events, unstamped: int) -> dict[str, int]:
         "used": int(np.count_nonzero(best == _FUSED)),
         Outcome.DUPLICATE.word: int(np.count_nonzero(again & hidden)),
         REPETITION: int(np.count_nonzero(again & ~hidden)),
-        **{one.word: int(np.count_nonzero(best == int(one))) for one in (Outcome.INVALID, Outcome.STRAY)},
+        **{outcome.word: int(np.count_nonzero(best == int(outcome))) for outcome in (Outcome.INVALID, Outcome.STRAY)},
         NO_STAMP_WORD: unstamped,
     }
 
@@ -398,10 +404,10 @@ def _on_ticks(run: Run, config: FusionConfig, rows: Events, notes: list[str]) ->
         return rows
     label = run.command.label
     rows = rows.where(on_any_axis(rows.known, Outcome.FUSED))
-    distinct, place = np.unique(rows.stamp, return_inverse=True)
+    distinct, tick = np.unique(rows.stamp, return_inverse=True)
     grid, note = regular_grid(distinct, config.arm.update_period, label)
     notes.extend([] if note is None else [note])
-    return rows._replace(time=grid[place], stamp=grid[place])
+    return rows._replace(time=grid[tick], stamp=grid[tick])
 
 
 def _measurement_rows(
@@ -412,7 +418,7 @@ def _measurement_rows(
     policy: Model,
     commands: Events,
     origin: int,
-    own: tuple[int, int],
+    span: tuple[int, int],
     notes: list[str],
 ) -> tuple[Events, dict[str, int]]:
     """The rows of one of the sensors ``names`` by stamp, each value classified, and how many of its own are what."""
@@ -428,8 +434,8 @@ def _measurement_rows(
     if sensor is not None:
         notes += _hold(rows, commands, config, name, label, run.axes, origin)
     kept = rows.where(used[order])
-    mine = source.stamp[_owned(_valid(source.stamp, latency), own)]
-    counts = _measurement_counts(kept.rows(_owned(kept.time, own)), mine)
+    stamps = source.stamp[_owned(_valid(source.stamp, latency), span)]
+    counts = _measurement_counts(kept.rows(_owned(kept.time, span)), stamps)
     note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
     if sensor is None:
         note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
@@ -437,15 +443,15 @@ def _measurement_rows(
     note_rows(notes, label, missing, f"no stamp: {Outcome.INVALID.word}")
     if ((rows.known == _FUSED) | (rows.known == ABSENT)).all():
         return kept, counts
-    known = np.empty_like(rows.known)
-    known[order] = rows.known
+    codes = np.empty_like(rows.known)
+    codes[order] = rows.known
     for kind, reason in _REASONS.items():
-        note_rows(notes, label, on_any_axis(known, kind), f"{reason}: {kind.word}")
+        note_rows(notes, label, on_any_axis(codes, kind), f"{reason}: {kind.word}")
     for column, axis in enumerate(run.axes):
         if axis in source.values and sensor.sd_of(axis) is None:
             sd = of_kind("sd_mm", config.arm.axes[axis].kind)
             notes.append(f"{label}: {sd} has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
-        hollow = (known[:, column] == int(Outcome.INVALID)) & ~missing
+        hollow = (codes[:, column] == int(Outcome.INVALID)) & ~missing
         note_rows(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
     return kept, counts
 
@@ -460,21 +466,23 @@ def _hold(
     origin: int,
 ) -> list[str]:
     """Mark what one sensor says again and again as held; a sentence on each axis where it does."""
-    found = list[str]()
+    notes = list[str]()
     for column, axis in enumerate(axes):
-        mine, told = (np.flatnonzero(one.known[:, column] == _FUSED) for one in (rows, commands))
-        stamp, command = rows.stamp[mine], (commands.stamp[told], commands.value[told, column])
-        again, times = held(stamp, rows.value[mine, column], command, latest_follow(config, name, axis))
+        rows_seen, told = (
+            np.flatnonzero(table_of_rows.known[:, column] == _FUSED) for table_of_rows in (rows, commands)
+        )
+        stamp, command = rows.stamp[rows_seen], (commands.stamp[told], commands.value[told, column])
+        again, times = held(stamp, rows.value[rows_seen, column], command, latest_follow(config, name, axis))
         if again.any():
-            rows.known[mine[again], column] = int(Outcome.HELD)
+            rows.known[rows_seen[again], column] = int(Outcome.HELD)
             first, last = seconds(stamp[again][[0, -1]], origin).tolist()
             slow = f"{axis} gives each value {times} times, as a sensor that is slower than its rows"
             froze = f"{axis} repeats its value to the last digit while the commands move it (did it freeze?)"
-            found.append(
+            notes.append(
                 f"{label}: {slow if times > 1 else froze}, from {first:.2f} to {last:.2f} s: each value counts once,"
                 f" {np.count_nonzero(again)} are {Outcome.HELD.word}"
             )
-    return found
+    return notes
 
 
 def latest_follow(config: FusionConfig, sensor: str, axis: str) -> int:
@@ -496,34 +504,34 @@ def _table(source: Source, axes: tuple[str, ...], order: IntArray | slice, numbe
     """Rows of a source in an order, everything that it gives for the filter to decide on."""
     stamp = source.stamp[order].copy()
     shape = len(stamp), len(axes)
-    value, known = np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
+    value, codes = np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
     spread = np.ones(shape if source.spread or len(source.noise) else (0, len(axes)))
     for axis, column in source.values.items():
         at = axes.index(axis)
         value[:, at] = column[order]
-        known[:, at] = np.where(np.isnan(value[:, at]), ABSENT, _FUSED) if source.apart else _FUSED
+        codes[:, at] = np.where(np.isnan(value[:, at]), ABSENT, _FUSED) if source.apart else _FUSED
         if axis in source.spread:
             spread[:, at] = source.spread[axis][order]
     if len(source.noise):
         spread *= source.noise[order, None]
-    return Events(_valid(stamp, latency), np.full(len(stamp), number, dtype=np.int16), stamp, value, spread, known)
+    return Events(_valid(stamp, latency), np.full(len(stamp), number, dtype=np.int16), stamp, value, spread, codes)
 
 
-def best_of(known: CodeArray) -> CodeArray:
+def best_of(codes: CodeArray) -> CodeArray:
     """Of each row the outcome of the value that got farthest, (n,)."""
-    return reduce(np.minimum, known.T)
+    return reduce(np.minimum, codes.T)
 
 
-def on_any_axis(known: CodeArray, kind: Outcome) -> BoolArray:
+def on_any_axis(codes: CodeArray, kind: Outcome) -> BoolArray:
     """Rows of which a value is of a kind, (n,); ``any(axis=1)`` takes twenty times as long for few axes."""
-    return reduce(np.logical_or, (known == int(kind)).T)
+    return reduce(np.logical_or, (codes == int(kind)).T)
 
 
-def _owned(time: TimeArray, own: tuple[int, int]) -> IntArray | slice:
+def _owned(time: TimeArray, span: tuple[int, int]) -> IntArray | slice:
     """Which rows of a piece are its own: those without a stamp too, which no other piece has."""
-    if own == WHOLE:
+    if span == WHOLE:
         return slice(None)
-    return np.flatnonzero((time > own[0]) & (time <= own[1]) | (time == NO_STAMP))
+    return np.flatnonzero((time > span[0]) & (time <= span[1]) | (time == NO_STAMP))
 
 
 def _valid(stamp: TimeArray, latency: IntArray | int) -> TimeArray:

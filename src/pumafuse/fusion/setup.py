@@ -36,15 +36,15 @@ def axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, floa
     """What the filter knows of axes, (A,), with the level u₀ [m] of each where it is known."""
     arm, axis = config.arm, np.zeros(len(axes), AXIS)
     for number, name in enumerate(axes):
-        process, one = config.process[name], arm.axes[name]
-        axis[number] = record_of(one, arm.update_period, arm.delay_of(name), levels.get(name, np.nan))[0]
+        process, model = config.process[name], arm.axes[name]
+        axis[number] = record_of(model, arm.update_period, arm.delay_of(name), levels.get(name, np.nan))[0]
         record = axis[number]
         record["input_noise"], record["drift"] = process.input_noise, process.drift
         record["maneuver_noise"], record["maneuver_drift"] = process.maneuver_noise, process.maneuver_drift
         record["disturbance_sd"], record["disturbance_time"] = process.disturbance_sd, process.disturbance_time
         record["smoothness"] = _SMOOTHNESS[process.disturbance_kind]
         record["offset_sd"] = config.start.offset_sd_of(name)
-        record["lag_sd"], record["gain_sd"] = _sd_of(one.lag_ci95, arm.lag_of(name)), _gain_sd_of(one)
+        record["lag_sd"], record["gain_sd"] = _sd_of(model.lag_ci95, arm.lag_of(name)), _gain_sd_of(model)
     return axis
 
 
@@ -55,15 +55,21 @@ def sensors_of(
     sensor, view = np.zeros(len(names), SENSOR), np.zeros((len(names), len(axes)), VIEW)
     view["sd"], view["bias_time"], sensor["scale"] = np.nan, 1.0, 1.0
     for row, name in enumerate(names):
-        known = config.sensors.get(name)
-        if known is None:
+        configured = config.sensors.get(name)
+        if configured is None:
             continue
-        sensor[row] = known.scale, known.latency, known.latency_sd, known.gate, known.gates_rows(config.arm)
-        for number, one in enumerate(axes):
-            sd = known.sd_of(one)
+        sensor[row] = (
+            configured.scale,
+            configured.latency,
+            configured.latency_sd,
+            configured.gate,
+            configured.gates_rows(config.arm),
+        )
+        for number, axis in enumerate(axes):
+            sd = configured.sd_of(axis)
             inside = biased is not None and name in biased[number]
-            biases = (known.bias_sd_of(one), known.bias_drift_sd_of(one)) if inside else (0.0, 0.0)
-            view[row, number] = np.nan if sd is None else sd, *biases, known.bias_time, turn_of(config, name, one)
+            biases = (configured.bias_sd_of(axis), configured.bias_drift_sd_of(axis)) if inside else (0.0, 0.0)
+            view[row, number] = np.nan if sd is None else sd, *biases, configured.bias_time, turn_of(config, name, axis)
     return sensor, view
 
 
@@ -90,5 +96,5 @@ def live_model(config: FusionConfig, start: Mapping[str, float] | None = None) -
 
 def turn_of(config: FusionConfig, sensor: str, axis: str) -> float:
     """After which angle a sensor's measurements of an axis are the same again [rad]; 0: never."""
-    known = config.sensors.get(sensor)
-    return known.turn if known is not None and config.arm.axes[axis].kind == "angle" else 0.0
+    configured = config.sensors.get(sensor)
+    return configured.turn if configured is not None and config.arm.axes[axis].kind == "angle" else 0.0

@@ -63,7 +63,7 @@ class Skill(msgspec.Struct, frozen=True, kw_only=True):
             "a constant velocity": self.constant_velocity,
             "the command through the arm alone": self.command_alone,
         }
-        return min(((words, one.rms) for words, one in ways.items()), key=lambda way: way[1])
+        return min(((words, way.rms) for words, way in ways.items()), key=lambda way: way[1])
 
     @property
     def of_best_other(self) -> float | None:
@@ -97,12 +97,12 @@ def _summed_up(error: FloatArray) -> PredictionError:
 
 def _by_command(est: Estimates, sensor: str, axis: str, measured: Measurements) -> FloatArray:
     """Measurements of one segment less what the commands say of them [m or rad], without the first, (n - 1,)."""
-    known, segment = est.config.sensors[sensor], est.segments[int(measured.segment[0])]
+    configured, segment = est.config.sensors[sensor], est.segments[int(measured.segment[0])]
     time = est.origin + nanoseconds(measured.time)
-    left = measured.value - known.scale * (segment.start[axis] + segment.led(est.config.arm, axis, time))
+    left = measured.value - configured.scale * (segment.start[axis] + segment.led(est.config.arm, axis, time))
     if turn := turn_of(est.config, sensor, axis):
         left = left - turn * round(float(left[0]) / turn)
-    if known.bias_sd_of(axis) == 0.0:
+    if configured.bias_sd_of(axis) == 0.0:
         return left[1:]
     passed = measured.outcome != Outcome.REJECTED
     bias = np.cumsum(np.where(passed, left, 0.0)) / np.maximum(np.cumsum(passed), 1)
@@ -113,11 +113,11 @@ def _by_constant_velocity(parts: Sequence[Measurements]) -> FloatArray:
     """Innovations [m or rad] of the best constant-velocity filter on each segment, without the first of each, (n,)."""
     intervals = np.concatenate([np.diff(part.time) for part in parts])
     unit = median(intervals[intervals > 0.0]) if (intervals > 0.0).any() else 1.0
-    square, found, end = np.zeros(len(_DENSITIES)), np.empty(len(intervals)), 0
+    square, by_constant_velocity, end = np.zeros(len(_DENSITIES)), np.empty(len(intervals)), 0
     for part in parts:
         constant_velocity(part.time / unit, part.value, _DENSITIES, square)
     best = _DENSITIES[[np.argmin(square)]]
     for part in parts:
         begin, end = end, end + len(part.value) - 1
-        constant_velocity(part.time / unit, part.value, best, np.zeros(1), found[begin:end])
-    return found
+        constant_velocity(part.time / unit, part.value, best, np.zeros(1), by_constant_velocity[begin:end])
+    return by_constant_velocity

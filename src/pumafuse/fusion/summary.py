@@ -210,7 +210,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 def encode(summary: Summary) -> bytes:
     """The text of ``summary.json``."""
     tree = msgspec.to_builtins(summary) | {"validity": toml.reported(summary.validity)}
-    tree["axes"] = {axis: toml.reported(one, one.kind) for axis, one in summary.axes.items()}
+    tree["axes"] = {axis: toml.reported(axis_summary, axis_summary.kind) for axis, axis_summary in summary.axes.items()}
     tree["orientation"] = summary.orientation and toml.reported(summary.orientation)
     return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2) + b"\n"
 
@@ -219,7 +219,7 @@ def decode(text: bytes) -> Summary:
     """The summary of the text of ``summary.json``."""
     tree = msgspec.json.decode(text, type=dict[str, Any])
     parts = msgspec.convert(tree, _InUnits)
-    axes = {axis: toml.as_lengths(to_si(one)) for axis, one in parts.axes.items()}
+    axes = {axis: toml.as_lengths(to_si(axis_parts)) for axis, axis_parts in parts.axes.items()}
     orientation = parts.orientation and to_si(parts.orientation)
     in_si = {"axes": axes, "orientation": orientation, "validity": to_si(parts.validity)}
     return msgspec.convert(tree | in_si, Summary)
@@ -242,7 +242,7 @@ def orientation_score(est: Estimates) -> OrientationScore | None:
     """The score of the axes rx, ry, rz together; None without such, or without a reference of them."""
     if est.reference is None:
         return None
-    sd = {axis: one.position_sd for axis, one in est.axes.items()}
+    sd = {axis: estimate.position_sd for axis, estimate in est.axes.items()}
     return score_orientation(est.time, est.segment, est.positions, sd, est.reference)
 
 
@@ -281,27 +281,27 @@ def summary_of(est: Estimates, axes: dict[str, AxisSummary], orientation: Orient
 
 def beaten(axes: Mapping[str, AxisSummary]) -> list[str]:
     """A sentence on each sensor on an axis whose next measurement a simpler way predicts better than the filter."""
-    found = list[str]()
+    sentences = list[str]()
     for axis, part in axes.items():
         screen = SCREEN[part.kind]
-        for sensor, one in part.sensors.items():
-            if one.skill is None or (ratio := one.skill.of_best_other) is None or ratio < _BEATEN:
+        for sensor, of_sensor in part.sensors.items():
+            if of_sensor.skill is None or (ratio := of_sensor.skill.of_best_other) is None or ratio < _BEATEN:
                 continue
-            words, least = one.skill.best_other
-            sizes = [f"{error * screen.scale:.3g}" for error in (least, one.skill.filter.rms)]
-            found.append(
+            words, least = of_sensor.skill.best_other
+            sizes = [f"{error * screen.scale:.3g}" for error in (least, of_sensor.skill.filter.rms)]
+            sentences.append(
                 f"{axis}: {words} predicts the next measurement of {sensor} better than the fused estimate (RMS"
                 f" {sizes[0]} against {sizes[1]} {screen.unit}): the model of arm or noise is wrong somewhere; look at"
                 " the verdict, and at --figures"
             )
-    return found
+    return sentences
 
 
 def weighted_mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
     """The weighted mean of the values that there are; None without any."""
-    known = [(value, weight) for value, weight in zip(values, weights, strict=True) if value is not None]
-    total = sum(weight for _, weight in known)
-    return sum(value * weight for value, weight in known) / total if total else None
+    pairs = [(value, weight) for value, weight in zip(values, weights, strict=True) if value is not None]
+    total = sum(weight for _, weight in pairs)
+    return sum(value * weight for value, weight in pairs) / total if total else None
 
 
 def pooled(parts: Sequence[P], weights: Sequence[int]) -> P | None:
@@ -309,7 +309,7 @@ def pooled(parts: Sequence[P], weights: Sequence[int]) -> P | None:
     if not parts:
         return None
     keys = parts[0].__struct_fields__
-    return type(parts[0])(**{key: pooled_number(key, [getattr(one, key) for one in parts], weights) for key in keys})
+    return type(parts[0])(**{key: pooled_number(key, [getattr(part, key) for part in parts], weights) for key in keys})
 
 
 def pooled_number(key: str, values: Sequence[Any], weights: Sequence[int]) -> Any:
@@ -345,38 +345,40 @@ def score_axis(
 
 def axis_summary(est: Estimates, axis: str) -> AxisSummary:
     """Consistency and scores of one axis."""
-    mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
-    fused = int(np.sum(mine.outcome == Outcome.FUSED))
-    found = None
+    measured = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
+    fused = int(np.sum(measured.outcome == Outcome.FUSED))
+    score_here = None
     if est.reference is not None:
-        found = score_axis(est.time, est.segment, est[axis], est.reference, axis, est.config.arm.update_period)
+        score_here = score_axis(est.time, est.segment, est[axis], est.reference, axis, est.config.arm.update_period)
     evidence = cache(lambda: evidence_of(est, axis))
     return AxisSummary(
         sensors={
-            name: _sensor_summary(est, name, axis, evidence) for name in mine.sensors if len(mine.of(name, axis).value)
+            name: _sensor_summary(est, name, axis, evidence)
+            for name in measured.sensors
+            if len(measured.of(name, axis).value)
         },
-        log_likelihood=log_likelihood(mine, est.config.sensors),
-        score=found,
+        log_likelihood=log_likelihood(measured, est.config.sensors),
+        score=score_here,
         nees_band=chi_square_band(fused) if fused else None,
         kind=est.config.arm.axes[axis].kind,
     )
 
 
 def _sensor_summary(est: Estimates, sensor: str, axis: str, evidence: Callable[[], Evidence]) -> SensorSummary:
-    measurements, found = est.measurements.of(sensor, axis), consistency(est, sensor, axis, evidence)
-    if found is None:
+    measurements, checked = est.measurements.of(sensor, axis), consistency(est, sensor, axis, evidence)
+    if checked is None:
         return SensorSummary(outcomes=measurements.counts(), skill=skill(est, measurements))
     fused = measurements.where(measurements.outcome == Outcome.FUSED)
     bias = est.biases.get(sensor, {}).get(axis)
     first = 1 if bias is not None and len(fused.value) > 1 else 0  # the first measurement determines the bias
     rms = [float(np.sqrt(np.mean(values[first:] ** 2))) for values in (fused.innovation, fused.innovation_sd)]
-    return sensor_summary(axis, measurements.counts(), found, rms[0], rms[1], bias, skill(est, measurements))
+    return sensor_summary(axis, measurements.counts(), checked, rms[0], rms[1], bias, skill(est, measurements))
 
 
 def sensor_summary(
     axis: str,
     outcomes: dict[str, int],
-    found: Consistency,
+    consistency: Consistency,
     innovation_rms: float,
     innovation_sd: float,
     bias: Bias | None,
@@ -387,20 +389,22 @@ def sensor_summary(
         outcomes=outcomes,
         innovation_rms=innovation_rms,
         innovation_sd=innovation_sd,
-        nis_mean=found.nis,
-        nis_band=found.nis_band,
-        correlation=found.correlation.tolist(),
-        correlation_band=found.correlation_band,
-        whiteness_p=found.whiteness,
-        finding=found.finding.value,
-        verdict=sentence(found),
-        causes=[_found_cause(axis, one, found) for one in found.causes],
+        nis_mean=consistency.nis,
+        nis_band=consistency.nis_band,
+        correlation=consistency.correlation.tolist(),
+        correlation_band=consistency.correlation_band,
+        whiteness_p=consistency.whiteness,
+        finding=consistency.finding.value,
+        verdict=sentence(consistency),
+        causes=[_found_cause(axis, cause, consistency) for cause in consistency.causes],
         bias=None if bias is None else bias.value,
         bias_sd=None if bias is None else bias.sd,
         skill=skill,
     )
 
 
-def _found_cause(axis: str, one: Suspect, found: Consistency) -> FoundCause:
-    size = {one.cause.measure: one.size} if one.cause.measure and 0.0 < abs(one.size) < math.inf else {}
-    return FoundCause(axis=axis, sensor=one.sensor, cause=one.cause.value, words=in_words(one, found), **size)
+def _found_cause(axis: str, suspect: Suspect, consistency: Consistency) -> FoundCause:
+    size = {suspect.cause.measure: suspect.size} if suspect.cause.measure and 0.0 < abs(suspect.size) < math.inf else {}
+    return FoundCause(
+        axis=axis, sensor=suspect.sensor, cause=suspect.cause.value, words=in_words(suspect, consistency), **size
+    )

@@ -18,24 +18,24 @@ _TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
 
 def sensor_problems(est: Estimates) -> list[str]:
     """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows."""
-    found, given = list[str](), est.measurements
-    order, begin = given.grouped
-    outcome, ends = given.outcome.take(order), begin.tolist()
-    count = np.diff(begin).reshape(len(given.sensors), len(given.axes))
+    sentences, measured = list[str](), est.measurements
+    order, begin = measured.grouped
+    outcome, ends = measured.outcome.take(order), begin.tolist()
+    count = np.diff(begin).reshape(len(measured.sensors), len(measured.axes))
     alone = np.count_nonzero(count.any(axis=1)) < 2
-    for number, name in enumerate(given.sensors):
+    for number, name in enumerate(measured.sensors):
         if not count[number].any():
             continue
-        mine = slice(ends[number * len(given.axes)], ends[(number + 1) * len(given.axes)])
-        rejected = np.count_nonzero(outcome[mine] == int(Outcome.REJECTED)) / count[number].sum()
-        reacquired = len(set(given.time[order[mine][outcome[mine] == int(Outcome.REACQUIRED)]].tolist()))
-        of_axes = [each for each, some in zip(given.axes, count[number].tolist(), strict=True) if some]
+        rows = slice(ends[number * len(measured.axes)], ends[(number + 1) * len(measured.axes)])
+        rejected = np.count_nonzero(outcome[rows] == int(Outcome.REJECTED)) / count[number].sum()
+        reacquired = len(set(measured.time[order[rows][outcome[rows] == int(Outcome.REACQUIRED)]].tolist()))
+        of_axes = [each for each, some in zip(measured.axes, count[number].tolist(), strict=True) if some]
         kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
         sd, bias_sd, offset_sd = (
             "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")
         )
         if (width := _width_of_prior(est, name)) > _WIDEST:
-            found.append(
+            sentences.append(
                 f"{name}: its prior ({offset_sd}, {bias_sd}) is {width:.1e} times its noise: more than double precision"
                 " resolves; use a narrower prior"
             )
@@ -43,10 +43,10 @@ def sensor_problems(est: Estimates) -> list[str]:
             times = "once" if reacquired == 1 else f"{reacquired} times"
             of_all = f"the others or the model; if it is off by a constant, give it {bias_sd}"
             of_one = f"the model; {sd}, latency_ms or the process noise may be wrong"
-            found.append(f"{name}: its gate reacquired {times}: it contradicts {of_one if alone else of_all}")
+            sentences.append(f"{name}: its gate reacquired {times}: it contradicts {of_one if alone else of_all}")
         if rejected > MANY_REJECTED:
-            found.append(f"{name}: {rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}")
-    return found
+            sentences.append(f"{name}: {rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}")
+    return sentences
 
 
 def _width_of_prior(est: Estimates, name: str) -> float:
@@ -62,20 +62,22 @@ def _width_of_prior(est: Estimates, name: str) -> float:
     return max(widths, default=0.0)
 
 
-def sentence(found: Consistency) -> str:
+def sentence(consistency: Consistency) -> str:
     """The verdict on a sensor's components on an axis, in words."""
-    if found.finding is Finding.FEW:
-        return f"too few measurements ({found.count}) to tell"
-    low, high = found.nis_band
-    digits = next(n for n in range(2, 17) if _beside([found.nis, low, high]) == _beside([found.nis, low, high], n))
-    nis = f"NIS {found.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
-    sd, lag = of_kind("sd_mm", found.kind), found.strongest_lag if len(found.correlation) else 0
-    causes = ", or ".join(in_words(one, found) for one in found.causes)
-    match found.finding:
+    if consistency.finding is Finding.FEW:
+        return f"too few measurements ({consistency.count}) to tell"
+    low, high = consistency.nis_band
+    digits = next(
+        n for n in range(2, 17) if _beside([consistency.nis, low, high]) == _beside([consistency.nis, low, high], n)
+    )
+    nis = f"NIS {consistency.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
+    sd, lag = of_kind("sd_mm", consistency.kind), consistency.strongest_lag if len(consistency.correlation) else 0
+    causes = ", or ".join(in_words(cause, consistency) for cause in consistency.causes)
+    match consistency.finding:
         case Finding.REJECTED:
-            return f"{nis}, but {found.rejected:.0%} were {_TOO_SMALL.format(sd=sd)}"
+            return f"{nis}, but {consistency.rejected:.0%} were {_TOO_SMALL.format(sd=sd)}"
         case Finding.NOT_WHITE:
-            white = f"consistent in size, but not white (lag {lag}: {found.correlation[lag - 1]:+.2f})"
+            white = f"consistent in size, but not white (lag {lag}: {consistency.correlation[lag - 1]:+.2f})"
             return f"{nis}: {white}" + (f": {causes}" if causes else "")
         case Finding.AT_BOUND:
             return f"{nis}, but {sd} is at a bound of what can be fitted: error bars need not hold; configure it"
@@ -87,40 +89,39 @@ def sentence(found: Consistency) -> str:
             return f"{nis}: {causes or 'no one cause stands out'}"
 
 
-def in_words(one: Suspect, found: Consistency) -> str:
+def in_words(suspect: Suspect, consistency: Consistency) -> str:
     """A cause as a clause."""
-    sd, drift, bias = (of_kind(key, found.kind) for key in ("sd_mm", "bias_drift_sd_mm", "bias_sd_mm"))
-    maneuvers = of_kind("maneuver_drift_mm_rts_per_m_s", found.kind)
-    mine = f" of {one.sensor}" if one.sensor not in ("", found.sensor) else ""
-    size, small, screen = abs(one.size), "small" if one.size > 0.0 else "large", SCREEN[found.kind]
-    match one.cause:
+    sd, drift, bias = (of_kind(key, consistency.kind) for key in ("sd_mm", "bias_drift_sd_mm", "bias_sd_mm"))
+    maneuvers = of_kind("maneuver_drift_mm_rts_per_m_s", consistency.kind)
+    of_sensor = f" of {suspect.sensor}" if suspect.sensor not in ("", consistency.sensor) else ""
+    size, small, screen = abs(suspect.size), "small" if suspect.size > 0.0 else "large", SCREEN[consistency.kind]
+    match suspect.cause:
         case Cause.NOISE:
-            return f"{sd}{mine} is {_factor(one.size)}"
+            return f"{sd}{of_sensor} is {_factor(suspect.size)}"
         case Cause.PROCESS:
-            return f"the process noise is {_factor(one.size)}"
+            return f"the process noise is {_factor(suspect.size)}"
         case Cause.MANEUVERS:
             return f"the arm strays more where its speed changes ({maneuvers})"
         case Cause.CORRELATED:
-            return f"the noise{mine} is correlated, as of filtered or repeated values ({drift}, bias_time_s)"
+            return f"the noise{of_sensor} is correlated, as of filtered or repeated values ({drift}, bias_time_s)"
         case Cause.OUTLIERS:
-            return (
-                f"a few innovations{mine} are far larger than the others: outliers of the sensor, or jerks of the arm"
-            )
+            larger = f"a few innovations{of_sensor} are far larger than the others"
+            return f"{larger}: outliers of the sensor, or jerks of the arm"
         case Cause.LATENCY:
-            return f"latency_ms{mine} is {size * MS:.3g} ms too {small}"
+            return f"latency_ms{of_sensor} is {size * MS:.3g} ms too {small}"
         case Cause.LAG | Cause.PLANT:
-            whose, keys = ("the", "latency_ms, ") if one.sensor else ("the arm's", "")
+            whose, keys = ("the", "latency_ms, ") if suspect.sensor else ("the arm's", "")
             return f"{whose} lag is {size * MS:.3g} ms too {small} ({keys}delay_ms or plant)"
         case Cause.DYNAMICS:
             return "the error follows the acceleration: delay_ms against the plant, or a sensor that smooths its values"
         case Cause.SCALE:
-            return f"scale{mine} is {size:.2g} of itself too {small}"
+            return f"scale{of_sensor} is {size:.2g} of itself too {small}"
         case Cause.POSITION:
-            share = f" by {one.size:+.1%} of it" if size else ""
-            scale = "scale, " if one.sensor else ""
+            share = f" by {suspect.size:+.1%} of it" if size else ""
+            scale = "scale, " if suspect.sensor else ""
             return f"the error follows the position{share}: {scale}gain or a sag"
         case Cause.BIAS:
-            return f"{one.sensor} is off by a constant of {size * screen.scale:.2g} {screen.unit} ({bias})"
+            return f"{suspect.sensor} is off by a constant of {size * screen.scale:.2g} {screen.unit} ({bias})"
         case Cause.PLAY:
             return f"the error turns with the direction: a play of about {size * screen.scale:.2g} {screen.unit}"
         case Cause.LIMIT:

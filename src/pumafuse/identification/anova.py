@@ -94,10 +94,10 @@ def speed_levels(trials: Sequence[Trial], period: float, kind: Kind) -> list[str
 def numbers(cells: Sequence[str]) -> list[float] | None:
     """Levels as numbers; None where one is none."""
     try:
-        found = [float(cell) for cell in cells]
+        numbers = [float(cell) for cell in cells]
     except ValueError:
         return None
-    return found if np.isfinite(found).all() else None
+    return numbers if np.isfinite(numbers).all() else None
 
 
 def ordered(levels: set[str]) -> list[str]:
@@ -110,8 +110,13 @@ def ordered(levels: set[str]) -> list[str]:
 def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
     """Mean and scatter of (n,) values at each level named in ``cells`` (n,)."""
     return [
-        Level(level=level, trials=len(one), mean=float(one.mean()), sd=float(one.std(ddof=1)) if len(one) > 1 else None)
-        for level, one in _groups(values, cells).items()
+        Level(
+            level=level,
+            trials=len(group),
+            mean=float(group.mean()),
+            sd=float(group.std(ddof=1)) if len(group) > 1 else None,
+        )
+        for level, group in _groups(values, cells).items()
     ]
 
 
@@ -119,7 +124,7 @@ def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Se
     """Every coefficient, (trials,), against every factor, the level of each trial."""
     from scipy.stats import f, f_oneway
 
-    found = list[Dependence]()
+    dependences = list[Dependence]()
     for (coefficient, values), factor in product(coefficients.items(), factors):
         groups = list(_groups(values, factors[factor]).values())
         by_welch, adjusted, ratio, p = welch(groups), _adjusted(values, factor, factors), None, None
@@ -127,7 +132,7 @@ def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Se
             test = f_oneway(*groups)
             ratio = float(test.statistic / f.ppf(0.95, len(groups) - 1, len(values) - len(groups)))
             p = float(test.pvalue)
-        found.append(
+        dependences.append(
             Dependence(
                 coefficient=coefficient,
                 factor=factor,
@@ -139,7 +144,7 @@ def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Se
                 verdict=_verdict(ratio, by_welch, adjusted, alone=len(factors) == 1),
             )
         )
-    return found
+    return dependences
 
 
 def welch(groups: Sequence[FloatArray]) -> float | None:
@@ -184,12 +189,12 @@ def performances(
     factors: Mapping[str, Sequence[str]], rms: FloatArray, tolerance: float, kind: Kind
 ) -> list[Performance]:
     """Error of a model by each factor: ``rms`` of each trial's residuals, (n,), and ``tolerance``, both [m or rad]."""
-    screen, found = SCREEN[kind], list[Performance]()
+    screen, performances = SCREEN[kind], list[Performance]()
     for factor, cells in factors.items():
         levels = levels_of(rms * screen.scale, cells)
         limit, verdict = _limit(levels, tolerance * screen.scale, screen.unit)
-        found.append(Performance(factor=factor, levels=levels, limit=limit, verdict=verdict))
-    return found
+        performances.append(Performance(factor=factor, levels=levels, limit=limit, verdict=verdict))
+    return performances
 
 
 def _levels(cells: Sequence[str]) -> list[str]:
@@ -207,9 +212,9 @@ def validity(performance: Sequence[Performance], fastest: float, kind: Kind) -> 
 
     The speed of the ``fastest`` trial [m/s or rad/s] is the limit where no factor gives one.
     """
-    limits = {one.factor: one.limit for one in performance}
-    radius, found = limits.get("radius_mm"), limits.get(of_kind("speed_m_s", kind))
-    speed = found / SCREEN[kind].fast_scale if found else fastest
+    limits = {performance.factor: performance.limit for performance in performance}
+    radius, limit = limits.get("radius_mm"), limits.get(of_kind("speed_m_s", kind))
+    speed = limit / SCREEN[kind].fast_scale if limit else fastest
     return Validity(
         max_speed=speed if kind == "length" else None,
         max_angular_speed=speed if kind == "angle" else None,
@@ -237,7 +242,7 @@ def _replicate_sd(trials: Sequence[Trial], values: FloatArray) -> float | None:
 def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
     """P of one factor in a model with all of them (main effects)."""
     without = {name: cells for name, cells in factors.items() if name != factor}
-    full, reduced = (weighted(values, np.ones(len(values)), _design(values, one)) for one in (factors, without))
+    full, reduced = (weighted(values, np.ones(len(values)), _design(values, columns)) for columns in (factors, without))
     if full.freedom < 1 or full.freedom == reduced.freedom or full.squares <= 1e-24 * float(values @ values):
         return None
     return full.p_against(reduced)
@@ -255,14 +260,14 @@ def _verdict(ratio: float | None, welch: float | None, adjusted: float | None, a
     if ratio is None:
         return "cannot be tested: no scatter within any level"
     words = {True: "dependent", False: "independent"}
-    found = words[ratio > 1.0]
+    verdict = words[ratio > 1.0]
     if welch is not None and (welch < 0.05) != (ratio > 1.0):
-        found += f", but by Welch's test {words[welch < 0.05]}"
+        verdict += f", but by Welch's test {words[welch < 0.05]}"
     if adjusted is None:
-        return found if alone else f"{found}; confounded with the other factors"
+        return verdict if alone else f"{verdict}; confounded with the other factors"
     if (adjusted < 0.05) != (ratio > 1.0):
-        found += f"; beside the other factors {words[adjusted < 0.05]}"
-    return found
+        verdict += f"; beside the other factors {words[adjusted < 0.05]}"
+    return verdict
 
 
 def _limit(levels: Sequence[Level], tolerance: float, unit: str) -> tuple[float | None, str]:

@@ -99,30 +99,30 @@ class Batch:
 
         A delay takes no part where it has no effect, or where its bound 0 is active.
         """
-        own = np.einsum("ij,ij->i", slopes[0], slopes[0])
+        squares = np.einsum("ij,ij->i", slopes[0], slopes[0])
         gradient = np.einsum("ij,ij->i", slopes[0], at.residual)
         largest = np.einsum("ij,ij->i", at.unit, at.unit) * (at.amplitude / at.shape[:, 1]) ** 2
-        effective = own > _NO_EFFECT * largest
-        delay_sd = np.where(effective, 1.0 / np.sqrt(np.where(effective, own, 1.0)), np.inf)
+        effective = squares > _NO_EFFECT * largest
+        delay_sd = np.where(effective, 1.0 / np.sqrt(np.where(effective, squares, 1.0)), np.inf)
         at_bound = (at.shape[:, 0] <= 0.0) & (gradient <= 0.0)
-        own = np.where(at_bound | ~effective, np.inf, own * (1.0 + damping))
+        squares = np.where(at_bound | ~effective, np.inf, squares * (1.0 + damping))
         cross = np.einsum("ij,kij->ik", slopes[0], slopes[1:])
-        coupling = cross / own[:, None]
+        coupling = cross / squares[:, None]
         information = np.einsum("kij,lij->ikl", slopes[1:], slopes[1:]) - cross[:, :, None] * coupling[:, None, :]
         score = np.einsum("kij,ij->ik", slopes[1:], at.residual) - coupling * gradient[:, None]
-        return Equations(gradient / own, coupling, information, score, delay_sd)
+        return Equations(gradient / squares, coupling, information, score, delay_sd)
 
     def stepped(self, at: Point, order: Order, damping: FloatArray, low: FloatArray, high: FloatArray) -> Point:
         """After a step of each group of rows, whose ``damping`` is (R / size,), between ``low`` and ``high`` (3,)."""
         size = len(at.shape) // len(damping)
         slopes, _ = self.slopes(at, order)
-        own = self.equations(at, slopes, np.repeat(damping, size))
-        information, score = _grouped(own.information, size), _grouped(own.score, size)
+        equations = self.equations(at, slopes, np.repeat(damping, size))
+        information, score = _grouped(equations.information, size), _grouped(equations.score, size)
         plant = _damped_step(at.shape[::size, 1:], information, score, damping)
         plant = np.clip(np.repeat(plant, size, axis=0), low[1:], high[1:])
         plant[:, 0] = np.maximum(plant[:, 0], 0.2 * at.shape[:, 1])
         moved = (plant - at.shape[:, 1:])[:, :order]
-        delay = at.shape[:, 0] + own.shift - np.einsum("ij,ij->i", own.coupling, moved)
+        delay = at.shape[:, 0] + equations.shift - np.einsum("ij,ij->i", equations.coupling, moved)
         return self.point(np.column_stack((np.clip(delay, low[0], high[0]), plant)))
 
     def fit(self, start: FloatArray, order: Order, size: int = 1) -> Point:
@@ -134,11 +134,11 @@ class Batch:
         most, spacing = float(end.max()), (end - self.time[:, 0]) / (self.count - 1.0)
         low = np.array([0.0, 1e-3 * float(spacing.min()), 0.0])
         high = np.array([most, 20.0 * most, (5.0 * most) ** 2])
-        found = self.point(np.clip(start, low, high))
+        point = self.point(np.clip(start, low, high))
         rows, damping = np.arange(len(start)), np.full(len(start) // size, 1e-3)
 
         for _ in range(_ITERATIONS):
-            here, at = self.take(rows), Point(*(whole[rows] for whole in found))
+            here, at = self.take(rows), Point(*(whole[rows] for whole in point))
             new = here.stepped(at, order, damping, low, high)
             cost = _grouped(at.cost, size)
             decrease = cost - _grouped(new.cost, size)
@@ -146,12 +146,12 @@ class Batch:
             damping = np.where(better, np.maximum(0.2 * damping, 1e-12), 8.0 * damping)
             going = np.where(better, decrease > _CONVERGED * cost, damping < _MOST_DAMPING)
             better, kept = np.repeat(better, size), np.repeat(going, size)
-            for whole, part in zip(found, new, strict=True):
+            for whole, part in zip(point, new, strict=True):
                 whole[rows[better]] = part[better]
             rows, damping = rows[kept], damping[going]
             if not len(rows):
                 break
-        return found
+        return point
 
 
 def sensitivity(time: FloatArray, shape: FloatArray, order: Order) -> list[FloatArray]:
@@ -160,12 +160,12 @@ def sensitivity(time: FloatArray, shape: FloatArray, order: Order) -> list[Float
     The difference quotient of p is one-sided where p is 0.
     """
     q, p = shape[:, 1], shape[:, 2]
-    size, found = _REACH * q, list[FloatArray]()
+    size, sensitivity = _REACH * q, list[FloatArray]()
     ends = [(size, size), (size, size), (np.minimum(size * q, p), size * q)][: order + 1]
     for unit, (below, above) in zip(np.eye(3), ends, strict=False):
         low, high = _response(time, shape - below[:, None] * unit), _response(time, shape + above[:, None] * unit)
-        found.append((high - low) / (above + below)[:, None])
-    return found
+        sensitivity.append((high - low) / (above + below)[:, None])
+    return sensitivity
 
 
 def _response(time: FloatArray, shape: FloatArray) -> FloatArray:

@@ -114,34 +114,34 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool, kind: Kind) ->
     if usual == 0.0:
         return "the arm does not move"
     left_out = _unseen(fitted) if paper else _outlying(fitted)
-    left_out |= {one.trial.name: why for one in fitted if (why := doubt(one.first, usual)) is not None}
-    used = [one for one in fitted if one.trial.name not in left_out]
+    left_out |= {fit.trial.name: why for fit in fitted if (why := doubt(fit.first, usual)) is not None}
+    used = [fit for fit in fitted if fit.trial.name not in left_out]
     if len(used) < _FEWEST:
         why = "; ".join(f"trial '{name}' {reason}" for name, reason in list(left_out.items())[:3])
         return f"{len(used)} usable trials, at least {_FEWEST} are needed" + (f" ({why})" if why else "")
-    found = _published(used, kind) if paper else _fitted_together(used, kind)
-    gain, lack, words = _gain_line(found, period, kind)
-    delay = common(found.delay, found.delay_sd)
-    tau = np.array([one.first.shape.q for one in used])
-    seen = np.array([one.onset for one in used if np.isfinite(one.onset)])
+    published = _published(used, kind) if paper else _fitted_together(used, kind)
+    gain, lack, words = _gain_line(published, period, kind)
+    delay = common(published.delay, published.delay_sd)
+    tau = np.array([fit.first.shape.q for fit in used])
+    seen = np.array([fit.onset for fit in used if np.isfinite(fit.onset)])
     axis = CombinedAxis(
         trials=len(used),
         left_out=left_out,
-        choice=found.choice,
-        model=AxisModel(kind=kind, plant=found.plant, gain=gain, delay=delay.value, delay_ci95=delay.ci95),
+        choice=published.choice,
+        model=AxisModel(kind=kind, plant=published.plant, gain=gain, delay=delay.value, delay_ci95=delay.ci95),
         time_constant_mean=mean(tau),
         time_constant_robust=robust(tau),
         delays=Delays(
-            lag=common(found.delay + found.lag, found.delay_sd),
+            lag=common(published.delay + published.lag, published.delay_sd),
             fitted=delay,
             onset=mean(seen) if len(seen) else None,
         ),
-        delay_spread=float(found.delay.std(ddof=1)),
-        delay_noise=float(np.median(found.delay_sd)),
+        delay_spread=float(published.delay.std(ddof=1)),
+        delay_noise=float(np.median(published.delay_sd)),
         lack_of_fit_p=lack,
         gain_words=words,
     )
-    return axis, found
+    return axis, published
 
 
 def combined_rms(trial: Trial, model: AxisModel, delay: float, period: float) -> float:
@@ -152,38 +152,38 @@ def combined_rms(trial: Trial, model: AxisModel, delay: float, period: float) ->
 
 def usual_gain(fitted: Sequence[Fitted]) -> float:
     """The median gain of trials."""
-    return float(np.median([one.first.gain for one in fitted]))
+    return float(np.median([fit.first.gain for fit in fitted]))
 
 
 def coefficients(fitted: Sequence[Fitted]) -> dict[str, tuple[FloatArray, FloatArray]]:
     """The paper's three coefficients of first-order fits with their sds, in the units of their names, (n,) each."""
-    values = np.array([(*one.first.shape, one.first.gain) for one in fitted])
-    sds = np.array([one.first.sd for one in fitted])
+    values = np.array([(*fit.first.shape, fit.first.gain) for fit in fitted])
+    sds = np.array([fit.first.sd for fit in fitted])
     scales = {"delay_ms": (0, MS), "gain": (3, 1.0), "time_constant_ms": (1, MS)}
-    return {name: (values[:, place] * unit, sds[:, place] * unit) for name, (place, unit) in scales.items()}
+    return {name: (values[:, number] * unit, sds[:, number] * unit) for name, (number, unit) in scales.items()}
 
 
 def _unseen(fitted: Sequence[Fitted]) -> dict[str, str]:
     """Trials whose window ends before the arm is seen to move."""
-    unseen = [one.trial.name for one in fitted if not one.onset < one.trial.time[-1]]
+    unseen = [fit.trial.name for fit in fitted if not fit.onset < fit.trial.time[-1]]
     return dict.fromkeys(unseen, "not seen to move within the window")
 
 
 def _outlying(fitted: Sequence[Fitted]) -> dict[str, str]:
     """Trials of which a coefficient is far from all the others."""
-    found: dict[str, str] = {}
+    reasons: dict[str, str] = {}
     for name, (values, sd) in coefficients(fitted).items():
-        for place in np.flatnonzero(outlying(values, sd)).tolist():
-            shown = f"{values[place]:.2f}" if name == "gain" else f"{values[place]:.0f} ms"
+        for row in np.flatnonzero(outlying(values, sd)).tolist():
+            shown = f"{values[row]:.2f}" if name == "gain" else f"{values[row]:.0f} ms"
             word = name.removesuffix("_ms").replace("_", " ")
-            found.setdefault(fitted[place].trial.name, f"outlying: its {word} is {shown}")
-    return found
+            reasons.setdefault(fitted[row].trial.name, f"outlying: its {word} is {shown}")
+    return reasons
 
 
 def _fitted_together(used: Sequence[Fitted], kind: Kind) -> Common:
     """The common plant by least squares over all trials, and delays and gains under it."""
-    trials, own = [one.trial for one in used], [one.second for one in used]
-    joints: tuple[JointFit, JointFit] = (fit_together(trials, own, 1), fit_together(trials, own, 2))
+    trials, fits = [fit.trial for fit in used], [fit.second for fit in used]
+    joints: tuple[JointFit, JointFit] = (fit_together(trials, fits, 1), fit_together(trials, fits, 2))
     count = joints[1].count
     choice = _choose(
         squares=[joint.cost for joint in joints],
@@ -209,47 +209,47 @@ def _fitted_together(used: Sequence[Fitted], kind: Kind) -> Common:
 
 def _published(used: Sequence[Fitted], kind: Kind) -> Common:
     """The paper's combination: averages of what was read off and of τ; equation 10 over all trials for ω and ζ."""
-    trials, n = [one.trial for one in used], len(used)
-    count = sum(one.first.samples for one in used)
-    squares = [sum(one.first.squares for one in used), sum(one.second.squares for one in used)]
+    trials, n = [fit.trial for fit in used], len(used)
+    count = sum(fit.first.samples for fit in used)
+    squares = [sum(fit.first.squares for fit in used), sum(fit.second.squares for fit in used)]
     choice = _choose(
         squares=squares,
         parameters=[(order + 3) * n for order in (1, 2)],  # what is read off counts as fitted
         samples=count,
         rms=[float(np.sqrt(square / count)) for square in squares],
-        inverse_square=mean(np.array([one.second.shape.p for one in used])),
+        inverse_square=mean(np.array([fit.second.shape.p for fit in used])),
         kind=kind,
     )
-    own = [one.first if choice.order == 1 else one.second for one in used]
-    lags = np.array([fit.shape.q for fit in own])
+    fits = [fit.first if choice.order == 1 else fit.second for fit in used]
+    lags = np.array([fit.shape.q for fit in fits])
 
     def over(rows: list[int]) -> tuple[float, float]:
         if choice.order == 1:
             return float(lags[rows].mean()), 0.0
-        q, p = minimise([trials[row] for row in rows], [own[row] for row in rows])
+        q, p = minimise([trials[row] for row in rows], [fits[row] for row in rows])
         return q, max(p, least_p(q))
 
     q, p = over(list(range(n)))
     without = [over([other for other in range(n) if other != row]) for row in range(n)]
     influence = (n - 1) * (np.array([q, p]) - without)  # jackknife
     plant = _plant(q, p, lambda slope: float(np.ptp(mean(influence @ slope).ci95)) / 2.0)
-    delay, gain = np.array([(fit.shape.delay, fit.gain) for fit in own]).T
+    delay, gain = np.array([(fit.shape.delay, fit.gain) for fit in fits]).T
     return Common(trials, choice, plant, q + influence[:, 0], delay, np.zeros(n), gain, np.zeros(n))
 
 
 def _plant(q: float, p: float, half_width: Callable[[list[float]], float]) -> PLANTS:
     """The plant with its intervals; ``half_width`` is of half a 95 % interval, by its gradient in q and p (2,)."""
-    found = plant_of(q, p)
-    if isinstance(found, FirstOrder):
+    plant = plant_of(q, p)
+    if isinstance(plant, FirstOrder):
         half = half_width([1.0, 0.0])
-        return msgspec.structs.replace(found, time_constant_ci95=(q - half, q + half))
+        return msgspec.structs.replace(plant, time_constant_ci95=(q - half, q + half))
     # of log ω and log ζ, whose errors are nearer to normal than those of ω and ζ
     wide = np.exp(half_width([0.0, -0.5 / p]))
     damping_wide = np.exp(half_width([1.0 / q, -0.5 / p]))
     return msgspec.structs.replace(
-        found,
-        natural_frequency_ci95=(float(found.natural_frequency / wide), float(found.natural_frequency * wide)),
-        damping_ci95=(float(found.damping / damping_wide), float(found.damping * damping_wide)),
+        plant,
+        natural_frequency_ci95=(float(plant.natural_frequency / wide), float(plant.natural_frequency * wide)),
+        damping_ci95=(float(plant.damping / damping_wide), float(plant.damping * damping_wide)),
     )
 
 
@@ -280,7 +280,7 @@ def _choose(
         words = f"AICc {abs(gain):.3g} {'lower' if gain > 0.0 else 'higher'}"
     preferred = p < 0.05 and gain is not None and gain > 0.0
     order: Order = 2 if preferred and inverse_square.ci95[0] > 0.0 else 1
-    unit, (first, second) = SCREEN[kind].unit, [one * SCREEN[kind].scale for one in rms]
+    unit, (first, second) = SCREEN[kind].unit, [rms_of_order * SCREEN[kind].scale for rms_of_order in rms]
     why = (
         f"{'second' if order == 2 else 'first'} order: first order leaves {first:.3g} {unit}, second"
         f" {second:.3g} (each trial weighted by its noise: F({more}, {freedom}) = {F:.3g},"
@@ -302,17 +302,20 @@ def _choose(
     )
 
 
-def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | None, str]:
+def _gain_line(together: Common, period: float, kind: Kind) -> tuple[Gain, float | None, str]:
     """K = a·speed + b with intervals, the p of its lack of fit, and what the line shows."""
-    speed, levels = np.array([one.speed_at(period) for one in found.trials]), speed_levels(found.trials, period, kind)
+    speed, levels = (
+        np.array([trial.speed_at(period) for trial in together.trials]),
+        speed_levels(together.trials, period, kind),
+    )
     distinct = ordered(set(levels))
     if len(distinct) == 1 or len(speed) < 4:
-        level = common(found.gain, found.gain_sd)
+        level = common(together.gain, together.gain_sd)
         why = (
             f"one speed only ({distinct[0]} {SCREEN[kind].fast})" if len(distinct) == 1 else "too few trials for a line"
         )
         return Gain(slope=0.0, intercept=level.value, intercept_ci95=level.ci95), None, f"slope 0: {why}"
-    line = regression(found.gain, found.gain_sd, np.column_stack((np.ones(len(speed)), speed)))
+    line = regression(together.gain, together.gain_sd, np.column_stack((np.ones(len(speed)), speed)))
     (b_low, b_high), (a_low, a_high) = line.ci95.tolist()
     b, a = line.values.tolist()
     gain = Gain(slope=a, intercept=b, slope_ci95=(a_low, a_high), intercept_ci95=(b_low, b_high))
@@ -322,6 +325,6 @@ def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | 
     if not 2 < len(distinct) < len(speed):
         return gain, None, words
     at_levels = np.array(levels)[:, None] == np.array(distinct)
-    apart = weighted(found.gain, line.weights, at_levels.astype(np.float64))
+    apart = weighted(together.gain, line.weights, at_levels.astype(np.float64))
     lack = apart.p_against(line)  # of the hypothesis that the means of all levels lie on the line
     return gain, lack, words + ("; not along a straight line" if lack < 0.05 else "")

@@ -80,9 +80,9 @@ def common(values: FloatArray, sd: FloatArray) -> Estimate:
     """The common value of trials, by random-effects meta-analysis; arguments as of :func:`regression`."""
     if len(values) < 2:
         return mean(values)
-    found = regression(values, sd, np.ones((len(values), 1)))
-    low, high = found.ci95[0].tolist()
-    return Estimate(value=float(found.values[0]), ci95=(low, high))
+    regressed = regression(values, sd, np.ones((len(values), 1)))
+    low, high = regressed.ci95[0].tolist()
+    return Estimate(value=float(regressed.values[0]), ci95=(low, high))
 
 
 def regression(values: FloatArray, sd: FloatArray, design: FloatArray) -> Line:
@@ -102,8 +102,8 @@ def regression(values: FloatArray, sd: FloatArray, design: FloatArray) -> Line:
         return weighted(values, 1.0 / (sd**2 + between**2 + least**2), design)
 
     def excess(between: float) -> float:
-        found = fitted(between)
-        return found.squares - found.freedom
+        estimate = fitted(between)
+        return estimate.squares - estimate.freedom
 
     widest = 3.0 * float(np.ptp(values)) + least
     return fitted(float(brentq(excess, 0.0, widest)) if excess(0.0) > 0.0 > excess(widest) else 0.0)

@@ -108,8 +108,8 @@ class StepFit:
             wide = float(np.exp(self._t * np.sqrt(slope @ self.covariance[1:3, 1:3] @ slope)))
             zeta = 0.5 * q * p**-0.5
             omega_ci95, damping_ci95 = (omega_ci95[0], self.ci95.p[0] ** -0.5), (zeta / wide, zeta * wide)
-        found = plant_of(q, max(p, least_p(q)))
-        return msgspec.structs.replace(found, natural_frequency_ci95=omega_ci95, damping_ci95=damping_ci95)
+        shape = plant_of(q, max(p, least_p(q)))
+        return msgspec.structs.replace(shape, natural_frequency_ci95=omega_ci95, damping_ci95=damping_ci95)
 
     @property
     def _t(self) -> float:
@@ -125,7 +125,9 @@ def fit_steps(trials: Sequence[Trial]) -> list[tuple[StepFit, StepFit]]:
     starts = np.stack([_starts(trial) for trial in trials], axis=2)
     first = _search(batch, 1, starts[0])
     second = _search(batch, 2, np.concatenate((first[None], starts[1])))
-    return [(_fit(trial, one, 1), _fit(trial, two, 2)) for trial, one, two in zip(trials, first, second, strict=True)]
+    return [
+        (_fit(trial, start, 1), _fit(trial, two, 2)) for trial, start, two in zip(trials, first, second, strict=True)
+    ]
 
 
 def doubt(fit: StepFit, usual: float) -> str | None:
@@ -141,14 +143,14 @@ def doubt(fit: StepFit, usual: float) -> str | None:
 def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
     """What a user should know before trusting a fit; ``usual`` is the median gain of its axis."""
     useless = doubt(fit, usual)
-    found = [] if useless is None else [useless]
+    flags = [] if useless is None else [useless]
     if fit.reached < _SETTLED:
-        found.append(f"not settled: {fit.reached:.0%} reached")
+        flags.append(f"not settled: {fit.reached:.0%} reached")
     if fit.order == 2 and fit.ci95.p[0] <= 0.0:
-        found.append("long flat valley: first order may do")
+        flags.append("long flat valley: first order may do")
     if fit.shape.delay <= 0.0:
-        found.append("delay at its bound 0")
-    return found
+        flags.append("delay at its bound 0")
+    return flags
 
 
 def _search(batch: Batch, order: Order, starts: FloatArray) -> FloatArray:
@@ -156,8 +158,8 @@ def _search(batch: Batch, order: Order, starts: FloatArray) -> FloatArray:
     rows = np.arange(len(batch.time))
     every, flat = batch.take(np.tile(rows, len(starts))), starts.reshape(-1, 3)
     ends = every.point(flat), every.fit(flat, order)  # a fit begins inside its bounds: a start on them may be better
-    shapes = np.concatenate([one.shape for one in ends]).reshape(-1, len(rows), 3)
-    cost = np.concatenate([one.cost for one in ends]).reshape(-1, len(rows))
+    shapes = np.concatenate([end.shape for end in ends]).reshape(-1, len(rows), 3)
+    cost = np.concatenate([end.cost for end in ends]).reshape(-1, len(rows))
     return shapes[(cost <= (1.0 + ALIKE) * cost.min(axis=0)).argmax(axis=0), rows]
 
 
@@ -172,7 +174,7 @@ def _starts(trial: Trial) -> FloatArray:
         arms, best = [Arm(*cell) for cell in product(delays, lags, dampings)], dict[float, Shape]()
         log, _ = measured.weighed(arms, measured.white(arms[0]), Limits({}, {}))
         places: list[int] = np.argsort(-log, kind="stable").tolist()
-        for arm in (arms[place] for place in places):
+        for arm in (arms[number] for number in places):
             p = (0.5 * arm.lag / arm.damping) ** 2 if arm.damping else 0.0
             best.setdefault(arm.delay, Shape(arm.delay, arm.lag, p))
         starts.append(list(best.values())[:_STARTS])
@@ -183,18 +185,18 @@ def _measured(trial: Trial) -> Measured:
     """A trial as the search for arms takes it: a recording of one command, in steps; its zero is free."""
     n, value = len(trial.time), trial.position / trial.step
     time, source = np.rint(trial.time * 1e9).astype(np.int64), np.zeros(n, dtype=np.int64)
-    one = Recording(np.zeros(1, dtype=np.int64), np.ones(1), 0.0, time, value, source, np.ones(n))
+    recording = Recording(np.zeros(1, dtype=np.int64), np.ones(1), 0.0, time, value, source, np.ones(n))
     # the update period has no effect on a constant gain
-    return Measured([one.of(slice(None, None, n // _MOST_SAMPLES + 1))], 1.0, ["position"])
+    return Measured([recording.of(slice(None, None, n // _MOST_SAMPLES + 1))], 1.0, ["position"])
 
 
-def _fit(trial: Trial, found: FloatArray, order: Order) -> StepFit:
-    time, shape, step = trial.time, Shape(*found.tolist()), trial.step
+def _fit(trial: Trial, numbers: FloatArray, order: Order) -> StepFit:
+    time, shape, step = trial.time, Shape(*numbers.tolist()), trial.step
     c = unit_response(time - shape.delay, shape.q, shape.p)
     design = np.stack((step * c, np.ones_like(c)), axis=1)
     gain, zero = np.linalg.lstsq(design, trial.position, rcond=None)[0].tolist()
     rms = float(np.sqrt(np.mean((trial.position - design @ [gain, zero]) ** 2)))
-    changes = [gain * step * one[0] for one in sensitivity(time[None], found[None], order)]
+    changes = [gain * step * change[0] for change in sensitivity(time[None], numbers[None], order)]
     jacobian = np.column_stack((*changes, design))
     fitted = [0, 1, 2, 3, 4] if order == 2 else [0, 1, 3, 4]
     freedom = max(len(time) - len(fitted), 1)

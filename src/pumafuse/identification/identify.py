@@ -160,44 +160,44 @@ def identify(
     period, kind = trials.period(period), trials.kind
     tolerance = TOLERANCE[kind] if tolerance is None else tolerance
     fitted = _fit_all(trials.trials, samples, paper)
-    by_axis = {axis: [one for one in fitted if one.trial.axis == axis] for axis in trials.axes}
+    by_axis = {axis: [fit for fit in fitted if fit.trial.axis == axis] for axis in trials.axes}
     usual = {axis: usual_gain(of_axis) for axis, of_axis in by_axis.items()}
     notes, axes, commons = list[str](), dict[str, CombinedAxis](), dict[str, Common]()
     for axis, of_axis in by_axis.items():
-        found = combine(of_axis, period, paper, kind)
-        if isinstance(found, str):
-            notes.append(f"{axis}: no model: {found}")
+        combined = combine(of_axis, period, paper, kind)
+        if isinstance(combined, str):
+            notes.append(f"{axis}: no model: {combined}")
         else:
-            axes[axis], commons[axis] = found
+            axes[axis], commons[axis] = combined
             notes.extend(f"{axis}: {doubt}" for doubt in _doubts(usual[axis], axes[axis].delays.lag.value))
     if not axes:
         reasons = first_few([*notes, *trials.notes])
         raise TrialsError("; ".join(["no axis has trials enough for a model", *reasons]))
     arm, one_delay = _arm(axes, commons, period, name)
     rms = {
-        one.trial.name: combined_rms(one.trial, arm.axes[one.trial.axis], arm.delay_of(one.trial.axis), period)
-        for one in fitted
-        if one.trial.axis in axes
+        fit.trial.name: combined_rms(fit.trial, arm.axes[fit.trial.axis], arm.delay_of(fit.trial.axis), period)
+        for fit in fitted
+        if fit.trial.axis in axes
     }
     left_out = {trial: why for axis in axes.values() for trial, why in axis.left_out.items()}
-    own: dict[str, dict[str, float]] = {
+    rms_of_models: dict[str, dict[str, float]] = {
         trial.name: {"common_delay": delay, "common_gain": gain}
-        for one in commons.values()
-        for trial, delay, gain in zip(one.trials, one.delay.tolist(), one.gain.tolist(), strict=True)
+        for common in commons.values()
+        for trial, delay, gain in zip(common.trials, common.delay.tolist(), common.gain.tolist(), strict=True)
     }
-    used = [one for one in fitted if one.trial.name in own]
-    factors = anova.factors_of([one.trial for one in used], period, kind)
-    performance = anova.performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance, kind)
-    fastest = max(one.trial.speed_at(period) for one in used)
+    used = [fit for fit in fitted if fit.trial.name in rms_of_models]
+    factors = anova.factors_of([fit.trial for fit in used], period, kind)
+    performance = anova.performances(factors, np.array([rms[fit.trial.name] for fit in used]), tolerance, kind)
+    fastest = max(fit.trial.speed_at(period) for fit in used)
     provenance = {
         "made_by": f"pumafuse identify {version('pumafuse')}",
-        "trials": {axis: one.trials for axis, one in axes.items()},
+        "trials": {axis: result.trials for axis, result in axes.items()},
         "left_out": left_out,
-        "order": {axis: one.choice.why for axis, one in axes.items()},
+        "order": {axis: result.choice.why for axis, result in axes.items()},
         "delay": one_delay,
-        "delay_spread_ms": {axis: round(one.delay_spread * units.MS, 2) for axis, one in axes.items()},
-        "gain": {axis: one.gain_words for axis, one in axes.items()},
-        "validity": {one.factor: one.verdict for one in performance},
+        "delay_spread_ms": {axis: round(result.delay_spread * units.MS, 2) for axis, result in axes.items()},
+        "gain": {axis: result.gain_words for axis, result in axes.items()},
+        "validity": {performance.factor: performance.verdict for performance in performance},
         "samples": "all" if samples is None else samples,
         "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
     }
@@ -214,20 +214,20 @@ def identify(
                 step=trial.step,
                 speed=trial.speed_at(period),
                 factors=trial.factors,
-                onset=one.onset if np.isfinite(one.onset) else None,
-                first=_order_fit(one.first, trial, usual[trial.axis]),
-                second=_order_fit(one.second, trial, usual[trial.axis]),
-                **own.get(trial.name, {"common_delay": None, "common_gain": None}),
+                onset=fit.onset if np.isfinite(fit.onset) else None,
+                first=_order_fit(fit.first, trial, usual[trial.axis]),
+                second=_order_fit(fit.second, trial, usual[trial.axis]),
+                **rms_of_models.get(trial.name, {"common_delay": None, "common_gain": None}),
                 combined_rms=rms.get(trial.name),
                 left_out=left_out.get(trial.name),
             )
-            for one, trial in ((one, one.trial) for one in fitted)
+            for fit, trial in ((fit, fit.trial) for fit in fitted)
         ],
         axes=axes,
         one_delay=one_delay,
         dependences=anova.dependences({key: values for key, (values, _) in coefficients(used).items()}, factors),
         scatter=[
-            anova.scatter(coefficient, [one.trial for one in of_axis], values, sd)
+            anova.scatter(coefficient, [fit.trial for fit in of_axis], values, sd)
             for of_axis in by_axis.values()
             for coefficient, (values, sd) in coefficients(of_axis).items()
         ],
@@ -249,10 +249,10 @@ def _fit_all(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[
         raise TrialsError("a worker process died (out of memory?) while trials were fitted") from None
     if paper:
         fits = [
-            (fit_as_published(one, first), fit_as_published(one, second))
-            for one, (first, second) in zip(cut, fits, strict=True)
+            (fit_as_published(trial, first), fit_as_published(trial, second))
+            for trial, (first, second) in zip(cut, fits, strict=True)
         ]
-    return [Fitted(one, *pair, onset(trial)) for trial, one, pair in zip(trials, cut, fits, strict=True)]
+    return [Fitted(cut_trial, *pair, onset(trial)) for trial, cut_trial, pair in zip(trials, cut, fits, strict=True)]
 
 
 def _doubts(gain: float, lag: float) -> Iterator[str]:
@@ -269,13 +269,13 @@ def _arm(
     axes: Mapping[str, CombinedAxis], commons: Mapping[str, Common], period: float, name: str
 ) -> tuple[ArmModel, str]:
     """The arm with one delay, or one for each axis where they differ significantly, and which in words."""
-    delays = [one.delay for one in commons.values()]
-    every = common(np.concatenate(delays), np.concatenate([one.delay_sd for one in commons.values()]))
-    models, p = {axis: one.model for axis, one in axes.items()}, anova.welch(delays)
+    delays = [common.delay for common in commons.values()]
+    every = common(np.concatenate(delays), np.concatenate([common.delay_sd for common in commons.values()]))
+    models, p = {axis: result.model for axis, result in axes.items()}, anova.welch(delays)
     if p is not None and p < 0.05:
         words = f"a delay for each axis: they differ (Welch's test, p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'})"
     else:
-        models = {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in models.items()}
+        models = {axis: msgspec.structs.replace(model, delay=None, delay_ci95=None) for axis, model in models.items()}
         words = "one delay" + ("" if p is None else f": the axes do not differ (Welch's test, p = {p:.2g})")
     return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=models), words
 

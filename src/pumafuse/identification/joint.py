@@ -54,30 +54,30 @@ class JointFit:
         return float(t_quantile(freedom) * np.sqrt(variance))
 
 
-def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order) -> JointFit:
-    """Fit one plant of an order to all trials of an axis; the RMS of each trial's ``own`` fit is its noise."""
+def fit_together(trials: Sequence[Trial], step_fits: Sequence[StepFit], order: Order) -> JointFit:
+    """Fit one plant of an order to all trials of an axis; the RMS of each trial's ``step_fits`` fit is its noise."""
     step = np.array([trial.step for trial in trials])
-    noise = np.maximum([fit.rms for fit in own], _NOISELESS * np.abs(step))
+    noise = np.maximum([fit.rms for fit in step_fits], _NOISELESS * np.abs(step))
     batch = Batch.of(trials, (1.0 / noise).tolist())
     # a trial determines the area over its response best
-    lag = np.array([fit.shape.delay + fit.shape.q for fit in own])
-    middle = float(np.median([fit.shape.q for fit in own]))
+    lag = np.array([fit.shape.delay + fit.shape.q for fit in step_fits])
+    middle = float(np.median([fit.shape.q for fit in step_fits]))
     n, starts = len(step), list[FloatArray]()
     for ratio in _STARTS[: 1 if order == 1 else None]:
         q = middle if ratio == 0.0 else 1.3 * middle
         starts.append(np.stack(np.broadcast_arrays(np.maximum(lag - q, 0.0), q, ratio * q * q), axis=1))
-    found = batch.take(np.tile(np.arange(n), len(starts))).fit(np.concatenate(starts), order, size=n)
-    cost = found.cost.reshape(-1, n).sum(axis=1)
+    fits = batch.take(np.tile(np.arange(n), len(starts))).fit(np.concatenate(starts), order, size=n)
+    cost = fits.cost.reshape(-1, n).sum(axis=1)
     best = int((cost <= (1.0 + ALIKE) * cost.min()).argmax())
-    at = Point(*(every[best * n : (best + 1) * n] for every in found))
+    at = Point(*(every[best * n : (best + 1) * n] for every in fits))
     slopes, amplitude_slopes = batch.slopes(at, order)
     equations = batch.equations(at, slopes)
     influence, expected = _influence(equations)
     delay_slope, gain_slope = np.zeros((n, 2)), np.zeros((n, 2))
     delay_slope[:, :order] = -equations.coupling
     gain_slope[:, :order] = (amplitude_slopes[1:] - equations.coupling.T * amplitude_slopes[0]).T / step[:, None]
-    known = np.isfinite(equations.delay_sd)
-    by_delay = np.where(known, amplitude_slopes[0] * np.where(known, equations.delay_sd, 0.0), np.inf)
+    is_known = np.isfinite(equations.delay_sd)
+    by_delay = np.where(is_known, amplitude_slopes[0] * np.where(is_known, equations.delay_sd, 0.0), np.inf)
     return JointFit(
         q=float(at.shape[0, 1]),
         p=float(at.shape[0, 2]),

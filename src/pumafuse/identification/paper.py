@@ -39,9 +39,9 @@ def fit_as_published(trial: Trial, fitted: StepFit) -> StepFit:
     shape = Shape(delay, *minimise([trial], [read]))
     height, n = gain * trial.step, len(trial.time)
     squares = float(np.sum((trial.position - level - height * unit_response(trial.time - delay, *shape[1:])) ** 2))
-    covariance, own = np.zeros((5, 5)), slice(1, order + 1)  # what is read off has no interval of its own
-    changes = [height * one[0] for one in sensitivity(trial.time[None], np.array([shape]), order)[1:]]
-    covariance[own, own] = inverse(np.column_stack(changes)) * squares / max(n - order, 1)
+    covariance, free = np.zeros((5, 5)), slice(1, order + 1)  # what is read off has no interval of its own
+    changes = [height * change[0] for change in sensitivity(trial.time[None], np.array([shape]), order)[1:]]
+    covariance[free, free] = inverse(np.column_stack(changes)) * squares / max(n - order, 1)
     end = reached(trial.time, shape)
     return replace(read, shape=shape, rms=float(np.sqrt(squares / n)), covariance=covariance, reached=end)
 
@@ -62,10 +62,10 @@ def minimise(trials: Sequence[Trial], read: Sequence[StepFit]) -> tuple[float, f
     size = np.array([q, q * q])[:order]
     start, span = np.array([q, min(p, q * q)])[:order], float(t.max())
     bounds = np.array([1e-3 * q, 0.0])[:order], np.array([20.0 * span, (5.0 * span) ** 2])[:order]
-    found = least_squares(
+    minimum = least_squares(
         residual, np.clip(start, *bounds), bounds=bounds, x_scale=size, xtol=1e-10, ftol=1e-12, gtol=1e-15, max_nfev=200
     )
-    return float(found.x[0]), float(found.x[1]) if order == 2 else 0.0
+    return float(minimum.x[0]), float(minimum.x[1]) if order == 2 else 0.0
 
 
 def _rest(trial: Trial) -> tuple[float, float]:

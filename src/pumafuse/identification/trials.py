@@ -89,25 +89,25 @@ class StepTrials:
         """The trials of one axis."""
         return [trial for trial in self.trials if trial.axis == axis]
 
-    def period(self, given: float | None = None) -> float:
-        """The update period T [s]: as ``given``, or step over speed where all trials agree on it.
+    def period(self, period: float | None = None) -> float:
+        """The update period T [s]: as ``period``, or step over speed where all trials agree on it.
 
         Raises:
             TrialsError: The trials do not agree, or on no period of 1 to 200 ms.
         """
-        if given is not None:
-            if not _GIVEN[0] <= given <= _GIVEN[1]:
-                raise TrialsError(f"an update period of {given * 1e3:g} ms: it must be 0.1 ms to 10 s")
-            return given
+        if period is not None:
+            if not _GIVEN[0] <= period <= _GIVEN[1]:
+                raise TrialsError(f"an update period of {period * 1e3:g} ms: it must be 0.1 ms to 10 s")
+            return period
         timed = [trial for trial in self.trials if trial.speed > 0.0]
         step, speed = np.abs([trial.step for trial in timed]), np.array([trial.speed for trial in timed])
         middle = float(np.median(step / speed)) if timed else np.nan
         if not _PERIODS[0] <= middle <= _PERIODS[1] or (np.abs(step / speed / middle - 1.0) > _AGREE).any():
             raise TrialsError("step over speed is not one update period of 1 to 200 ms in all trials: give --period")
         # least squares through 0: speeds are rounded, the small ones the most for their size
-        found = float(step @ speed / (speed @ speed))
-        whole, scatter = round(found, 3), float(np.std(step / speed / found))
-        return whole if abs(whole / found - 1.0) <= 0.5 * scatter else found
+        fitted_period = float(step @ speed / (speed @ speed))
+        whole, scatter = round(fitted_period, 3), float(np.std(step / speed / fitted_period))
+        return whole if abs(whole / fitted_period - 1.0) <= 0.5 * scatter else fitted_period
 
     @staticmethod
     def read(folder: str | Path) -> StepTrials:
@@ -128,8 +128,8 @@ class StepTrials:
         step = _noted(listed.numbers(_column(listed, "step")), notes)
         speed, speed_column = _speed(listed, kind, notes)
         names, axes = listed.texts("trial"), listed.texts("axis")
-        own = {"trial", "axis", speed_column, _column(listed, "step")}
-        factors = {column: listed.texts(column) for column in listed.columns if column not in own}
+        described = {"trial", "axis", speed_column, _column(listed, "step")}
+        factors = {column: listed.texts(column) for column in listed.columns if column not in described}
         samples = _samples(sampled, notes)
         listings = Counter(names)
         if unlisted := [name for name in samples if name not in listings]:
@@ -140,17 +140,17 @@ class StepTrials:
                 notes.append(f"{listed.path.name}: row {row + 1} names no trial: left out")
                 continue
             time, position = samples.get(name, (np.zeros(0), np.zeros(0)))
-            found = (np.abs(time) < _LATEST) & (np.abs(position) < _FARTHEST)
-            reason = _unusable(listings[name], axes[row], float(step[row]), time[found], position[found])
+            is_real = (np.abs(time) < _LATEST) & (np.abs(position) < _FARTHEST)
+            reason = _unusable(listings[name], axes[row], float(step[row]), time[is_real], position[is_real])
             if reason is not None:
                 notes.append(f"trial '{name}': {reason}: left out")
                 continue
-            if not found.all():
-                notes.append(f"trial '{name}': {int((~found).sum())} samples without a number: left out")
-            if (np.diff(time[found]) < 0.0).any():
+            if not is_real.all():
+                notes.append(f"trial '{name}': {int((~is_real).sum())} samples without a number: left out")
+            if (np.diff(time[is_real]) < 0.0).any():
                 notes.append(f"trial '{name}': times step back: sorted")
             order = np.argsort(time, kind="stable")
-            time, position = time[order[found[order]]], position[order[found[order]]]
+            time, position = time[order[is_real[order]]], position[order[is_real[order]]]
             of = {factor: cells[row] for factor, cells in factors.items()}
             trials.append(Trial(name, axes[row], float(step[row]), float(speed[row]), of, time, position))
         if not trials:

@@ -172,37 +172,37 @@ def verify(
     chosen = _with_sources(run, None if names is None else tuple(names))
     config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
     parts, jumps = segments(in_axes(chosen.delayed(arm), None)[0])
-    found: list[tuple[AxisVerification, Trace]] = []
+    results: list[tuple[AxisVerification, Trace]] = []
     for number, part in enumerate(parts, 1):
         name = run.name if len(parts) == 1 else f"{run.name}, part {number}"
         part = replace(part, name=name, start={**part.start, **(start or {})})
-        found.extend(_part(part, config, jumps if number == 1 else ()))
-    if not found:
+        results.extend(_part(part, config, jumps if number == 1 else ()))
+    if not results:
         raise RunError(
             f"run '{run.name}': no source has {_FEWEST} measurements of a commanded axis after the first command"
         )
-    return found
+    return results
 
 
 def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[AxisVerification, Trace]]:
     """Every axis and source of one segment of a run."""
     segment, arm = build(run, config), config.arm
-    rows, found = segment.measurement_rows, list[tuple[AxisVerification, Trace]]()
+    rows, part = segment.measurement_rows, list[tuple[AxisVerification, Trace]]()
     for number, axis in enumerate(segment.axes):
-        given, command = segment.given(axis)
+        told_at, command = segment.given(axis)
         first = segment.start[axis]
         for index, source in enumerate(segment.sensors):
             here = np.flatnonzero((rows.source == index) & (rows.known[:, number] == Outcome.FUSED))
             if len(here) < _FEWEST or not np.ptp(command) > 0.0:
                 continue
             time, value = rows.time[here], rows.value[here, number] - first
-            recording = Recording(given, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
+            recording = Recording(told_at, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
             measured = Measured([recording], arm.update_period, [source], arm.axes[axis])
             counts = {"used" if word == Outcome.FUSED.word else word: n for word, n in segment.counts[source].items()}
-            notes = [*jumps, *segment.notes] if not found else []
+            notes = [*jumps, *segment.notes] if not part else []
             counted = {"commands": dict(segment.command_counts), "rows": counts}
-            found.append(_verified(measured, run, axis, arm, counted, notes))
-    return found
+            part.append(_verified(measured, run, axis, arm, counted, notes))
+    return part
 
 
 def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
@@ -221,18 +221,18 @@ def _verified(
     measured: Measured, run: Run, axis: str, arm: ArmModel, counted: Mapping[str, dict[str, int]], notes: list[str]
 ) -> tuple[AxisVerification, Trace]:
     """One axis of a run by one source, of which the rows are ``counted``."""
-    model, own = arm.axes[axis], Arm.of(arm.axes[axis], arm.delay_of(axis))
-    recovery = own.recovery or RECOVERY
-    farthest = abs(measured.recordings[0].start) + np.abs(measured.responses(own)[0]).max()
-    if not (farthest <= _FARTHEST and own.lag <= _SLOWEST):  # also where it is not a number
+    model, configured = arm.axes[axis], Arm.of(arm.axes[axis], arm.delay_of(axis))
+    recovery = configured.recovery or RECOVERY
+    farthest = abs(measured.recordings[0].start) + np.abs(measured.responses(configured)[0]).max()
+    if not (farthest <= _FARTHEST and configured.lag <= _SLOWEST):  # also where it is not a number
         raise ConfigError(f"axis '{axis}': a start level, gain or plant of no size that an arm has")
-    measured, start_from = _started(measured, own, axis in run.start)
+    measured, start_from = _started(measured, configured, axis in run.start)
     count = len(measured.recordings[0].time)
-    measured = _without_spikes(measured, own)
-    (recording,), (modelled,) = measured.recordings, measured.responses(own)
-    as_it_is, recovering = model_fit(measured, own), model_fit(measured, own._replace(recovery=recovery))
-    best = best_in_class(measured, own)
-    lag = model.lag(own.delay, float(speeds(measured).mean()))
+    measured = _without_spikes(measured, configured)
+    (recording,), (modelled,) = measured.recordings, measured.responses(configured)
+    as_it_is, recovering = model_fit(measured, configured), model_fit(measured, configured._replace(recovery=recovery))
+    best = best_in_class(measured, configured)
+    lag = model.lag(configured.delay, float(speeds(measured).mean()))
     trace = Trace(
         units.seconds(recording.time, int(recording.told[0])),
         recording.value - recording.value.mean(),
@@ -249,7 +249,7 @@ def _verified(
         start=recording.start,
         start_from=start_from,
         model=as_it_is,
-        without_recovery=model_fit(measured, own._replace(recovery=0.0)),
+        without_recovery=model_fit(measured, configured._replace(recovery=0.0)),
         with_recovery=recovering,
         recovery=recovery,
         best_in_class=best,
@@ -262,18 +262,21 @@ def _verified(
     return verification, trace
 
 
-def _started(measured: Measured, own: Arm, given: bool) -> tuple[Measured, str]:
+def _started(measured: Measured, arm: Arm, is_given: bool) -> tuple[Measured, str]:
     """The run from its level before the first command, and where that comes from."""
-    (one,) = measured.recordings
-    levels = np.unique(one.command)
-    if given or len(levels) > _MOST_LEVELS:
-        return measured, "given" if given else "the first command"
-    tried = [measured.of([one._replace(start=level, value=one.value + one.start - level)]) for level in levels.tolist()]
-    best = min(tried, key=lambda other: float(np.std(other.left(own))))
+    (recording,) = measured.recordings
+    levels = np.unique(recording.command)
+    if is_given or len(levels) > _MOST_LEVELS:
+        return measured, "given" if is_given else "the first command"
+    tried = [
+        measured.of([recording._replace(start=level, value=recording.value + recording.start - level)])
+        for level in levels.tolist()
+    ]
+    best = min(tried, key=lambda other: float(np.std(other.left(arm))))
     return best, f"chosen among the run's {len(levels)} levels by RMS"
 
 
-def _without_spikes(measured: Measured, own: Arm) -> Measured:
+def _without_spikes(measured: Measured, arm: Arm) -> Measured:
     """The run without measurements that jump away from their neighbours, whatever the model.
 
     A model that is wrong for a while must not be spared: only eight robust standard deviations from the running
@@ -282,7 +285,7 @@ def _without_spikes(measured: Measured, own: Arm) -> Measured:
     from scipy.ndimage import median_filter
     from scipy.stats import median_abs_deviation
 
-    (residual,) = measured.residuals(own)
+    (residual,) = measured.residuals(arm)
     jump = residual - median_filter(residual, size=5, mode="nearest")
     kept = np.abs(jump) <= _SPIKE * max(float(median_abs_deviation(residual, scale="normal")), 1e-9)
     return measured.of([measured.recordings[0].of(kept)])
@@ -319,28 +322,28 @@ def speeds(measured: Measured) -> FloatArray:
 
 def model_fit(measured: Measured, arm: Arm) -> ModelFit:
     """How well an arm fits a run."""
-    (one,) = measured.recordings
-    rms, signal = float(np.std(measured.left(arm))), float(np.std(one.value))
+    (recording,) = measured.recordings
+    rms, signal = float(np.std(measured.left(arm))), float(np.std(recording.value))
     return ModelFit(
         rms=rms,
-        percent=100.0 * rms / float(np.ptp(one.command)),
+        percent=100.0 * rms / float(np.ptp(recording.command)),
         fit=100.0 * (1.0 - rms / signal) if signal > 0.0 else -np.inf,
     )
 
 
-def best_in_class(measured: Measured, own: Arm) -> BestInClass:
+def best_in_class(measured: Measured, configured: Arm) -> BestInClass:
     """The best gain, delay and plant of the model's order on one recording by one source.
 
-    The order and recovery of the arm's ``own`` model stay; its numbers are one start of the search.
+    The order and recovery of the arm's ``configured`` model stay; its numbers are one start of the search.
     """
     moving = speeds(measured)
-    names = ["delay", "lag", *(["damping"] if own.damping else []), "gain"]
+    names = ["delay", "lag", *(["damping"] if configured.damping else []), "gain"]
     if np.ptp(moving) > 1e-6 * moving.max():
         names.append("slope")
-    starts = _on_grid(measured, own)
+    starts = _on_grid(measured, configured)
     noise = measured.white(starts[0])
-    fits = [measured.fitted(arm, names, noise, _ANY) for arm in (own, *starts)]
-    near = max(fits, key=lambda one: one.log_posterior).arm
+    fits = [measured.fitted(arm, names, noise, _ANY) for arm in (configured, *starts)]
+    near = max(fits, key=lambda fit: fit.log_posterior).arm
     noise = measured.white(near)  # beside the noise of a poor start the last steps seemed to gain nothing
     best, speed = measured.fitted(near, names, noise, _ANY).arm, float(moving.mean())
     lag, half = best.model.lag(best.delay, speed), _half_width(measured, best, names, noise, speed)
@@ -354,11 +357,11 @@ def best_in_class(measured: Measured, own: Arm) -> BestInClass:
     )
 
 
-def _on_grid(measured: Measured, own: Arm) -> list[Arm]:
+def _on_grid(measured: Measured, arm: Arm) -> list[Arm]:
     """The best of a grid over dead times and plants, each with its best gain that is the same at every speed."""
-    part, alike = measured.excerpt(COMMANDS, ROWS), own._replace(damping=_DAMPED if own.damping else 0.0, slope=0.0)
+    part, alike = measured.excerpt(COMMANDS, ROWS), arm._replace(damping=_DAMPED if arm.damping else 0.0, slope=0.0)
     arms = [alike._replace(delay=delay, lag=lag) for delay, lag in product(delays(part).tolist(), LAGS.tolist())]
-    return part.likeliest(arms, part.white(own), _ANY, _STARTS)
+    return part.likeliest(arms, part.white(arm), _ANY, _STARTS)
 
 
 def _half_width(measured: Measured, arm: Arm, names: Coordinates, noise: NoiseModel, speed: float) -> float:
@@ -367,5 +370,5 @@ def _half_width(measured: Measured, arm: Arm, names: Coordinates, noise: NoiseMo
     What a model leaves over of a run is correlated, and each measurement alone would count far too much: a block of the
     run counts as one observation (Bester, Conley & Hansen, J. Econometrics 165, 2011).
     """
-    _, variance = measured.lag_variances(arm, names, noise, _ANY, _BLOCKS, lambda one: one.model.lag(one.delay, speed))
+    _, variance = measured.lag_variances(arm, names, noise, _ANY, _BLOCKS, lambda arm: arm.model.lag(arm.delay, speed))
     return t_quantile(_BLOCKS - 1) * (variance * _BLOCKS / (_BLOCKS - 1)) ** 0.5

@@ -35,8 +35,8 @@ def in_axes(run: Run, frame: Frame | None, tool: tuple[float, float, float] | No
         return run, None
     placed = _placed(run, frame)
     command = _converted(run.command, placed, None)
-    rest = Source(np.zeros(1, np.int64), {axis: np.array([level]) for axis, level in run.start.items()}, "start")
-    start = {axis: float(level[0]) for axis, level in _converted(rest, placed, None).values.items()}
+    at_rest = Source(np.zeros(1, np.int64), {axis: np.array([level]) for axis, level in run.start.items()}, "start")
+    start = {axis: float(level[0]) for axis, level in _converted(at_rest, placed, None).values.items()}
     converted = run.each(lambda _, source: command if source is run.command else _converted(source, placed, command))
     return replace(converted, start=start, frame=None), placed
 
@@ -67,8 +67,8 @@ def _turning(run: Run, tool: tuple[float, float, float] | None) -> Run:
             spread |= dict.fromkeys(TURNING, rotations.spread(vector))
         return replace(source, values=values, spread=spread, orientation=None)
 
-    found = run.each(turning)
-    told = np.stack([found.command.values[axis] for axis in TURNING])
+    turned = run.each(turning)
+    told = np.stack([turned.command.values[axis] for axis in TURNING])
     farthest = float(np.sqrt(np.nanmax(np.sum(told**2, axis=0))))
     by = f"{math.degrees(farthest):.0f}° from its reference orientation"
     far = f"{run.command.label}: the tool is told to turn by {by}"
@@ -77,7 +77,7 @@ def _turning(run: Run, tool: tuple[float, float, float] | None) -> Run:
     if farthest > FAR_TURN:
         notes.append(f"{far}: beyond 120° error bars of its orientation are too small")
     kinds = dict(run.kinds) | dict.fromkeys(TURNING, "angle")
-    return replace(found, tool=tool, kinds=kinds, notes=tuple(notes))
+    return replace(turned, tool=tool, kinds=kinds, notes=tuple(notes))
 
 
 def _placed(run: Run, frame: Frame) -> Placed:
@@ -105,15 +105,17 @@ def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:
 
 
 def _converted(source: Source, placed: Placed, command: Source | None) -> Source:
-    given = [name for name in CARTESIAN if name in source.values]
-    if not given:
+    cartesian = [name for name in CARTESIAN if name in source.values]
+    if not cartesian:
         return source
-    if ("x" in given) != ("y" in given):
-        raise RunError(f"{source.label}: gives {'x without y' if 'x' in given else 'y without x'}; a frame needs both")
+    if ("x" in cartesian) != ("y" in cartesian):
+        raise RunError(
+            f"{source.label}: gives {'x without y' if 'x' in cartesian else 'y without x'}; a frame needs both"
+        )
     named = {axis: value for axis, value in source.values.items() if axis not in CARTESIAN}
     spread = dict(source.spread)
-    found: dict[str, FloatArray] = {}
-    if "x" in given:
+    converted: dict[str, FloatArray] = {}
+    if "x" in cartesian:
         near = None  # where the commands are then, tangential [m], (rows,)
         if command is not None and not isinstance(placed.frame, Rotated):
             if "tangential" not in command.values:
@@ -121,9 +123,9 @@ def _converted(source: Source, placed: Placed, command: Source | None) -> Source
                 raise RunError(f"{command.label}: {both}")
             near = np.interp(source.stamp, *command.series("tangential"))
         x, y = source.values["x"], source.values["y"]
-        found["tangential"], found["radial"], spread["tangential"] = placed.to_axes(x, y, near)
-    if "z" in given:
-        found["vertical"] = source.values["z"]
-    if twice := next((axis for axis in found if axis in named), None):
-        raise RunError(f"{source.label}: gives {twice} both by its name and by {', '.join(given)}; give one")
-    return replace(source, values={**named, **found}, spread=spread)
+        converted["tangential"], converted["radial"], spread["tangential"] = placed.to_axes(x, y, near)
+    if "z" in cartesian:
+        converted["vertical"] = source.values["z"]
+    if twice := next((axis for axis in converted if axis in named), None):
+        raise RunError(f"{source.label}: gives {twice} both by its name and by {', '.join(cartesian)}; give one")
+    return replace(source, values={**named, **converted}, spread=spread)

@@ -182,8 +182,10 @@ def fields_of(value: Any) -> Message | None:
     if isinstance(value, Mapping):
         return cast(Message, value)
     if hasattr(value, "DESCRIPTOR"):  # protobuf: what can be absent, and is, is null
-        there = ((one.name, not one.has_presence or value.HasField(one.name)) for one in value.DESCRIPTOR.fields)
-        return {name: getattr(value, name) if is_there else None for name, is_there in there}
+        fields = (
+            (field.name, not field.has_presence or value.HasField(field.name)) for field in value.DESCRIPTOR.fields
+        )
+        return {name: getattr(value, name) if is_there else None for name, is_there in fields}
     if hasattr(value, "get_fields_and_field_types"):  # of a running ROS 2
         return {name: getattr(value, name) for name in value.get_fields_and_field_types()}
     if hasattr(value, "__msgtype__"):  # ROS, by rosbags

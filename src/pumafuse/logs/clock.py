@@ -65,14 +65,14 @@ def stray_offsets(stamp: TimeArray) -> IntArray:
     One row is tried before two. Three in a row or more are never stray: there the clock was set anew. A row that is
     ahead and never contradicted is a pause. Rows without a stamp are skipped.
     """
-    found = np.zeros(len(stamp), dtype=np.int64)
+    offsets = np.zeros(len(stamp), dtype=np.int64)
     stamped = np.flatnonzero(stamp != NO_STAMP) if NO_STAMP in stamp else slice(None)
-    known = stamp[stamped]
-    back = np.flatnonzero(np.diff(known) < -TOLERATED_STEP_BACK_NS) + 1
+    known_stamps = stamp[stamped]
+    back = np.flatnonzero(np.diff(known_stamps) < -TOLERATED_STEP_BACK_NS) + 1
     if not len(back):
-        return found
-    apart = np.zeros(len(known), dtype=np.int64)
-    stamps: list[int] = known.tolist()
+        return offsets
+    apart = np.zeros(len(known_stamps), dtype=np.int64)
+    stamps: list[int] = known_stamps.tolist()
     before, after = -1, 0  # the last row that is not stray before `after`
     for row in np.unique(back[:, None] - [2, 1, 0]).tolist():  # nothing else can begin what ends in a step back
         if row < after:
@@ -80,13 +80,13 @@ def stray_offsets(stamp: TimeArray) -> IntArray:
         before = before if row == after else row - 1
         after = row + _stray_from(stamps, before, row)
         if after > row:
-            apart[row:after] = known[row:after] - known[before if before >= 0 else after]
+            apart[row:after] = known_stamps[row:after] - known_stamps[before if before >= 0 else after]
     edges = np.flatnonzero(np.diff(apart != 0, prepend=False, append=False))
     for first, end in edges.reshape(-1, 2).tolist():
         if end - first >= _NEW_CLOCK:
             apart[first:end] = 0
-    found[stamped] = apart
-    return found
+    offsets[stamped] = apart
+    return offsets
 
 
 def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
@@ -95,13 +95,13 @@ def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
     for after in range(row + 1, min(row + _NEW_CLOCK, len(stamp) + 1)):
         out = stamp[row:after]
         if before < 0:
-            found = len(stamp) - after >= _NEW_CLOCK and min(out) > stamp[after] + far
+            stray = len(stamp) - after >= _NEW_CLOCK and min(out) > stamp[after] + far
         elif after == len(stamp):
-            found = before + 1 >= _NEW_CLOCK and max(out) < stamp[before] - far
+            stray = before + 1 >= _NEW_CLOCK and max(out) < stamp[before] - far
         else:
             low, high = stamp[before] - far, max(stamp[before], stamp[after]) + far
-            found = stamp[after] >= low and all(one < low or one > high for one in out)
-        if found:
+            stray = stamp[after] >= low and all(row_out < low or row_out > high for row_out in out)
+        if stray:
             return after - row
     return 0
 
@@ -134,9 +134,9 @@ def without_strays(run: Run) -> Run:
                 note_rows(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
         return replace(source, stamp=np.where(apart == 0, source.stamp, NO_STAMP))
 
-    found = run.each(mended)
-    command = without_stray_values(found.command, list(found.sensors.values()), notes)
-    return replace(found, command=command, notes=tuple(notes), without_strays=True)
+    screened_run = run.each(mended)
+    command = without_stray_values(screened_run.command, list(screened_run.sensors.values()), notes)
+    return replace(screened_run, command=command, notes=tuple(notes), without_strays=True)
 
 
 def segments(run: Run) -> tuple[list[Run], list[str]]:
@@ -168,10 +168,10 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
     measured = {name: pieces(source) for name, source in run.measured.items()}
     parts = list[Run]()
     for index, command in enumerate(pieces(run.command)):
-        mine = {name: parts[index] for name, parts in measured.items()}
-        reference = None if run.reference is None else mine.pop(REFERENCE)
+        times = {name: parts[index] for name, parts in measured.items()}
+        reference = None if run.reference is None else times.pop(REFERENCE)
         begin: dict[str, Any] = {} if index == 0 else {"start": {}, "notes": ()}
-        parts.append(replace(run, command=command, sensors=mine, reference=reference, **begin))
+        parts.append(replace(run, command=command, sensors=times, reference=reference, **begin))
     lag, label = behind(run.command.stamp) / 1e9, run.command.label
     notes = [
         f"{label}: the clock is set back by {lag[row]:.3f} s in row {row + 1}: new segment, filter restarted"
@@ -182,14 +182,14 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
 
 def _jumps(source: Source) -> list[int]:
     """Rows at which the clock was set back by more than 1 s."""
-    found: list[int] = []
+    jumps: list[int] = []
     while True:
-        first = found[-1] if found else 0
+        first = jumps[-1] if jumps else 0
         back = np.flatnonzero(behind(source.stamp[first:]) > TOLERATED_STEP_BACK_NS)
         if not len(back):
-            return found
-        found.append(first + int(back[0]))
-        if len(found) > _MOST_JUMPS:
+            return jumps
+        jumps.append(first + int(back[0]))
+        if len(jumps) > _MOST_JUMPS:
             raise RunError(
                 f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock,"
                 " or many runs in one table (run.toml chooses one by 'where')"
@@ -198,19 +198,19 @@ def _jumps(source: Source) -> list[int]:
 
 def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
     """A sentence on each of some sensors whose stamps are not of the commands' time; ``period`` is the arm's T [s]."""
-    found, label, stamp = list[str](), run.command.label, run.command.stamp
+    clock_faults, label, stamp = list[str](), run.command.label, run.command.stamp
     command = np.sort(stamp[stamp != NO_STAMP], kind="stable")
     first = run.command.series(run.axes[0])[0] if run.command.apart else command
     if (senders := two_senders(first, period)) is not None:
-        found.append(f"{label}: {senders}")
+        clock_faults.append(f"{label}: {senders}")
     elif (other := other_interval(first, period)) is not None:
         sentence, kind = other
         if kind != "other":
             advice = _CORRECT if kind == "unit" else "Log every command"
             raise RunError(f"{label}: {sentence} {advice}, or correct update_period_ms in arm.toml")
-        found.append(f"{label}: {sentence}")
+        clock_faults.append(f"{label}: {sentence}")
     if senders is None and (missing := missing_commands(run.command)) is not None:
-        found.append(f"{label}: {missing}: the model holds the one before; log every command")
+        clock_faults.append(f"{label}: {missing}: the model holds the one before; log every command")
     for name in sensors:
         stamp = run.sensors[name].stamp
         stamp = np.sort(stamp[stamp != NO_STAMP], kind="stable")  # fast where they are in order
@@ -222,8 +222,8 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
                 f"{run.sensors[name].label_for(name)}: measurements go on for {span:.4g} s, the commands for"
                 f" {commanded:.4g} s: {_taken(units)} {_CORRECT}"
             )
-        found += [f"{name}: {one}" for one in _apart(stamp, int(command[0]), int(command[-1]))]
-    return found
+        clock_faults += [f"{name}: {fault}" for fault in _apart(stamp, int(command[0]), int(command[-1]))]
+    return clock_faults
 
 
 def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit", "lost", "other"]] | None:

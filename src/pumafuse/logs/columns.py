@@ -47,7 +47,7 @@ _TEXTS = (pa.types.is_string, pa.types.is_large_string)
 # Numbers that stand for "none": nines, and the ends of whole numbers of 16 and 32 bits.
 SENTINELS = {
     *(10.0**digits - 1.0 for digits in range(3, 10)),
-    *(2.0**bits - one for bits in (15, 16, 31, 32) for one in (0, 1)),
+    *(2.0**bits - less for bits in (15, 16, 31, 32) for less in (0, 1)),
 }
 _FAR, _OTHERS = 10.0, 10  # times all other numbers of a column; different ones at least: steps may go to 999
 _LONGEST_LIST = 64  # elements of a list that are listed one by one
@@ -69,12 +69,12 @@ class Table:
 
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
         """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels."""
-        given, note = self.plain(name)
+        numbers, note = self.plain(name)
         unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
-        size = sentinel(given) if self.sentinel_of is None else self.sentinel_of(name)
-        values = given if size is None else without(given, size)
-        if (gone := np.isnan(values) & ~np.isnan(given)).any():
-            number = f"with {given[gone][0]:.15g}, ten times as far as all others"
+        size = sentinel(numbers) if self.sentinel_of is None else self.sentinel_of(name)
+        values = numbers if size is None else without(numbers, size)
+        if (gone := np.isnan(values) & ~np.isnan(numbers)).any():
+            number = f"with {numbers[gone][0]:.15g}, ten times as far as all others"
             note = "; ".join(filter(None, (note, self._missing(name, int(gone.sum()), number, int(gone.argmax())))))
         return units.si_of(values, unit), note
 
@@ -167,23 +167,23 @@ class Table:
         with np.errstate(over="ignore"):  # refused below
             rough = _filled(column.cast(pa.float64(), safe=False), np.nan) * per_unit
         self._refuse_beyond(name, np.isfinite(rough) & (np.abs(rough) >= REACH_NS))
-        found = np.where(np.isfinite(rough), np.rint(rough), NO_STAMP).astype(np.int64)
+        nanoseconds = np.where(np.isfinite(rough), np.rint(rough), NO_STAMP).astype(np.int64)
         if _is_any(column.type, _TEXTS):
             column = pc.if_else(pc.match_substring_regex(column, _WHOLE), column, pa.scalar(None, pa.string()))
         if not pa.types.is_floating(column.type):
             whole = _filled(self._cast(name, column, pa.int64()), NO_STAMP)
-            found = np.where(whole == NO_STAMP, found, whole * per_unit)
-        return found, note
+            nanoseconds = np.where(whole == NO_STAMP, nanoseconds, whole * per_unit)
+        return nanoseconds, note
 
     def _of_two(self, name: str, nanoseconds: str) -> tuple[TimeArray, str | None]:
-        (seconds, note), (rest, other) = self._whole(name), self._whole(nanoseconds)
-        missing = (seconds == NO_STAMP) | (rest == NO_STAMP)
+        (seconds, note), (fraction, other) = self._whole(name), self._whole(nanoseconds)
+        missing = (seconds == NO_STAMP) | (fraction == NO_STAMP)
         self._refuse_beyond(name, ~missing & (np.abs(seconds * 1e9) >= REACH_NS))
-        wrong = np.flatnonzero(~missing & ((rest < 0) | (rest >= _GIGA)))
+        wrong = np.flatnonzero(~missing & ((fraction < 0) | (fraction >= _GIGA)))
         if len(wrong):
-            what = f"{rest[wrong[0]]} is no number of nanoseconds within a second, 0 to {_GIGA - 1}"
+            what = f"{fraction[wrong[0]]} is no number of nanoseconds within a second, 0 to {_GIGA - 1}"
             raise self._refusal(nanoseconds, what, int(wrong[0]))
-        return np.where(missing, NO_STAMP, np.where(missing, 0, seconds) * _GIGA + rest), note or other
+        return np.where(missing, NO_STAMP, np.where(missing, 0, seconds) * _GIGA + fraction), note or other
 
     def _whole(self, name: str) -> tuple[IntArray, str | None]:
         """Whole numbers of a column, ``NO_STAMP`` where it has none, and a note on cells that were text."""
@@ -252,8 +252,8 @@ class Table:
             raise self._refusal(name, what, int(rows.argmax()))
 
     def _refusal(self, name: str, what: str, row: int | None = None) -> RunError:
-        place = "" if row is None else f", row {row + 1}:"
-        return RunError(f"{self.path}: column '{shortened(name)}'{place} {what}")
+        where_in_column = "" if row is None else f", row {row + 1}:"
+        return RunError(f"{self.path}: column '{shortened(name)}'{where_in_column} {what}")
 
     def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
         try:
@@ -352,14 +352,14 @@ def prefixes(paths: Sequence[str]) -> list[str]:
 
     ``joints.position[elbow]`` needs ``joints.position`` and the names beside it, ``joints.name``. Some may not exist.
     """
-    found: dict[str, None] = {}
+    inner_paths: dict[str, None] = {}
     for path in paths:
-        found[path] = None
+        inner_paths[path] = None
         for bracket in re.finditer(r"\[", path):
             whole = path[: bracket.start()]
             beside, dot, _ = whole.rpartition(".")
-            found |= {whole: None, f"{beside}{dot}{NAMES}": None}
-    return list(found)
+            inner_paths |= {whole: None, f"{beside}{dot}{NAMES}": None}
+    return list(inner_paths)
 
 
 def holders(fields: Iterable[str]) -> set[str]:
@@ -401,7 +401,7 @@ def longest(columns: Container[str], path: str) -> str | None:
 
 def _ends(path: str) -> list[int]:
     """Where names of columns may end in a field path."""
-    return [place for place, letter in enumerate(f"{path}.") if letter in ".["]
+    return [index for index, letter in enumerate(f"{path}.") if letter in ".["]
 
 
 def joined(tables: Iterable[pa.Table], what: str) -> pa.Table | None:
@@ -419,25 +419,25 @@ def joined(tables: Iterable[pa.Table], what: str) -> pa.Table | None:
 
 
 def _inside(
-    column: pa.ChunkedArray, rest: str, names: pa.ChunkedArray | None, label: str, part: bool
+    column: pa.ChunkedArray, inner: str, names: pa.ChunkedArray | None, label: str, part: bool
 ) -> pa.ChunkedArray:
     """What the rest of a field path, ``[2].x``, leads to in a column; ``names`` is the list of names beside it."""
-    if not rest:
+    if not inner:
         return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
-    if rest.startswith("["):
-        key, closed, rest = rest[1:].partition("]")
+    if inner.startswith("["):
+        key, closed, inner = inner[1:].partition("]")
         if not closed:
             raise RunError(f"{label}: '[' without ']'; an element is written position[2] or position[elbow]")
-        return _inside(_element(column, key, names, label, part), rest, None, label, part)
-    if not rest.startswith("."):
-        raise RunError(f"{label}: '.' or '[' is missing before '{shortened(rest)}'")
+        return _inside(_element(column, key, names, label, part), inner, None, label, part)
+    if not inner.startswith("."):
+        raise RunError(f"{label}: '.' or '[' is missing before '{shortened(inner)}'")
     if not pa.types.is_struct(column.type):
-        raise RunError(f"{label}: no field '{shortened(rest[1:])}' in {_in_words(column.type)}")
-    fields = {field.name: pc.struct_field(column, [place]) for place, field in enumerate(column.type)}
-    name = longest(fields, rest[1:])
+        raise RunError(f"{label}: no field '{shortened(inner[1:])}' in {_in_words(column.type)}")
+    fields = {field.name: pc.struct_field(column, [index]) for index, field in enumerate(column.type)}
+    name = longest(fields, inner[1:])
     if name is None:
-        raise UnknownNameError(label, "field", rest[1:], fields)
-    return _inside(fields[name], rest[1 + len(name) :], fields.get(NAMES), label, part)
+        raise UnknownNameError(label, "field", inner[1:], fields)
+    return _inside(fields[name], inner[1 + len(name) :], fields.get(NAMES), label, part)
 
 
 def _element(
@@ -448,22 +448,22 @@ def _element(
         raise RunError(f"{label}: no element '{shortened(key)}' in {_in_words(column.type)}")
     elements, lengths, starts = _elements(column)
     if key.isascii() and key.isdigit():
-        place = int(key) if len(key) < 10 else _GIGA
+        index = int(key) if len(key) < 10 else _GIGA
     elif names is None or not _is_any(names.type, _LISTS) or not _is_any(names.type.value_type, _TEXTS):
         raise RunError(
             f"{label}: no list '{NAMES}' of text beside it says which element is '{shortened(key)}'; by their place"
             " they are 0, 1, 2"
         )
     else:
-        place = _places(names, key)
-    there = (place >= 0) & (place < lengths)
-    if len(there) and not there.any() and not part:
+        index = _places(names, key)
+    in_list = (index >= 0) & (index < lengths)
+    if len(in_list) and not in_list.any() and not part:
         what = f"at most {lengths.max()} elements"
-        if names is not None and not isinstance(place, int):
-            known = pc.unique(pc.list_flatten(names).drop_null()).to_pylist()[:20]
-            what = ", ".join(map(shortened, known)) or "no names"
+        if names is not None and not isinstance(index, int):
+            names_seen = pc.unique(pc.list_flatten(names).drop_null()).to_pylist()[:20]
+            what = ", ".join(map(shortened, names_seen)) or "no names"
         raise RunError(f"{label}: no row has an element '{shortened(key)}'; they have {what}")
-    return pa.chunked_array([elements.take(pa.array(starts + place, mask=~there))])
+    return pa.chunked_array([elements.take(pa.array(starts + index, mask=~in_list))])
 
 
 def _elements(column: pa.ChunkedArray) -> tuple[pa.Array, IntArray, IntArray]:
@@ -475,10 +475,10 @@ def _elements(column: pa.ChunkedArray) -> tuple[pa.Array, IntArray, IntArray]:
 def _places(names: pa.ChunkedArray, key: str) -> IntArray:
     """Place of a name in the list of each row, −1 where it is not there, (rows,)."""
     elements, lengths, starts = _elements(names)
-    found = np.flatnonzero(_filled(pc.equal(elements, key).cast(pa.uint8()), 0))
-    rows = np.repeat(np.arange(len(lengths)), lengths)[found]
+    positions = np.flatnonzero(_filled(pc.equal(elements, key).cast(pa.uint8()), 0))
+    rows = np.repeat(np.arange(len(lengths)), lengths)[positions]
     places = np.full(len(lengths), -1)
-    places[rows[::-1]] = (found - starts[rows])[::-1]  # the first of several
+    places[rows[::-1]] = (positions - starts[rows])[::-1]  # the first of several
     return places
 
 
@@ -498,6 +498,6 @@ def _in_words(kind: pa.DataType) -> str:
 def _filled(column: Any, missing: float) -> Any:
     """The numbers of a column, ``missing`` where it has none. Pyarrow's ``to_numpy`` would import pandas (0.2 s)."""
     whole = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    found = np.full(len(whole), missing)
-    found[np.from_dlpack(pc.is_valid(whole).cast(pa.uint8())) > 0] = np.from_dlpack(pc.drop_null(whole))
-    return found
+    values_there = np.full(len(whole), missing)
+    values_there[np.from_dlpack(pc.is_valid(whole).cast(pa.uint8())) > 0] = np.from_dlpack(pc.drop_null(whole))
+    return values_there

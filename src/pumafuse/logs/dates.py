@@ -42,23 +42,23 @@ def iso(column: pa.ChunkedArray) -> tuple[pa.ChunkedArray, str | None]:
     for written, meant in _REWRITTEN:
         text = pc.replace_substring_regex(text, written, meant)
     text, note = _without_slashes(text) if pc.any(pc.match_substring_regex(text, _SLASHED)).as_py() else (text, None)
-    found = pc.extract_regex(text, _DATED)
-    if found.null_count == len(found):
+    fields = pc.extract_regex(text, _DATED)
+    if fields.null_count == len(fields):
         return text, note
-    day, hours, rest, half = (pc.struct_field(found, name) for name in ("date", "hours", "rest", "half"))
+    day, hours, minutes, half = (pc.struct_field(fields, name) for name in ("date", "hours", "rest", "half"))
     hours = pc.utf8_lpad(_of_day(hours.cast(pa.int64()), half).cast(pa.string()), 2, "0")
-    dated = pc.binary_join_element_wise(day, "T", hours, rest, "")
-    return pc.if_else(pc.is_valid(found), dated, text), note
+    dated = pc.binary_join_element_wise(day, "T", hours, minutes, "")
+    return pc.if_else(pc.is_valid(fields), dated, text), note
 
 
 def durations(text: pa.ChunkedArray) -> pa.ChunkedArray:
     """Times without a date as durations [ns]; null where a cell has none."""
-    found, total = pc.extract_regex(text, ELAPSED), pa.scalar(0)
+    fields, total = pc.extract_regex(text, ELAPSED), pa.scalar(0)
     for factor, part in ((1, "days"), (24, "hours"), (60, "minutes"), (60, "seconds"), (_NANOSECONDS, "fraction")):
-        digits = pc.struct_field(found, part)
+        digits = pc.struct_field(fields, part)
         digits = pc.utf8_rpad(digits, 9, "0") if part == "fraction" else digits
         number = pc.if_else(pc.equal(digits, ""), "0", digits).cast(pa.int64())
-        number = _of_day(number, pc.struct_field(found, "half")) if part == "hours" else number
+        number = _of_day(number, pc.struct_field(fields, "half")) if part == "hours" else number
         total = pc.add(pc.multiply(total, factor), number)
     return total.cast(pa.duration("ns"))
 
@@ -72,8 +72,8 @@ def _of_day(hours: pa.ChunkedArray, half: pa.ChunkedArray) -> pa.ChunkedArray:
 
 def _without_slashes(text: pa.ChunkedArray) -> tuple[pa.ChunkedArray, str | None]:
     """Dates like 3/4/2026 in the order of ISO 8601, and which way they were read where both may be meant."""
-    found = pc.extract_regex(text, _SLASHED)
-    first, second, year, time = (pc.struct_field(found, name) for name in ("first", "second", "year", "time"))
+    fields = pc.extract_regex(text, _SLASHED)
+    first, second, year, time = (pc.struct_field(fields, name) for name in ("first", "second", "year", "time"))
     written: list[str] = pc.unique(pc.binary_join_element_wise(first, second, year, "/")).drop_null().to_pylist()
     span = {order: _span(written, order) for order in ("month", "day")}
     if math.isinf(min(span.values())):
@@ -84,14 +84,14 @@ def _without_slashes(text: pa.ChunkedArray) -> tuple[pa.ChunkedArray, str | None
     dated = pc.binary_join_element_wise(pc.binary_join_element_wise(year, *padded, "-"), time, " ")
     both = not math.isinf(max(span.values()))
     note = f"dates like {written[0]} are read with the {leading} first" if both else None
-    return pc.if_else(pc.is_valid(found), dated, text), note
+    return pc.if_else(pc.is_valid(fields), dated, text), note
 
 
 def _span(written: Sequence[str], leading: str) -> float:
     """Days from the first to the last of some dates that are written with slashes; infinite where one is none."""
     order = slice(None) if leading == "month" else slice(None, None, -1)
     try:
-        parted = [[int(part) for part in one.split("/")] for one in written]
+        parted = [[int(part) for part in date.split("/")] for date in written]
         days = [date(year, *parts[order]).toordinal() for *parts, year in parted]
     except ValueError:
         return math.inf

@@ -49,18 +49,18 @@ class Recording:
 
 def read(path: Path, entity: str, fields: Sequence[str] | None) -> Table:
     """An entity, its rows in the order in which they were logged."""
-    place, known = _place(entity), dict[str, set[str]]()
-    with _opened(path, place) as opened:
-        table = joined(_parts(opened.chunks, place, fields, known), f"entity '{place}'")
+    place_of_entity, components_seen = _place(entity), dict[str, set[str]]()
+    with _opened(path, place_of_entity) as opened:
+        table = joined(_parts(opened.chunks, place_of_entity, fields, components_seen), f"entity '{place_of_entity}'")
     if table is None:
-        listed = {one: ", ".join(sorted(components)) for one, components in sorted(known.items())}
-        raise unknown_part(path, "entity", entity and place, listed, opened.notes)
+        listed = {name: ", ".join(sorted(components)) for name, components in sorted(components_seen.items())}
+        raise unknown_part(path, "entity", entity and place_of_entity, listed, opened.notes)
     table = table.take(pc.sort_indices(table[_ROW])).drop_columns(_ROW)
-    timelines = [name for name in table.column_names if name not in known[place]]
-    names = _names(known[place], timelines)
+    timelines = [name for name in table.column_names if name not in components_seen[place_of_entity]]
+    names = _names(components_seen[place_of_entity], timelines)
     told = {name: short for name, short in names.items() if name in table.column_names}
-    there = [pc.greater(pc.fill_null(pc.list_value_length(table[name]), 0), 0) for name in told]
-    table = table.filter(reduce(pc.or_, there)) if there else table
+    is_filled = [pc.greater(pc.fill_null(pc.list_value_length(table[name]), 0), 0) for name in told]
+    table = table.filter(reduce(pc.or_, is_filled)) if is_filled else table
     columns = {name: table[name] for name in timelines}
     columns |= {short: _single(table[name]) for name, short in told.items()}
     return Table(path, columns, table.num_rows, opened.notes, (*timelines, *names.values()))
@@ -80,16 +80,16 @@ def topics(path: Path) -> tuple[Topic, ...]:
                 recorded += pc.min_max(chunk[LOG_TIME].cast(pa.int64())).as_py().values()
     span = {name: (min(some, default=None), max(some, default=None)) for name, some in ends.items()}
     return tuple(
-        Topic(name, ", ".join(sorted(found)), rows[name], *span[name], tuple(fields[name]))
-        for name, found in sorted(components.items())
+        Topic(name, ", ".join(sorted(components_of)), rows[name], *span[name], tuple(fields[name]))
+        for name, components_of in sorted(components.items())
     )
 
 
 def recording_of(path: Path, entity: str, time: str, unit: str) -> Recording:
     """What a result needs to open on top of the Rerun recording that it was made from, by the entity of its stamps."""
-    place = _place(entity)
-    with _opened(path, place) as opened:
-        chunk = next(chunk for name, chunk in opened.chunks if name == place)
+    entity_place = _place(entity)
+    with _opened(path, entity_place) as opened:
+        chunk = next(chunk for name, chunk in opened.chunks if name == entity_place)
     is_timeline = time in chunk.column_names and time not in _components(chunk)
     kind = chunk[time].type if is_timeline else pa.null()
     count = 10 ** (9 - 3 * TIMES.index(unit)) if pa.types.is_integer(kind) else 1
@@ -97,15 +97,22 @@ def recording_of(path: Path, entity: str, time: str, unit: str) -> Recording:
 
 
 def _parts(
-    chunks: Iterable[tuple[str, pa.Table]], place: str, fields: Sequence[str] | None, known: dict[str, set[str]]
+    chunks: Iterable[tuple[str, pa.Table]],
+    entity_place: str,
+    fields: Sequence[str] | None,
+    components_seen: dict[str, set[str]],
 ) -> Iterator[pa.Table]:
-    """The chunks of an entity, with the fields asked for; the components of all entities go into ``known``."""
+    """The chunks of an entity, with the fields asked for; components of all entities go into ``components_seen``."""
     asked = None if fields is None else holders(fields)
     for name, chunk in chunks:
         components = _components(chunk)
-        known.setdefault(name, set()).update(components)
-        if name == place:
-            unwanted = [one for one in components if asked is not None and asked.isdisjoint((one, _last(one)))]
+        components_seen.setdefault(name, set()).update(components)
+        if name == entity_place:
+            unwanted = [
+                component
+                for component in components
+                if asked is not None and asked.isdisjoint((component, _last(component)))
+            ]
             kept = chunk.drop_columns(unwanted)
             yield kept.take(pc.sort_indices(kept[_ROW]))  # a copy: what was dropped leaves the memory
 
@@ -116,7 +123,7 @@ def _place(entity: str) -> str:
 
 def _components(chunk: pa.Table) -> list[str]:
     """The columns of a chunk that are components; the others are timelines and the row's id."""
-    return [one.name for one in chunk.schema if (one.metadata or {}).get(b"rerun:kind") == b"data"]
+    return [field.name for field in chunk.schema if (field.metadata or {}).get(b"rerun:kind") == b"data"]
 
 
 def _last(component: str) -> str:
@@ -126,7 +133,9 @@ def _last(component: str) -> str:
 def _names(components: Iterable[str], timelines: Sequence[str]) -> dict[str, str]:
     """What the components of an entity are called: the last part of their names, where that is nothing else's."""
     called = Counter([*map(_last, components), *timelines])
-    return {one: _last(one) if called[_last(one)] == 1 else one for one in sorted(components)}
+    return {
+        component: _last(component) if called[_last(component)] == 1 else component for component in sorted(components)
+    }
 
 
 def _single(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -135,10 +144,10 @@ def _single(column: pa.ChunkedArray) -> pa.ChunkedArray:
     length = pc.fill_null(pc.list_value_length(lists), 0)
     if (pc.max(length).as_py() or 0) > 1:
         return column
-    place = pc.if_else(
+    index = pc.if_else(
         pc.equal(length, 1), pc.subtract(pc.cumulative_sum(length), length), pa.scalar(None, length.type)
     )
-    return pa.chunked_array([lists.flatten().take(place)])
+    return pa.chunked_array([lists.flatten().take(index)])
 
 
 def _numbers_of(chunk: pa.Table) -> Iterator[str]:
@@ -169,12 +178,12 @@ class _Opened(NamedTuple):
 def _opened(path: Path, entity: str = "") -> Generator[_Opened]:
     """A recording, from memory where it is small; of others than an ``entity`` columns may come without rows."""
     with one_line(path, "rerun-sdk"):
-        found = path.stat()
-    if found.st_size > _SMALL:
+        stat = path.stat()
+    if stat.st_size > _SMALL:
         with _read(path, entity) as opened:
             yield opened
     else:
-        yield _kept(path, found.st_mtime_ns, found.st_size)
+        yield _kept(path, stat.st_mtime_ns, stat.st_size)
 
 
 @lru_cache(maxsize=1)
@@ -202,7 +211,9 @@ def _read(path: Path, entity: str) -> Generator[_Opened]:
             messages = _messages(path, reader.stdout)
             about, _ = next(messages)
             notes = (about["note"],) if about["note"] else ()
-            yield _Opened(about["application"], about["id"], notes, ((one["entity"], rows) for one, rows in messages))
+            yield _Opened(
+                about["application"], about["id"], notes, ((message["entity"], rows) for message, rows in messages)
+            )
         finally:
             reader.kill()
 
@@ -249,19 +260,19 @@ def _recorded(path: Path, entity: str) -> Iterator[tuple[dict[str, str], pa.Reco
         warnings.simplefilter("always")
         try:
             reader = RrdReader(path)
-            found = reader.recordings()
+            stores = reader.recordings()
         except RuntimeError as error:
             if "exceeds file size" not in str(error):
                 raise
             raise RunError(
                 f"{path}: the recording was cut off; this saves what is there: rerun rrd merge {path} -o saved.rrd"
             ) from None
-    if len(found) != 1:
-        raise RunError(f"{path}: the file has {len(found)} recordings; a file with one is needed")
+    if len(stores) != 1:
+        raise RunError(f"{path}: the file has {len(stores)} recordings; a file with one is needed")
     note = f"{path.name}: the recording has no end (cut off, or of an old Rerun): read as far as it goes"
-    ids = {"application": found[0].application_id, "id": found[0].recording_id}
+    ids = {"application": stores[0].application_id, "id": stores[0].recording_id}
     yield {**ids, "note": note if caught else ""}, _NO_ROWS
-    for chunk in reader.stream(store=found[0]):
+    for chunk in reader.stream(store=stores[0]):
         if not chunk.is_static:
             batch = chunk.to_record_batch()
             names = batch.schema.names  # a component may be called what a timeline is: it cannot be had

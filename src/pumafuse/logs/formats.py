@@ -39,10 +39,10 @@ def names(path: Path) -> list[str]:
 
 def table(path: Path, name: str) -> pa.Table | bytes:
     """A table of a file; of a sheet its cells as CSV."""
-    found = _tables(path, _written(path))
-    if name not in found:
-        raise unknown_part(path, "topic", name, dict.fromkeys(found, "a table"), ())
-    return found[name]
+    read_tables = _tables(path, _written(path))
+    if name not in read_tables:
+        raise unknown_part(path, "topic", name, dict.fromkeys(read_tables, "a table"), ())
+    return read_tables[name]
 
 
 def turned_note(signals: int, numbers: int) -> str:
@@ -53,7 +53,7 @@ def turned_note(signals: int, numbers: int) -> str:
 def _written(path: Path) -> int:
     """When a file, or the last of a folder, was written [ns since 1970]."""
     files = [*path.glob(f"*{ARRAY}")] if path.is_dir() else [path] if path.is_file() else []
-    return max((one.stat().st_mtime_ns for one in files), default=0)
+    return max((file.stat().st_mtime_ns for file in files), default=0)
 
 
 @lru_cache(maxsize=1)
@@ -61,15 +61,15 @@ def _tables(path: Path, _written: int) -> dict[str, pa.Table | bytes]:
     """The tables of a file by name; a file is read once for all of them."""
     with one_line(path, "'pumafuse[formats]'"):
         if path.is_dir():
-            found = _of_value(_loaded(path))
+            tables = _of_value(_loaded(path))
         elif path.is_file() and not path.stat().st_size:
             raise RunError(f"{path}: the file is empty")
         else:
             with path.open("rb") as file:
-                found = {SHEETS: _sheets, ".ulg": _topics}.get(path.suffix, _arrays)(path, file)
-    if not found:
+                tables = {SHEETS: _sheets, ".ulg": _topics}.get(path.suffix, _arrays)(path, file)
+    if not tables:
         raise RunError(f"{path}: no table in it: nothing has rows of numbers")
-    return {"": next(iter(found.values()))} if len(found) == 1 else found
+    return {"": next(iter(tables.values()))} if len(tables) == 1 else tables
 
 
 def _sheets(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
@@ -77,21 +77,21 @@ def _sheets(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     from openpyxl import load_workbook
 
     book: Any = load_workbook(file, read_only=True, data_only=True)
-    found = dict[str, pa.Table | bytes]()
+    sheets = dict[str, pa.Table | bytes]()
     for sheet in book.worksheets:
         text = io.StringIO()
         rows = (row for row in sheet.iter_rows(values_only=True) if any(cell is not None for cell in row))
         csv.writer(text).writerows([c.isoformat() if isinstance(c, datetime) else c for c in row] for row in rows)
         if text.tell():
-            found[sheet.title] = text.getvalue().encode()
-    return found
+            sheets[sheet.title] = text.getvalue().encode()
+    return sheets
 
 
 def _topics(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     """The topics of a log of PX4, whose stamps are in us; what its reader prints of a damaged one is a warning."""
     from pyulog import ULog  # pyright: ignore[reportMissingTypeStubs]
 
-    found = dict[str, pa.Table | bytes]()
+    by_topic = dict[str, pa.Table | bytes]()
     with contextlib.redirect_stdout(io.StringIO()) as said:
         topics = cast(Any, ULog)(file).data_list
     if lines := said.getvalue().splitlines():
@@ -99,8 +99,8 @@ def _topics(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     for topic in topics:
         data: Mapping[str, npt.NDArray[Any]] = topic.data
         columns = {f"{name}_us" if name.startswith("timestamp") else name: column for name, column in data.items()}
-        found[f"{topic.name}_{topic.multi_id}" if topic.multi_id else topic.name] = pa.table(columns)
-    return found
+        by_topic[f"{topic.name}_{topic.multi_id}" if topic.multi_id else topic.name] = pa.table(columns)
+    return by_topic
 
 
 def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
@@ -120,19 +120,19 @@ def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
 
 def _loaded(folder: Path) -> Arrays:
     """The arrays of a folder by the names of their files; a file that is none is for others to say."""
-    found = Arrays()
+    arrays = Arrays()
     for path in sorted(folder.glob(f"*{ARRAY}")):
         with contextlib.suppress(ValueError, OSError, EOFError):
-            found[path.stem] = np.load(path, allow_pickle=False)
-    return found
+            arrays[path.stem] = np.load(path, allow_pickle=False)
+    return arrays
 
 
 def _of_value(value: Any) -> dict[str, pa.Table | bytes]:
     """The tables in a value of arrays, structs and lists."""
-    found = dict[str, pa.Table | bytes]()
-    for name, one in _apart(value, ""):
-        found.update(_by_length(one, name))
-    return found
+    tables = dict[str, pa.Table | bytes]()
+    for name, item in _apart(value, ""):
+        tables.update(_by_length(item, name))
+    return tables
 
 
 def _matlab(path: Path, file: BinaryIO) -> Any:
@@ -150,33 +150,33 @@ def _matlab(path: Path, file: BinaryIO) -> Any:
 def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
     """Values that are tables of their own: each of a list of trials; those of a struct without arrays beside them."""
     if _are_trials(value):
-        for place, one in enumerate(value):
-            yield from _apart(one, f"{name}[{place}]")
+        for index, item in enumerate(value):
+            yield from _apart(item, f"{name}[{index}]")
         return
     struct = cast(Mapping[str, Any], value) if isinstance(value, Mapping) else dict[str, Any]()
     inside = {
         key: struct[key]
-        for key, one in struct.items()
-        if not key.startswith("__") and (isinstance(one, Mapping | list) or np.size(one) > 1)
+        for key, item in struct.items()
+        if not key.startswith("__") and (isinstance(item, Mapping | list) or np.size(item) > 1)
     }
-    if inside and all(isinstance(one, Mapping) and not _is_column(one) for one in inside.values()):
-        for key, one in inside.items():
-            yield from _apart(one, f"{name}.{key}" if name else key)
+    if inside and all(isinstance(item, Mapping) and not _is_column(item) for item in inside.values()):
+        for key, item in inside.items():
+            yield from _apart(item, f"{name}.{key}" if name else key)
     elif len(inside) == 1 and not isinstance(only := next(iter(inside.values())), np.ndarray):
         yield from _apart(only, name)
     else:
-        lists = {key: one for key, one in inside.items() if _are_trials(one)}
-        for key, one in lists.items():
-            yield from _apart(one, f"{name}.{key}" if name else key)
-        yield name, {key: one for key, one in struct.items() if key not in lists} if lists else value
+        lists = {key: records for key, records in inside.items() if _are_trials(records)}
+        for key, item in lists.items():
+            yield from _apart(item, f"{name}.{key}" if name else key)
+        yield name, {key: item for key, item in struct.items() if key not in lists} if lists else value
 
 
 def _are_trials(value: Any) -> bool:
     """Whether a list is of records with lists, some of them longer: runs, and no rows with the joints of an arm."""
     records = cast(Sequence[Any], value if isinstance(value, list) else [])
-    if len(records) < 2 or not all(isinstance(one, Mapping) for one in records):
+    if len(records) < 2 or not all(isinstance(record, Mapping) for record in records):
         return False
-    lists = [[cast(list[Any], one) for one in record.values() if isinstance(one, list)] for record in records]
+    lists = [[cast(list[Any], cells) for cells in record.values() if isinstance(cells, list)] for record in records]
     longest = [max(map(len, some), default=0) for some in lists]
     return min(longest) >= _FEWEST and max(longest) > len(records)
 
@@ -190,26 +190,26 @@ def _is_column(value: Any) -> bool:
 def _by_length(value: Any, name: str) -> dict[str, pa.Table]:
     """Tables of arrays that are equally long, called after their first array where there are several."""
     columns = dict(_columns(value, ""))
-    lengths = {len(one) for one in columns.values() if one.ndim == 1}
+    lengths = {len(column) for column in columns.values() if column.ndim == 1}
     groups, turned = dict[int, Arrays](), dict[str, str]()
-    for key, one in columns.items():
-        along = one.shape[0] in lengths or (one.shape[-1] not in lengths and one.shape[0] >= one.shape[-1])
-        if one.ndim == 2 and not along:
-            turned |= {} if lengths else {"note": turned_note(*one.shape)}
-            one = one.T
-        groups.setdefault(len(one), {})[key] = one
+    for key, column in columns.items():
+        along = column.shape[0] in lengths or (column.shape[-1] not in lengths and column.shape[0] >= column.shape[-1])
+        if column.ndim == 2 and not along:
+            turned |= {} if lengths else {"note": turned_note(*column.shape)}
+            column = column.T
+        groups.setdefault(len(column), {})[key] = column
     groups = {rows: group for rows, group in groups.items() if rows >= _FEWEST}
     made = {next(iter(group)): _table(group).replace_schema_metadata(turned) for group in groups.values()}
-    return {name if len(made) == 1 else ".".join(filter(None, (name, first))): one for first, one in made.items()}
+    return {name if len(made) == 1 else ".".join(filter(None, (name, first))): group for first, group in made.items()}
 
 
 def _table(arrays: Arrays) -> pa.Table:
     """A table of arrays (rows,) or (rows, n); of one array without a name its n columns."""
     if list(arrays) == [""]:
         whole = arrays[""].reshape(len(arrays[""]), -1)
-        arrays = {f"column {place + 1}": column for place, column in enumerate(whole.T)}
-    columns = {name: pa.array(np.ascontiguousarray(one).ravel()) for name, one in arrays.items()}
-    wide = {name: one.shape[1] for name, one in arrays.items() if one.ndim == 2}
+        arrays = {f"column {index + 1}": column for index, column in enumerate(whole.T)}
+    columns = {name: pa.array(np.ascontiguousarray(array).ravel()) for name, array in arrays.items()}
+    wide = {name: array.shape[1] for name, array in arrays.items() if array.ndim == 2}
     lists = {name: pa.FixedSizeListArray.from_arrays(columns[name], width) for name, width in wide.items()}
     return pa.table({**columns, **lists})
 
@@ -222,9 +222,9 @@ def _columns(value: Any, name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
             struct = dict(zip(struct["columns"], zip(*struct["data"], strict=True), strict=True))
         if _is_column(struct):
             struct, value = {}, list(struct.values())
-        for key, one in struct.items():
+        for key, item in struct.items():
             if not key.startswith("__"):
-                yield from _columns(one, f"{name}.{key}" if name else str(key))
+                yield from _columns(item, f"{name}.{key}" if name else str(key))
     if isinstance(value, list | tuple):
         rows = cast(Sequence[Any], value)
         if rows and all(isinstance(row, Mapping) for row in rows):
@@ -243,9 +243,9 @@ def _columns(value: Any, name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
 
 def _as_array(rows: Sequence[Any]) -> npt.NDArray[Any]:
     """A list as an array: of numbers with NaN for none, or of text; empty of anything else."""
-    if any(isinstance(one, str) for one in rows):
-        return np.array(["" if one is None else str(one) for one in rows])
+    if any(isinstance(row, str) for row in rows):
+        return np.array(["" if row is None else str(row) for row in rows])
     try:
-        return np.array(rows, dtype=None if all(type(one) is int for one in rows) else np.float64)
+        return np.array(rows, dtype=None if all(type(row) is int for row in rows) else np.float64)
     except (ValueError, TypeError, OverflowError):
         return np.empty(0)

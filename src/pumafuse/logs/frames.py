@@ -58,8 +58,8 @@ def in_space(arm: ArmModel) -> tuple[str, ...]:
     x, y, z; tangential, radial, vertical; or else the first three lengths, or two that are a position in a plane.
     """
     lengths = [name for name, axis in arm.axes.items() if axis.kind == "length"]
-    known = next((names for names in (CARTESIAN, CANONICAL_AXES) if set(lengths).issuperset(names)), None)
-    return known or (tuple(lengths[:3]) if len(lengths) > 1 else ())
+    names_of_space = next((names for names in (CARTESIAN, CANONICAL_AXES) if set(lengths).issuperset(names)), None)
+    return names_of_space or (tuple(lengths[:3]) if len(lengths) > 1 else ())
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,9 @@ class Placed:
             return self._sign * (y * cos - x * sin), x * cos + y * sin, np.ones(len(x))
         dx, dy = x - self.frame.base[0], y - self.frame.base[1]
         r = np.hypot(dx, dy)
-        known = np.isfinite(x + y) & (r > 0.0)  # some sensors that lost their target report the base's axis
-        r, turn = np.where(known, (r, np.arctan2(dy, dx) - self.angle), np.nan)
-        spread = np.where(known, self.radius / r, 1.0)
+        is_seen = np.isfinite(x + y) & (r > 0.0)  # some sensors that lost their target report the base's axis
+        r, turn = np.where(is_seen, (r, np.arctan2(dy, dx) - self.angle), np.nan)
+        spread = np.where(is_seen, self.radius / r, 1.0)
         lever = self._lever
         if near is not None:
             return lever * (turn + _TURN * np.rint((near / lever - turn) / _TURN)), r, spread
@@ -121,7 +121,7 @@ class Placed:
             return lever * (turn + _TURN * round((before / lever - turn) / _TURN))
 
         tangential = np.full(len(x), np.nan)
-        tangential[known] = list(accumulate(turn[known].tolist(), follow, initial=last))[1:]
+        tangential[is_seen] = list(accumulate(turn[is_seen].tolist(), follow, initial=last))[1:]
         return tangential, r, spread
 
     @_QUIET

@@ -41,10 +41,10 @@ def regular_grid(stamp: TimeArray, period: float, label: str, what: str = COMMAN
     """
     tick = period * 1e9
     since = (stamp - stamp[0]).astype(np.float64)
-    place = _places(since, tick)
-    ticks = assigned_ticks(place)
+    indices = _places(since, tick)
+    ticks = assigned_ticks(indices)
     if ticks is None:
-        shared = int(np.sum(np.diff(np.rint(place)) <= 0))
+        shared = int(np.sum(np.diff(np.rint(indices)) <= 0))
         fault = f"{shared} of {len(stamp)} are stamped nearest to the tick of the one before"
         raise _refusal(fault, stamp, period, label, what)
     notes: list[str] = []
@@ -79,7 +79,7 @@ def ticks_of(stamp: TimeArray) -> float:
         some = since[:size]
         count = max(some[-1] / tick, 1.0)
         tried = tick * (1.0 + np.arange(-width, width, 0.1 / count))  # a tenth of a turn at the last row
-        clear = [abs(np.exp(2j * np.pi / one * some).mean()) for one in tried.tolist()]
+        clear = [abs(np.exp(2j * np.pi / tick * some).mean()) for tick in tried.tolist()]
         tick = float(tried[int(np.argmax(clear))])
         if size >= len(since):
             slope = cast(FloatArray, np.polyfit(np.rint(_places(since, tick)), since, 1))[0]
@@ -104,7 +104,7 @@ def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
     row = max(_longest(late), _longest(off < -0.5))
     clear = min(float(np.abs(np.mean(np.exp(2j * np.pi * off)))), 1.0)
     spread = math.sqrt(-2.0 * math.log(clear)) / (2.0 * math.pi) if clear > 0.0 else math.inf
-    aside = _aside(ticks, late, spread)
+    beside = _aside(ticks, late, spread)
     least = max(_LEAST_CLEAR, 3.0 / math.sqrt(len(off) + 9))  # of stamps without ticks one in e⁹ reaches this
     doubts = {
         f"and more than {_MOST_ASTRAY:.0%} is too many": np.mean(np.abs(off) > 0.5) > _MOST_ASTRAY,
@@ -113,7 +113,7 @@ def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
         f"one of them {early:.2f} periods early, where the jitter's standard deviation is {spread:.2f}": (
             early > max(0.5, _MOST_EARLY * spread)
         ),
-        f"and some {aside:.0f} beside missing ticks may be of those": aside > max(_MOST_ASIDE * len(off), 2.0),
+        f"and some {beside:.0f} beside missing ticks may be of those": beside > max(_MOST_ASIDE * len(off), 2.0),
     }
     return next((words for words, holds in doubts.items() if holds), None)
 
@@ -132,37 +132,37 @@ def _longest(flag: BoolArray) -> int:
     return int(np.diff(np.flatnonzero(np.concatenate(([True], ~flag, [True])))).max()) - 1
 
 
-def assigned_ticks(place: FloatArray) -> IntArray | None:
+def assigned_ticks(positions: FloatArray) -> IntArray | None:
     """Ascending ticks of least total cost for stamps in periods, (n,); None if there are too few ticks.
 
     Each stamp costs least on its nearest tick. Where these ticks do not ascend, the stamps about there form a group,
     which takes the cheapest ascending ticks of its own. It is widened until its ticks ascend among those around it:
     then each part costs the least it can, and so does the whole.
     """
-    ticks = np.rint(place).astype(np.int64)
-    tied = np.zeros(len(place), dtype=np.bool_)  # stamps in the group of the one before
+    ticks = np.rint(positions).astype(np.int64)
+    tied = np.zeros(len(positions), dtype=np.bool_)  # stamps in the group of the one before
     reach = 1
     while len(clash := np.flatnonzero(np.diff(ticks) <= 0) + 1):
-        tied[np.clip(clash[:, None] + np.arange(-reach, reach + 1), 1, len(place) - 1)] = True
+        tied[np.clip(clash[:, None] + np.arange(-reach, reach + 1), 1, len(positions) - 1)] = True
         group = np.cumsum(~tied)
         rows = np.isin(group, group[clash])
-        found = _cheapest_ticks(place[rows], tied[rows])
-        if found is None:
+        cheapest = _cheapest_ticks(positions[rows], tied[rows])
+        if cheapest is None:
             return None
-        ticks[rows] = found
+        ticks[rows] = cheapest
         reach *= 2  # where no tick is free for a thousand stamps, few rounds find the next one
     return ticks
 
 
-def _cheapest_ticks(place: FloatArray, tied: BoolArray) -> IntArray | None:
+def _cheapest_ticks(positions: FloatArray, tied: BoolArray) -> IntArray | None:
     """Ticks that ascend within each group at the least total cost, (n,); None if there are too few about the stamps.
 
     A stamp's cost is the square of its distance from the tick in periods; beyond 0.7 late it hardly grows. ``tied`` are
     stamps in the group of the one before, (n,).
     """
-    first = np.floor(place).astype(np.int64) - _MOST_LATE
+    first = np.floor(positions).astype(np.int64) - _MOST_LATE
     choices = np.arange(_CHOICES)
-    off = place[:, None] - (first[:, None] + choices)
+    off = positions[:, None] - (first[:, None] + choices)
     total = np.where(off > _LATE, _LATE_COST + _LATER_COST * (off - _LATE), off * off)
     # Least cost so far if the last stamp's tick is one of its first 0, 1, 2, ...; at the end 0, the cost of no stamp.
     least = np.concatenate(([math.inf], np.zeros(_CHOICES + 1)))
@@ -177,7 +177,7 @@ def _cheapest_ticks(place: FloatArray, tied: BoolArray) -> IntArray | None:
     lowest = total == np.minimum.accumulate(total, axis=1)
     choice = np.maximum.accumulate(np.where(lowest, choices, 0), axis=1)  # the cheapest one up to each
     ticks, upto = np.empty_like(first), _CHOICES
-    for n in range(len(place) - 1, -1, -1):
+    for n in range(len(positions) - 1, -1, -1):
         chosen = choice[n, min(upto, _CHOICES) - 1]
         ticks[n], upto = first[n] + chosen, before[n, chosen]
     return ticks

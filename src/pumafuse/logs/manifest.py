@@ -117,7 +117,7 @@ class Orientation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     def read(self, table: Table) -> tuple[FloatArray, list[str]]:
         """Quaternions x, y, z, w of the rows of a table, (rows, 4), and notes; NaN in rows that have none."""
         ending = Column("", self.unit).ending
-        parts = [table.plain(one) if self.quaternion else table.numbers(one, ending) for one in self.columns]
+        parts = [table.plain(column) if self.quaternion else table.numbers(column, ending) for column in self.columns]
         return self.quaternions(np.column_stack([part for part, _ in parts])), [note for _, note in parts if note]
 
     def quaternions(self, value: FloatArray) -> FloatArray:
@@ -199,7 +199,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
         turning = () if self.orientation is None else self.orientation.columns
         noise = () if self.noise is None else (self.noise.column,)
         names = [*self.time.columns, *(column.column for column in axes), *turning, *noise]
-        return [*names, *(name for one in axes for name in one.where)]
+        return [*names, *(name for axis in axes for name in axis.where)]
 
     @property
     def has_own_rows(self) -> bool:
@@ -253,10 +253,10 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     @property
     def fields(self) -> dict[tuple[str, ...], list[str]]:
         """The columns and field paths of all its sources, by where their rows are."""
-        found: dict[tuple[str, ...], list[str]] = {}
+        fields: dict[tuple[str, ...], list[str]] = {}
         for entry in self.entries.values():
-            found.setdefault(entry.rows, []).extend(entry.fields)
-        return found
+            fields.setdefault(entry.rows, []).extend(entry.fields)
+        return fields
 
 
 def file_of(run: Path) -> Path:
@@ -278,7 +278,7 @@ def refuse_twice(path: Path) -> None:
     told = {repr(column): axis for axis, columns in listed.command.axes.items() for column in columns}
     for name, entry in listed.sensors.items() if told else ():
         for axis, columns in entry.axes.items() if entry.rows == listed.command.rows else ():
-            if twice := next((told[repr(one)] for one in columns if repr(one) in told), None):
+            if twice := next((told[repr(column)] for column in columns if repr(column) in told), None):
                 raise ConfigError(
                     f"{path}: sensors.{name}.{axis} is the column '{columns[0].column}' of {entry.label}, and so is"
                     f" command.{twice}: give each the column of its own, what the arm is told and what is measured"
@@ -315,10 +315,10 @@ def stamps_of(run: Path) -> dict[str, tuple[int, int]]:
             names += [] if told.robot is None else [told.robot.urdf]
             files = [listed.parent / name for name in names]
         parts = [part for file in files for part in (file.iterdir() if file.is_dir() else [file])]
-        found = {os.path.relpath(part, listed.parent): part.stat() for part in parts}
+        stats = {os.path.relpath(part, listed.parent): part.stat() for part in parts}
     except (PumafuseError, OSError, ValueError):
         return {}
-    return {name: (one.st_size, one.st_mtime_ns) for name, one in found.items()}
+    return {name: (stat.st_size, stat.st_mtime_ns) for name, stat in stats.items()}
 
 
 def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry:
@@ -328,13 +328,15 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
     kinds: dict[str, Any] = {}
     if isinstance(keys.get("start"), dict):
-        given = {key: axis_of(key, where, f"{path}.start") for key in keys["start"]}
-        keys["start"] = {axis: keys["start"][key] for key, axis in given.items()}
-        kinds = {axis: kind_of(key) for key, axis in given.items()}
+        start = {key: axis_of(key, where, f"{path}.start") for key in keys["start"]}
+        keys["start"] = {axis: keys["start"][key] for key, axis in start.items()}
+        kinds = {axis: kind_of(key) for key, axis in start.items()}
     if "pose" in keys:
         keys = _with_pose(keys, where, path)
-    own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes", "kinds"}
-    axes = {axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in list(keys) if axis not in own}
+    fields_of_kind = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes", "kinds"}
+    axes = {
+        axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in list(keys) if axis not in fields_of_kind
+    }
     if "orientation" in keys:
         _check_orientation(keys["orientation"], axes, where, f"{path}.orientation")
     if "joints" in keys:
@@ -363,77 +365,77 @@ def _with_pose(keys: dict[str, Any], where: str, path: str) -> dict[str, Any]:
         raise ConfigError(f"{where}: {path}: gives {twice} and a pose, which has it; give one")
     position, orientation = _IN_TRANSFORM if leaf(pose).rpartition(".")[2] == "transform" else _IN_POSE
     inside = "" if pose == "." else f"{pose}."
-    found = {key: value for key, value in keys.items() if key != "pose"}
-    found |= {axis: {"column": f"{inside}{position}.{axis}", "unit": "m"} for axis in CARTESIAN}
-    return found | {"orientation": {"quaternion": [f"{inside}{orientation}.{one}" for one in "xyzw"]}}
+    without_pose = {key: value for key, value in keys.items() if key != "pose"}
+    without_pose |= {axis: {"column": f"{inside}{position}.{axis}", "unit": "m"} for axis in CARTESIAN}
+    return without_pose | {"orientation": {"quaternion": [f"{inside}{orientation}.{letter}" for letter in "xyzw"]}}
 
 
-def _check_orientation(given: Any, axes: dict[str, list[Any]], where: str, path: str) -> None:
-    one = toml.struct(given, Orientation, where, path)
-    forms = [one.quaternion, one.rotation_vector, one.euler]
+def _check_orientation(table: Any, axes: dict[str, list[Any]], where: str, path: str) -> None:
+    entry = toml.struct(table, Orientation, where, path)
+    forms = [entry.quaternion, entry.rotation_vector, entry.euler]
     if sum(form is not None for form in forms) != 1:
         raise ConfigError(
             f"{where}: {path}: expected one of quaternion = ['qx', 'qy', 'qz', 'qw'], rotation_vector = ['rx', 'ry',"
             " 'rz'] and euler = ['A', 'B', 'C']"
         )
-    if one.euler and not (one.letters in _LETTERS or one.letters.swapcase() in _LETTERS):
+    if entry.euler and not (entry.letters in _LETTERS or entry.letters.swapcase() in _LETTERS):
         accepted = ", ".join(CONVENTIONS)
         raise ConfigError(
             f"{where}: {path}.convention: expected {accepted}, or letters as in 'ZYX' (about axes that turn along) or"
-            f" 'xyz' (about axes that stay), not '{one.convention}'"
+            f" 'xyz' (about axes that stay), not '{entry.convention}'"
         )
-    if one.convention and not one.euler and not (one.quaternion and one.convention == "abb"):
+    if entry.convention and not entry.euler and not (entry.quaternion and entry.convention == "abb"):
         raise ConfigError(f"{where}: {path}.convention: only Euler angles have one, and a quaternion of ABB's")
-    if not one.quaternion:
-        _check_unit(given, ANGLES, where, path)
-        if column := next((name for name in one.columns if Column(name, one.unit).kind != "angle"), None):
+    if not entry.quaternion:
+        _check_unit(table, ANGLES, where, path)
+        if column := next((name for name in entry.columns if Column(name, entry.unit).kind != "angle"), None):
             raise ConfigError(f"{where}: {path}: '{column}' ends in no unit of an angle; give unit = 'deg' or 'rad'")
     if twice := next((axis for axis in TURNING if axis in axes), None):
         raise ConfigError(f"{where}: {path}: the orientation has {twice}, which is an axis of its own, too; give one")
 
 
-def _check_noise(given: Any, kind: type[SourceEntry], where: str, path: str) -> None:
-    one = toml.struct(given, RowNoise, where, path)
-    if bool(one.sd) == bool(one.variance):
+def _check_noise(table: Any, kind: type[SourceEntry], where: str, path: str) -> None:
+    noise = toml.struct(table, RowNoise, where, path)
+    if bool(noise.sd) == bool(noise.variance):
         raise ConfigError(f"{where}: {path}: expected one of sd = 'error_mm' and variance = 'pose.covariance[0]'")
     if kind is not SourceEntry:
         raise ConfigError(f"{where}: {path}: only rows of sensors have a noise")
 
 
-def _joints(given: Any, beside: Iterable[str], where: str, path: str) -> dict[str, Any]:
-    if not isinstance(given, dict) or not given:
+def _joints(table: Any, beside: Iterable[str], where: str, path: str) -> dict[str, Any]:
+    if not isinstance(table, dict) or not table:
         raise ConfigError(f"{where}: {path}: expected a column for each joint, as in {{ j1 = 'j1_deg' }}")
     if twice := next(iter(beside), None):
         raise ConfigError(
             f"{where}: {path}: the pose of the joints is x, y, z and an orientation; {twice} is given, too"
         )
-    return {name: _columns(one, where, f"{path}.{name}") for name, one in cast(dict[str, Any], given).items()}
+    return {name: _columns(column, where, f"{path}.{name}") for name, column in cast(dict[str, Any], table).items()}
 
 
-def _columns(given: Any, where: str, path: str) -> list[Any]:
+def _columns(table: Any, where: str, path: str) -> list[Any]:
     """The columns of an axis: one or a list, each by its name or as a table."""
-    listed = cast(list[Any], given if isinstance(given, list) else [given])
-    columns: list[Any] = [{"column": one} if isinstance(one, str) else one for one in listed]
-    if not columns or not all(isinstance(one, dict) and cast(dict[str, Any], one).get("column") for one in columns):
+    listed = cast(list[Any], table if isinstance(table, list) else [table])
+    columns: list[Any] = [{"column": item} if isinstance(item, str) else item for item in listed]
+    if not columns or not all(isinstance(item, dict) and cast(dict[str, Any], item).get("column") for item in columns):
         axis = path.rpartition(".")[2]
         raise ConfigError(
             f"{where}: {path}: expected a column name or a list of them, as in {axis} = 'x_mm', or with its unit"
             f" {axis} = {{ column = 'pose.position.x', unit = 'm' }}"
         )
-    for one in columns:
-        if "where" in one:
-            one["where"] = _where(one["where"], where, f"{path}.where")
-        toml.check(one, Column, where, path)
-        _check_unit(one, (*LENGTHS, *ANGLES), where, path)
-        if one.get("turn_deg") and msgspec.convert(one, Column).kind != "angle":
+    for column in columns:
+        if "where" in column:
+            column["where"] = _where(column["where"], where, f"{path}.where")
+        toml.check(column, Column, where, path)
+        _check_unit(column, (*LENGTHS, *ANGLES), where, path)
+        if column.get("turn_deg") and msgspec.convert(column, Column).kind != "angle":
             raise ConfigError(f"{where}: {path}.turn_deg: the column is no angle")
     return columns
 
 
-def _time(given: Any, where: str, path: str) -> dict[str, Any]:
-    match given:
-        case str() if given:
-            return {"column": given}
+def _time(table: Any, where: str, path: str) -> dict[str, Any]:
+    match table:
+        case str() if table:
+            return {"column": table}
         case [str() as seconds, str() as nanoseconds] if seconds and nanoseconds:
             return {"column": seconds, "nanoseconds": nanoseconds}
         case {"column": str() as column, **more} if column and more.keys() <= _OF_TIME:
@@ -450,13 +452,13 @@ def _time(given: Any, where: str, path: str) -> dict[str, Any]:
             )
 
 
-def _where(given: Any, where: str, path: str) -> dict[str, Any]:
+def _where(table: Any, where: str, path: str) -> dict[str, Any]:
     """Values by column, in the unit of the column: they are compared with what is in the file."""
-    values = cast(dict[str, Any], given if isinstance(given, dict) else {})
-    known = (
+    values = cast(dict[str, Any], table if isinstance(table, dict) else {})
+    accepted = (
         isinstance(value, str) or (isinstance(value, int | float) and abs(value) < _MOST) for value in values.values()
     )
-    if not values or not all(known):
+    if not values or not all(accepted):
         raise ConfigError(
             f"{where}: {path}: expected a number, a text or a boolean for each column, as in {{ episode_index = 3 }};"
             " a field path is quoted, as in { 'meta.episode' = 3 }"

@@ -55,7 +55,7 @@ def _read_topic(path: Path, topic: str, fields: Sequence[str] | None) -> Table:
     table = joined(_batches(rows, fields, names), f"topic '{topic}'")
     notes = faults.notes(path.name)
     if table is None:
-        raise unknown_part(path, "topic", topic, {one.topic: one.type for one in sorted(seen)}, notes)
+        raise unknown_part(path, "topic", topic, {channel.topic: channel.type for channel in sorted(seen)}, notes)
     time = table[LOG_TIME].cast(pa.int64())
     if pc.any(pc.greater(time[:-1], time[1:])).as_py():  # chunks and files of one bag may overlap
         table = table.take(pc.sort_indices(time))  # stable
@@ -80,18 +80,22 @@ def _messages(path: Path, topic: str, faults: Faults, seen: set[Channel]) -> Ite
 
 
 def _rows(
-    found: Iterator[tuple[Record, Message]], fields: Sequence[str] | None, faults: Faults
+    messages: Iterator[tuple[Record, Message]], fields: Sequence[str] | None, faults: Faults
 ) -> Iterable[tuple[Record, Message]]:
     """Messages as rows: each as one, or, where fields of rows in them are asked for, these."""
-    first = next(found, None)
+    first = next(messages, None)
     if first is None:
         return []
-    found, asked = chain([first], found), holders(fields or ())
+    messages, asked = chain([first], messages), holders(fields or ())
     if fields is not None and list(first[1]) == [TRANSFORMS] and TRANSFORMS not in asked:
-        return ((record, bags.fields_of(one) or {}) for record, message in found for one in message[TRANSFORMS])
+        return (
+            (record, bags.fields_of(transform) or {})
+            for record, message in messages
+            for transform in message[TRANSFORMS]
+        )
     if PATH not in first[1] and PATH in asked:
-        return _each_place(found, faults)
-    return found
+        return _each_place(messages, faults)
+    return messages
 
 
 def _batches(
@@ -123,19 +127,25 @@ def _batch(rows: Sequence[Message], times: Sequence[int | None]) -> pa.Table:
 
 
 def _topics(path: Path) -> tuple[Topic, ...]:
-    faults, seen, found = Faults(), set[Channel](), Counter[Channel]()
+    faults, seen, counts = Faults(), set[Channel](), Counter[Channel]()
     first, ends = dict[Channel, Record](), dict[Channel, tuple[int, int]]()
     for record in bags.records_of(path, None, faults, seen):
         channel, time = record.channel, record.time
         first.setdefault(channel, record)
         low, high = ends.get(channel, (time, time))
         ends[channel] = min(low, time), max(high, time)
-        found[channel] += 1
+        counts[channel] += 1
     if not seen:
         raise unknown_part(path, "topic", "", {}, faults.notes(path.name))
     return tuple(
-        Topic(one.topic, one.type, found[one], *ends.get(one, (None, None)), *_fields_in(first.get(one)))
-        for one in sorted(seen)
+        Topic(
+            channel.topic,
+            channel.type,
+            counts[channel],
+            *ends.get(channel, (None, None)),
+            *_fields_in(first.get(channel)),
+        )
+        for channel in sorted(seen)
     )
 
 
@@ -161,7 +171,7 @@ def trajectory_in(message: Any) -> Mapping[str, Any] | None:
     if {"joint_names", "points"} <= fields.keys():
         return fields
     inside = (trajectory_in(fields[name]) for name in _AROUND if name in fields)
-    return next((one for one in inside if one is not None), None)
+    return next((trajectory for trajectory in inside if trajectory is not None), None)
 
 
 def _each_place(messages: Iterable[tuple[Record, Message]], faults: Faults) -> Iterator[tuple[Record, Message]]:
@@ -171,10 +181,14 @@ def _each_place(messages: Iterable[tuple[Record, Message]], faults: Faults) -> I
     and begins where that was. One without points ends it, too.
     """
     every = ((record, trajectory_in(bags.plain(message))) for record, message in messages)
-    begun = ((begin_of(one, record.time), record, one) for record, one in every if one is not None)
-    known = sorted(begun, key=lambda one: one[0])
+    begun = (
+        (begin_of(trajectory, record.time), record, trajectory)
+        for record, trajectory in every
+        if trajectory is not None
+    )
+    ordered = sorted(begun, key=lambda begun_at: begun_at[0])
     before: CommandedPath | None = None
-    for (begin, record, trajectory), end in zip_longest(known, (begin for begin, _, _ in known[1:])):
+    for (begin, record, trajectory), end in zip_longest(ordered, (begin for begin, _, _ in ordered[1:])):
         try:
             path = CommandedPath(trajectory, begin, before)
         except bags.DAMAGE as error:
@@ -218,8 +232,8 @@ class CommandedPath:
     def rows(self, end: int | None = None) -> Iterator[tuple[int, FloatArray]]:
         """Times [ns] and positions, each 4 ms, up to the last point, or to where the next trajectory begins."""
         first, last = self._time
-        times = (one for one in chain(range(first, last, _STEP), (last,)) if end is None or one < end)
-        return ((one, self.at(one)) for one in times)
+        times = (instant for instant in chain(range(first, last, _STEP), (last,)) if end is None or instant < end)
+        return ((time, self.at(time)) for time in times)
 
 
 def _curve(time: FloatArray, position: FloatArray, velocity: FloatArray | None) -> PPoly:
@@ -240,12 +254,12 @@ def begin_of(trajectory: Mapping[str, Any], received: int) -> int:
 
 
 def _nanoseconds(time: Mapping[str, int]) -> int:
-    seconds, rest = next(pair for pair in SPLIT_STAMPS if pair[0] in time and pair[1] in time)
-    return int(time[seconds]) * 10**9 + int(time[rest])
+    seconds, nanoseconds = next(pair for pair in SPLIT_STAMPS if pair[0] in time and pair[1] in time)
+    return int(time[seconds]) * 10**9 + int(time[nanoseconds])
 
 
 def _numbers(point: Mapping[str, Any], key: str, joints: Sequence[str]) -> FloatArray:
-    found = np.array(point[key], dtype=np.float64)
-    if found.shape != (len(joints),) or not np.isfinite(found).all():
+    numbers = np.array(point[key], dtype=np.float64)
+    if numbers.shape != (len(joints),) or not np.isfinite(numbers).all():
         raise ValueError(f"a point has no {key} for each of its {len(joints)} joints")
-    return found
+    return numbers

@@ -99,10 +99,10 @@ class Source:
     @property
     def has_value(self) -> BoolArray:
         """Rows that have a value for any axis, (rows,)."""
-        known = [~np.isnan(value) for value in self.values.values()]
+        has_number = [~np.isnan(value) for value in self.values.values()]
         if self.orientation is not None:
-            known.append(~np.isnan(self.orientation[:, 0]))
-        return np.any(known, axis=0)
+            has_number.append(~np.isnan(self.orientation[:, 0]))
+        return np.any(has_number, axis=0)
 
     def posed(self, joints: Joints) -> Source:
         """The source with the pose of the tip to which joints move their chain."""
@@ -119,9 +119,9 @@ class Source:
         if self.joints is None or not any(later.values()):
             return self
         told, late = self.joints.values.copy(), self.joints.chain.columns(later, self.label)
-        known = np.flatnonzero(np.isfinite(told).all(axis=1) & (self.stamp != NO_STAMP))
-        set_back = np.flatnonzero(np.diff(self.stamp[known]) < -TOLERATED_STEP_BACK_NS) + 1
-        for part in np.split(known, set_back):
+        complete = np.flatnonzero(np.isfinite(told).all(axis=1) & (self.stamp != NO_STAMP))
+        set_back = np.flatnonzero(np.diff(self.stamp[complete]) < -TOLERATED_STEP_BACK_NS) + 1
+        for part in np.split(complete, set_back):
             rows = part[np.argsort(self.stamp[part], kind="stable")]
             time = self.stamp[rows]
             last = np.flatnonzero(np.diff(time, append=NEVER))  # of a stamp the last command counts
@@ -139,8 +139,8 @@ class Source:
 
     def ordered(self, axis: str) -> IntArray:
         """The rows that have a stamp and a value of an axis, by stamp, (n,)."""
-        known = np.flatnonzero(np.isfinite(self.values[axis]) & (self.stamp != NO_STAMP))
-        return known[np.argsort(self.stamp[known], kind="stable")]
+        rows = np.flatnonzero(np.isfinite(self.values[axis]) & (self.stamp != NO_STAMP))
+        return rows[np.argsort(self.stamp[rows], kind="stable")]
 
     def series(self, axis: str) -> tuple[TimeArray, FloatArray]:
         """Stamps and values of these rows, (n,) each."""
@@ -151,9 +151,9 @@ class Source:
         """The source with angles that go on moved by whole ``turns`` [rad], by axis, to where they are commanded."""
         values = dict(self.values)
         for axis in turns.keys() & values.keys() & command.values.keys():
-            turn, told, (stamp, mine) = turns[axis], command.series(axis), self.series(axis)
+            turn, told, (stamp, positions) = turns[axis], command.series(axis), self.series(axis)
             if len(told[0]) and len(stamp):
-                apart = np.median(mine - np.interp(stamp, *told))
+                apart = np.median(positions - np.interp(stamp, *told))
                 values[axis] = values[axis] - turn * np.round(apart / turn)
         return replace(self, values=values)
 
@@ -162,28 +162,28 @@ class Source:
 
         Axes that stand one below another, each with stamps that begin anew, are brought into the order of time first.
         """
-        mine = self.rows(self.has_value)
-        inside = [np.flatnonzero(np.isfinite(value)) for value in mine.values.values()]
+        with_values = self.rows(self.has_value)
+        inside = [np.flatnonzero(np.isfinite(value)) for value in with_values.values.values()]
         ends = sorted((int(rows[0]), int(rows[-1])) for rows in inside if len(rows))
         reach = accumulate((end for _, end in ends), max)
         begins = {begin for (begin, _), end in zip(ends[1:], reach, strict=False) if begin > end}
-        falls = np.flatnonzero(np.diff(mine.stamp) < 0) + 1
+        falls = np.flatnonzero(np.diff(with_values.stamp) < 0) + 1
         if len(falls) and begins.issuperset(falls.tolist()):
-            return mine.rows(np.argsort(mine.stamp, kind="stable")).pivoted()
-        known = {axis: np.isfinite(value) for axis, value in self.values.items()}
+            return with_values.rows(np.argsort(with_values.stamp, kind="stable")).pivoted()
+        has_number = {axis: np.isfinite(value) for axis, value in self.values.items()}
         group = np.cumsum(np.diff(self.stamp, prepend=self.stamp[:1]) != 0)
         first = np.searchsorted(group, group)
-        place = np.zeros(len(group), dtype=np.int64)  # of an axis with several values of one stamp
-        for mask in known.values():
+        number = np.zeros(len(group), dtype=np.int64)  # of an axis with several values of one stamp
+        for mask in has_number.values():
             count = np.cumsum(mask)
-            place = np.maximum(place, np.where(mask, count - (count - mask)[first], 0))
-        key = group * (place.max(initial=0) + 1) + place
+            number = np.maximum(number, np.where(mask, count - (count - mask)[first], 0))
+        key = group * (number.max(initial=0) + 1) + number
         _, row, together = np.unique(key, return_index=True, return_inverse=True)
         values = {axis: np.full(len(row), np.nan) for axis in self.values}
-        for axis, mask in known.items():
+        for axis, mask in has_number.items():
             values[axis][together[mask]] = self.values[axis][mask]
-        found = replace(self, stamp=self.stamp[row], values=values, apart=True)
-        return found.rows(found.has_value)
+        pivoted = replace(self, stamp=self.stamp[row], values=values, apart=True)
+        return pivoted.rows(pivoted.has_value)
 
     def interpolated(self, step: float) -> Source:
         """The source with values between its rows, on the line from each to the next, for a controller that does so.
@@ -198,11 +198,11 @@ class Source:
         """
         if self.apart:
             alone = {axis: self.rows(np.isfinite(value)) for axis, value in self.values.items()}
-            some = [replace(one, values={axis: one.values[axis]}, apart=False) for axis, one in alone.items()]
-            every = [one.interpolated(step) for one in some]
-            stamp = np.concatenate([one.stamp for one in every])
+            some = [replace(source, values={axis: source.values[axis]}, apart=False) for axis, source in alone.items()]
+            every = [source.interpolated(step) for source in some]
+            stamp = np.concatenate([source.stamp for source in every])
             values = {
-                axis: np.concatenate([one.values.get(axis, np.full(len(one.stamp), np.nan)) for one in every])
+                axis: np.concatenate([source.values.get(axis, np.full(len(source.stamp), np.nan)) for source in every])
                 for axis in self.values
             }
             whole = replace(every[0], stamp=stamp, values=values)
@@ -245,8 +245,8 @@ class Source:
         if (np.diff(self.stamp) >= -TOLERATED_STEP_BACK_NS).all():
             return self, None
         again = np.append(False, (np.diff(self.stamp[order]) == 0) & (np.diff(order) > 1))
-        mine = [value[order] for value in self.values.values()]
-        other = again & np.any([value != np.roll(value, 1) for value in mine], axis=0)
+        values_in_order = [value[order] for value in self.values.values()]
+        other = again & np.any([value != np.roll(value, 1) for value in values_in_order], axis=0)
         twice = f"; {counted(int(again.sum()), 'row')} of a time that was there already left out" if again.any() else ""
         twice += f", {other.sum()} of them with another value" if other.any() else ""
         return self.rows(order[~again]), f"{self.label}: rows are not in the order of time: put in order{twice}"
@@ -359,7 +359,7 @@ class Run:
         Raises:
             RunError: That is no interval after the first command.
         """
-        low, high = (_number(one, end) for one, end in ((since, 0.0), (until, np.inf)))
+        low, high = (_number(given_end, end) for given_end, end in ((since, 0.0), (until, np.inf)))
         if not (0.0 <= low < high and low < np.inf):
             raise RunError(f"run '{self.name}': from {since} to {until} s is no interval after the first command")
         return replace(self, since=since, until=until if high < np.inf else None)
@@ -463,10 +463,10 @@ def _on_the_line(stamp: TimeArray, value: FloatArray, at: TimeArray) -> FloatArr
 
 def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: str = "") -> None:
     """Append a note: how many ``rows`` of a source have ``what``, and the first of them; nothing without any."""
-    found = np.flatnonzero(rows)
-    if len(found):
-        plural = "row has" if len(found) == 1 else "rows have"
-        notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1}{first})")
+    numbers = np.flatnonzero(rows)
+    if len(numbers):
+        plural = "row has" if len(numbers) == 1 else "rows have"
+        notes.append(f"{label}: {len(numbers)} {plural} {what} (first: row {numbers[0] + 1}{first})")
 
 
 def standing_clock(source: Source) -> str:
@@ -481,8 +481,8 @@ def standing_clock(source: Source) -> str:
     most = changes.sum()
     if not most:
         return ""
-    known = np.isfinite(source.values[axis]) & (source.stamp != NO_STAMP)
-    step, tick = np.abs(np.diff(source.values[axis][known])), np.diff(source.stamp[known])
+    has_number = np.isfinite(source.values[axis]) & (source.stamp != NO_STAMP)
+    step, tick = np.abs(np.diff(source.values[axis][has_number])), np.diff(source.stamp[has_number])
     ticks = int((tick != 0).sum()) + 1
     period = np.median(tick[tick > 0]) / 1e9 if (tick > 0).any() else np.inf
     going_on = 2.0 * step[tick == 0].mean() >= (step[tick != 0].mean() if ticks > 1 else 0.0)
@@ -510,9 +510,9 @@ def _most_changes(source: Source) -> tuple[str, BoolArray]:
     """The axis with the most rows that have the stamp of the row before and another value, and these rows, (rows,)."""
     changes = {"": np.zeros(len(source.stamp), dtype=np.bool_)}
     for axis, value in source.values.items() if (np.diff(source.stamp) == 0).any() else ():
-        known = np.flatnonzero(np.isfinite(value) & (source.stamp != NO_STAMP))
+        rows = np.flatnonzero(np.isfinite(value) & (source.stamp != NO_STAMP))
         changes[axis] = np.zeros(len(value), dtype=np.bool_)
-        changes[axis][known[1:]] = (np.diff(source.stamp[known]) == 0) & (np.diff(value[known]) != 0)
+        changes[axis][rows[1:]] = (np.diff(source.stamp[rows]) == 0) & (np.diff(value[rows]) != 0)
     axis = max(changes, key=lambda axis: changes[axis].sum())
     return axis, changes[axis]
 
@@ -608,31 +608,31 @@ def of_tables(
         if entry.rows not in read:
             read[entry.rows] = read_table(entry)
             notes.extend(note for note in read[entry.rows].notes if note not in notes)
-        known = None if entry.time.rate else read[entry.rows].zoned(entry.time.column)
-        if known is not None:
-            (zoned if known else naive).append(name)
-        found = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units, entry.orientation)
+        zone = None if entry.time.rate else read[entry.rows].zoned(entry.time.column)
+        if zone is not None:
+            (zoned if zone else naive).append(name)
+        source = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units, entry.orientation)
         if entry.noise is not None:
-            found = replace(found, noise=entry.noise.factor(read[entry.rows].plain(entry.noise.column)[0]))
+            source = replace(source, noise=entry.noise.factor(read[entry.rows].plain(entry.noise.column)[0]))
         if chain is not None and entry.joints:
-            found = _posed(found, read[entry.rows], entry.joints, chain, units)
+            source = _posed(source, read[entry.rows], entry.joints, chain, units)
         if entry.entity:
-            found, note = found.on_timeline()
+            source, note = source.on_timeline()
             notes.extend([] if note is None else [note])
-        found = found.pivoted() if entry.has_own_rows else found
-        return _on_ticks(found, notes) if entry.clock == "regular" and entry is not listed.command else found
+        source = source.pivoted() if entry.has_own_rows else source
+        return _on_ticks(source, notes) if entry.clock == "regular" and entry is not listed.command else source
 
     sources = {name: source(name) for name in entries}
     has_value = {name: sources[name].has_value for name, entry in entries.items() if not entry.has_own_rows}
     empty: dict[tuple[str, ...], BoolArray] = {}  # rows of a table in which none of its sources has a value
-    for name, mine in has_value.items():
-        empty[entries[name].rows] = ~mine & empty.get(entries[name].rows, True)
-    for name, mine in has_value.items():  # where only others of its table have any, a row is theirs
-        sources[name] = sources[name].rows(mine | empty[entries[name].rows])
+    for name, has_row in has_value.items():
+        empty[entries[name].rows] = ~has_row & empty.get(entries[name].rows, True)
+    for name, has_row in has_value.items():  # where only others of its table have any, a row is theirs
+        sources[name] = sources[name].rows(has_row | empty[entries[name].rows])
     if listed.command.interpolation:
         sources["command"] = sources["command"].interpolated(listed.command.interpolation)
     command = sources["command"]
-    sources = {name: one.beside(command, entries[name].turns) for name, one in sources.items()}
+    sources = {name: source.beside(command, entries[name].turns) for name, source in sources.items()}
     reference, sensors = sources.get("reference"), {name: sources[f"sensor {name}"] for name in listed.sensors}
     if reference is not None and scored is not None:
         of_kind = {"length": scored.sd, "angle": scored.angular_sd}
@@ -646,14 +646,14 @@ def of_tables(
 
 def _on_ticks(source: Source, notes: list[str]) -> Source:
     """A source on the even ticks of its own clock; those of the commands are of T, which is not known here."""
-    known = source.stamp != NO_STAMP
-    distinct, place = np.unique(source.stamp[known], return_inverse=True)
+    stamped = source.stamp != NO_STAMP
+    distinct, tick = np.unique(source.stamp[stamped], return_inverse=True)
     if len(distinct) < _FEW_ROWS:
         return source
     grid, note = regular_grid(distinct, ticks_of(distinct), source.label, "rows")
     notes.extend([] if note is None else [note])
     stamp = source.stamp.copy()
-    stamp[known] = grid[place]
+    stamp[stamped] = grid[tick]
     return replace(source, stamp=stamp)
 
 
@@ -678,8 +678,8 @@ def of_table(table: tables.Table) -> Run:
     path, clock, listed = table.path, clock_of(table), ", ".join(table.columns)
     groups: dict[str, dict[str, list[manifest.Column]]] = {}
     for column in (name for name in table.columns if "." in name):
-        source, _, rest = column.partition(".")
-        axis = rest.rpartition("_")[0]
+        source, _, inner = column.partition(".")
+        axis = inner.rpartition("_")[0]
         if axis in groups.setdefault(source, {}):
             raise RunError(f"{path}: two columns for {source}.{axis}; give one")
         groups[source][axis] = [manifest.Column(column)]
@@ -706,7 +706,7 @@ def _source(
 ) -> Source:
     """A source from its columns, those of an axis added up; new notes and new kinds of axes are put in."""
     stamp, of_time = time.stamps(table)
-    values, found = dict[str, FloatArray](), list[str | None](of_time)
+    values, faults = dict[str, FloatArray](), list[str | None](of_time)
     for axis, columns in axes.items():
         parts = [_own(table, column) for column in columns]
         for column in columns:
@@ -717,14 +717,14 @@ def _source(
                     " in run.toml: in another source, or in its start"
                 )
         values[axis] = np.sum([numbers for numbers, _ in parts], 0)
-        found.extend(note for _, note in parts)
+        faults.extend(note for _, note in parts)
     turned = None
     if orientation is not None:
         turned, more = orientation.read(table)
-        found += more
+        faults += more
         if np.isnan(turned).all():
             raise RunError(f"{table.path}: no row of {', '.join(orientation.columns)} is an orientation")
-    notes.extend(note for note in found if note is not None and note not in notes)
+    notes.extend(note for note in faults if note is not None and note not in notes)
     source = Source(stamp, values, label, orientation=turned)
     beside = None if time.nanoseconds else table.nanoseconds_beside(time.column)
     advice = f"write time = ['{time.column}', '{beside}']" if beside else "name a finer column of time"
@@ -744,9 +744,9 @@ def _posed(
     for joint, kind in chain.kinds.items():
         if joint not in joints:
             raise RunError(f"{table.path}: no column for joint '{joint}' of the [robot]; there are {', '.join(joints)}")
-        if wrong := next((one.column for one in joints[joint] if one.kind not in (kind, None)), None):
+        if wrong := next((joint.column for joint in joints[joint] if joint.kind not in (kind, None)), None):
             raise RunError(f"{table.path}: column '{wrong}' is no {kind}, which joint '{joint}' moves by")
-        values.append(np.sum([_own(table, one)[0] for one in joints[joint]], 0))
+        values.append(np.sum([_own(table, joint)[0] for joint in joints[joint]], 0))
     units |= dict.fromkeys(CARTESIAN, "length")
     return source.posed(Joints(chain, np.column_stack(values)))
 
@@ -754,5 +754,5 @@ def _posed(
 def _own(table: tables.Table, column: manifest.Column) -> tuple[FloatArray, str | None]:
     """The numbers of a column, NaN in rows that are another axis's, and a note; an angle that begins anew goes on."""
     numbers, note = table.numbers(column.column, column.ending)
-    own = np.where(tables.meets(table, column.where), numbers, np.nan) if column.where else numbers
-    return unwrapped(own, column.turn) if column.turn else own, note
+    chosen = np.where(tables.meets(table, column.where), numbers, np.nan) if column.where else numbers
+    return unwrapped(chosen, column.turn) if column.turn else chosen, note

@@ -39,8 +39,8 @@ def lost(position: FloatArray) -> BoolArray:
 
 def usual_of(steps: FloatArray) -> float:
     """The step than which few are larger; numpy's quantile takes longer, and imports masked arrays (0.02 s)."""
-    place = int(USUAL * len(steps))
-    return float(np.partition(steps, place)[place])
+    rank = int(USUAL * len(steps))
+    return float(np.partition(steps, rank)[rank])
 
 
 def leaps(value: float, before: float, usual: float) -> bool:
@@ -52,22 +52,22 @@ def leaps(value: float, before: float, usual: float) -> bool:
 
 def returns(value: float, before: float, out: Iterable[float]) -> bool:
     """Whether a value is back near the one before those that leapt ``out``."""
-    return abs(value - before) < BACK * min(min(abs(one - before), abs(one - value)) for one in out)
+    return abs(value - before) < BACK * min(min(abs(stray - before), abs(stray - value)) for stray in out)
 
 
 def without_stray_values(command: Source, sensors: Sequence[Source], notes: list[str]) -> Source:
     """The commands without values that nobody sent: NaN, with a note."""
     if command.joints is not None:  # what nobody sent is among these, and a pose is of all of them
-        found = without_stray_values(command.in_joints(), [one.in_joints() for one in sensors], notes)
-        if not len(found.stray):
+        screened = without_stray_values(command.in_joints(), [sensor.in_joints() for sensor in sensors], notes)
+        if not len(screened.stray):
             return command
-        told = np.column_stack([found.values[joint] for joint in command.joints.chain.joints])
-        values = {**command.values, **{axis: found.values[axis] for axis in found.values.keys() & command.values}}
-        return replace(command, values=values, stray=found.stray).posed(command.joints._replace(values=told))
+        told = np.column_stack([screened.values[joint] for joint in command.joints.chain.joints])
+        values = {**command.values, **{axis: screened.values[axis] for axis in screened.values.keys() & command.values}}
+        return replace(command, values=values, stray=screened.stray).posed(command.joints._replace(values=told))
     values, left_out = dict(command.values), np.zeros(len(command.stamp), dtype=np.bool_)
     for axis, value in command.values.items():
         told = command.ordered(axis)
-        measured = [one.series(axis) for one in sensors if axis in one.values]
+        measured = [sensor.series(axis) for sensor in sensors if axis in sensor.values]
         stray = np.zeros(len(value), dtype=np.bool_)
         stray[told] = _stray(command.stamp[told], value[told], measured)
         if stray.any():
@@ -79,10 +79,10 @@ def without_stray_values(command: Source, sensors: Sequence[Source], notes: list
 
 def _stray(stamp: TimeArray, value: FloatArray, sensors: Sequence[tuple[TimeArray, FloatArray]]) -> BoolArray:
     """Which of the commands of an axis, by stamp, are stray, (rows,)."""
-    found = np.zeros(len(value), dtype=np.bool_)
+    is_stray = np.zeros(len(value), dtype=np.bool_)
     begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)  # a table may say each several times
     if len(begin) <= FEWEST:
-        return found
+        return is_stray
     steps = np.abs(np.diff(value[begin]))
     usual, interval = usual_of(steps), median(np.diff(stamp[begin]).astype(np.float64))
     u, t, end = value[begin].tolist(), stamp[begin].tolist(), [*begin[1:].tolist(), len(value)]
@@ -90,23 +90,23 @@ def _stray(stamp: TimeArray, value: FloatArray, sensors: Sequence[tuple[TimeArra
     def pace(row: int, way: int) -> float:
         """How far the commands go beside a row, one stray value apart."""
         beside = (min(max(row + way * many, 0), len(u) - 1) for many in (1, 2))
-        return min(abs(u[one] - u[row]) for one in beside)
+        return min(abs(u[row_beside] - u[row]) for row_beside in beside)
 
     row = 1  # the first that may be stray
-    for place in (np.flatnonzero(steps > FAR * usual) + 1).tolist():
-        if place < row:
+    for stray_row in (np.flatnonzero(steps > FAR * usual) + 1).tolist():
+        if stray_row < row:
             continue
-        before = place - 1
-        for after in range(place + 1, min(place + MOST_STRAY + 1, len(u))):
-            typical, out = max(usual, pace(before, -1), pace(after, 1)), u[place:after]
-            brief = t[after] - t[place] <= BRIEF * interval * (after - place)
-            away = all(leaps(one, u[beside], typical) for one in out for beside in (before, after))
+        before = stray_row - 1
+        for after in range(stray_row + 1, min(stray_row + MOST_STRAY + 1, len(u))):
+            typical, out = max(usual, pace(before, -1), pace(after, 1)), u[stray_row:after]
+            brief = t[after] - t[stray_row] <= BRIEF * interval * (after - stray_row)
+            away = all(leaps(stray, u[beside], typical) for stray in out for beside in (before, after))
             if brief and away and returns(u[after], u[before], out):
-                if not any(_follows(*one, t[place]) for one in sensors):
-                    found[begin[place] : end[after - 1]] = True
+                if not any(_follows(*sensor, t[stray_row]) for sensor in sensors):
+                    is_stray[begin[stray_row] : end[after - 1]] = True
                     row = after + 1
                 break
-    return found
+    return is_stray
 
 
 def _follows(stamp: TimeArray, value: FloatArray, leap: int) -> bool:
@@ -149,9 +149,9 @@ class Habit(NamedTuple):
         """Whether a motion [m or rad] is clearly more than the steps of the values."""
         return moved > max(_STEPS * self.smallest, _CLEARLY * self.typical)
 
-    def is_again(self, place: int) -> bool:
-        """Whether a value that has come ``place`` times before in a row is that of a sample that is held."""
-        return self.times > 1 and place % (2 * self.times) != 0
+    def is_again(self, count: int) -> bool:
+        """Whether a value that has come ``count`` times before in a row is that of a sample that is held."""
+        return self.times > 1 and count % (2 * self.times) != 0
 
 
 def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArray], lag: int) -> tuple[BoolArray, int]:
@@ -166,8 +166,8 @@ def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArr
         return np.zeros(len(value), dtype=np.bool_), 1
     count, steps = np.diff(begin, append=len(value)), np.pad(np.abs(np.diff(value[begin])), 1)
     habit = Habit.of(steps[1:-1], count[:-1])
-    place = np.arange(len(value)) - np.repeat(begin, count)
-    found = np.array([habit.is_again(one) for one in range(int(count.max()))])[place]
+    index = np.arange(len(value)) - np.repeat(begin, count)
+    is_held = np.array([habit.is_again(index) for index in range(int(count.max()))])[index]
     leaps, travel, repeats = steps > FAR * habit.usual, float(np.ptp(command[1])), len(value) - len(begin)
     for run in np.flatnonzero(count >= _FROZEN).tolist():
         first, last = int(begin[run]), int(begin[run] + count[run] - 1)
@@ -175,5 +175,5 @@ def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArr
         moved = float(np.ptp(command[1][max(low - 1, 0) : high])) if high > max(low - 1, 0) else 0.0
         elsewhere = (repeats - count[run] + 1) / (len(value) - count[run])
         if habit.froze(int(count[run]), moved, travel, bool(leaps[run : run + 2].any()), elsewhere):
-            found[first + (0 if leaps[run] else 1) : last + 1] = True  # what it leaps to is where nobody was
-    return found, habit.times
+            is_held[first + (0 if leaps[run] else 1) : last + 1] = True  # what it leaps to is where nobody was
+    return is_held, habit.times

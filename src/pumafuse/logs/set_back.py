@@ -39,7 +39,7 @@ def going_on(run: Run) -> tuple[Run, list[str]]:
     notes = list[str]()
     for _ in range(_MOST):
         steps = {name: steps_back(source.stamp) for name, source in _sources(run).items()}
-        common = next(filter(None, (_common(run, one, steps) for one in _candidates(steps))), None)
+        common = next(filter(None, (_common(run, candidate, steps) for candidate in _candidates(steps))), None)
         if common is None:
             return run, [*notes, *_alone(run, steps)]
         later = _rows_after(run.command, common)
@@ -62,8 +62,8 @@ def steps_back(stamp: TimeArray) -> list[Step]:
     apart = np.diff(back, prepend=0, append=len(stamp))
     begins, ends = back - apart[:-1], back + apart[1:]
     some = np.flatnonzero((apart[:-1] > _IN_ORDER) & (apart[1:] > _LEAST))
-    steps = [_step(stamp, int(begins[one]), int(back[one]), int(ends[one])) for one in some.tolist()]
-    return [one for one in steps if one is not None]
+    steps = [_step(stamp, int(begins[row]), int(back[row]), int(ends[row])) for row in some.tolist()]
+    return [step for step in steps if step is not None]
 
 
 def _step(stamp: TimeArray, begin: int, row: int, end: int) -> Step | None:
@@ -78,7 +78,7 @@ def _step(stamp: TimeArray, begin: int, row: int, end: int) -> Step | None:
     hole = max(_HOLE * usual, _HOLE_OF_STEP * (newest - first))
     behind = int(np.count_nonzero(after <= newest))
     few = min(len(before) - 1, behind) < _REGULAR * expected
-    longest = max(int(np.diff(one).max(initial=0)) for one in (before, after))
+    longest = max(int(np.diff(stamps).max(initial=0)) for stamps in (before, after))
     if behind < _LEAST or few or longest > hole:
         return None
     return Step(row, newest, newest - first + usual, usual, behind)
@@ -91,7 +91,10 @@ def _sources(run: Run) -> dict[str, Source]:
 
 def _candidates(steps: Mapping[str, list[Step]]) -> Iterable[Step]:
     """The steps of all sources, the first ones first; of one instant those of the densest source."""
-    every = sorted((one for mine in steps.values() for one in mine), key=lambda one: (one.newest - one.back, one.usual))
+    every = sorted(
+        (step for steps_of_source in steps.values() for step in steps_of_source),
+        key=lambda step: (step.newest - step.back, step.usual),
+    )
     return every[:_MOST]
 
 
@@ -99,29 +102,29 @@ def _common(run: Run, step: Step, steps: Mapping[str, list[Step]]) -> Step | Non
     """The step back of all clocks at a step of one: the surest one; None where not all were."""
     agreeing = list[Step]()
     for name, source in _sources(run).items():
-        mine = [one for one in steps[name] if _agree(one, step)]
-        if mine:
-            agreeing += mine[:1]
+        agreeing_steps = [other for other in steps[name] if _agree(other, step)]
+        if agreeing_steps:
+            agreeing += agreeing_steps[:1]
         elif _goes_on(source.stamp, step):
             return None
-    if steps[""] and not any(_agree(one, step) for one in steps[""]):
+    if steps[""] and not any(_agree(other, step) for other in steps[""]):
         return None
     several = len(agreeing) > 1 or not run.sensors
-    if not several or max(one.behind for one in agreeing) < _OF_ALL:
+    if not several or max(step.behind for step in agreeing) < _OF_ALL:
         return None
-    surest = min(agreeing, key=lambda one: one.usual)
-    return surest._replace(newest=max(one.newest for one in agreeing))
+    surest = min(agreeing, key=lambda step: step.usual)
+    return surest._replace(newest=max(step.newest for step in agreeing))
 
 
-def _agree(one: Step, other: Step) -> bool:
-    apart = _AGREE * (one.usual + other.usual)
-    return abs(one.back - other.back) <= apart and abs(one.newest - other.newest) <= apart
+def _agree(step: Step, other: Step) -> bool:
+    apart = _AGREE * (step.usual + other.usual)
+    return abs(step.back - other.back) <= apart and abs(step.newest - other.newest) <= apart
 
 
 def _goes_on(stamp: TimeArray, step: Step) -> bool:
     """Whether a source goes on over a step as if there was none: it has rows just before and after, and no step."""
-    known = stamp[stamp != NO_STAMP]
-    near = known[np.abs(known - step.newest) <= step.back + TOLERATED_STEP_BACK_NS]
+    stamps = stamp[stamp != NO_STAMP]
+    near = stamps[np.abs(stamps - step.newest) <= step.back + TOLERATED_STEP_BACK_NS]
     if len(near) < _LEAST or not (near.min() < step.newest - step.back and near.max() > step.newest):
         return False
     return bool((np.diff(near) >= 0).all()) and float(np.median(np.diff(near))) < step.back
@@ -129,19 +132,19 @@ def _goes_on(stamp: TimeArray, step: Step) -> bool:
 
 def _shows(stamp: TimeArray, step: Step) -> bool:
     """Whether an interval of a reference is shorter by about a step, where that is."""
-    known = stamp[stamp != NO_STAMP]
-    interval, near = np.diff(known), np.abs(known[1:] - step.newest) <= step.back + TOLERATED_STEP_BACK_NS
+    stamps = stamp[stamp != NO_STAMP]
+    interval, near = np.diff(stamps), np.abs(stamps[1:] - step.newest) <= step.back + TOLERATED_STEP_BACK_NS
     return bool(near.any()) and float(interval[near].min()) < float(np.median(interval)) - 0.5 * step.back
 
 
 def _rows_after(source: Source, step: Step) -> IntArray:
     """The rows of a source that came after a step, of those with a stamp."""
-    known = np.flatnonzero(source.stamp != NO_STAMP)
-    stamp = source.stamp[known]
-    rows = [one.row for one in steps_back(stamp) if abs(one.newest - step.newest) <= step.back]
+    stamped = np.flatnonzero(source.stamp != NO_STAMP)
+    stamp = source.stamp[stamped]
+    rows = [other.row for other in steps_back(stamp) if abs(other.newest - step.newest) <= step.back]
     falls = (np.diff(stamp) < 0) & (np.abs(stamp[:-1] - step.newest) <= step.back)
     rows = rows or (np.flatnonzero(falls) + 1).tolist()
-    return known[rows[0] if rows else _shortest(stamp, step) :]
+    return stamped[rows[0] if rows else _shortest(stamp, step) :]
 
 
 def _shortest(stamp: TimeArray, step: Step) -> int:
@@ -166,10 +169,10 @@ def _moved(run: Run, step: Step) -> Run:
 def _alone(run: Run, steps: Mapping[str, list[Step]]) -> list[str]:
     """A sentence on each sensor whose clock was set back while the commands' went on."""
     return [
-        f"{source.label_for(name)}: its clock is set back by {one.back / 1e9:.3f} s in row"
-        f" {int(np.flatnonzero(source.stamp != NO_STAMP)[one.row]) + 1}, and others are not: rows are sorted by their"
+        f"{source.label_for(name)}: its clock is set back by {step.back / 1e9:.3f} s in row"
+        f" {int(np.flatnonzero(source.stamp != NO_STAMP)[step.row]) + 1}, and others are not: rows are sorted by their"
         " stamps; where it was right before, they are stamped too early from there on"
         for name, source in run.sensors.items()
-        for one in steps[name]
-        if one.behind >= _OF_ONE and _goes_on(run.command.stamp, one)
+        for step in steps[name]
+        if step.behind >= _OF_ONE and _goes_on(run.command.stamp, step)
     ]

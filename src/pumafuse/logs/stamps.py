@@ -50,9 +50,9 @@ def going_on(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
     hours = np.where((back == 0) & (np.abs(np.abs(steps) - _HOUR_NS) <= close), np.sign(steps), 0)
     if np.count_nonzero(hours) == 1:
         take(hours, _HOUR_NS, f"is set {'back' if hours.sum() < 0 else 'ahead'} by an hour, as for daylight saving")
-    found = stamp.copy()
-    found[rows[1:]] -= np.cumsum(back)
-    return found, notes
+    unwrapped = stamp.copy()
+    unwrapped[rows[1:]] -= np.cumsum(back)
+    return unwrapped, notes
 
 
 def packets(stamp: TimeArray) -> tuple[float, float] | None:
@@ -73,12 +73,12 @@ def spread(stamp: TimeArray, number: FloatArray) -> TimeArray:
     No row arrives before it is made. So the line from number to stamp lies below all arrivals; of such lines it is
     the one that is nearest to them on average, an edge of their convex hull.
     """
-    there = (stamp != NO_STAMP) & np.isfinite(number)
-    if not there.any():
+    has_both = (stamp != NO_STAMP) & np.isfinite(number)
+    if not has_both.any():
         return stamp
-    origin, middle = stamp[there].min(), float(np.median(number[there]))
+    origin, middle = stamp[has_both].min(), float(np.median(number[has_both]))
     hull: list[tuple[float, float]] = []
-    at, arrival = number[there] - middle, (stamp[there] - origin).astype(np.float64)
+    at, arrival = number[has_both] - middle, (stamp[has_both] - origin).astype(np.float64)
     order = np.lexsort((arrival, at))
     for point in zip(at[order].tolist(), arrival[order].tolist(), strict=True):
         if hull and point[0] == hull[-1][0]:  # a number again, later
@@ -91,8 +91,8 @@ def spread(stamp: TimeArray, number: FloatArray) -> TimeArray:
         hull.append(point)
     if len(hull) < 2:
         return stamp
-    place = min(max(int(np.searchsorted([one for one, _ in hull], float(at.mean()))), 1), len(hull) - 1)
-    (begin, low), (end, high) = hull[place - 1], hull[place]
+    corner = min(max(int(np.searchsorted([point for point, _ in hull], float(at.mean()))), 1), len(hull) - 1)
+    (begin, low), (end, high) = hull[corner - 1], hull[corner]
     slope = (high - low) / (end - begin)
     even = origin + np.rint(low + slope * (np.nan_to_num(number) - middle - begin)).astype(np.int64)
-    return np.where(there, even, NO_STAMP)
+    return np.where(has_both, even, NO_STAMP)

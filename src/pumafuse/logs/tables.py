@@ -122,10 +122,10 @@ def meets(table: Table, where: Where) -> BoolArray:
     """Rows in which each of some columns has a value, (rows,)."""
     whole = pa.table(dict(table.columns))
     met = _met(table.path, whole, _conditions(table.path, whole, where))
-    found = np.from_dlpack(pc.fill_null(met, False).cast(pa.uint8()).combine_chunks()) > 0
-    if not found.any():
+    is_met = np.from_dlpack(pc.fill_null(met, False).cast(pa.uint8()).combine_chunks()) > 0
+    if not is_met.any():
         raise _no_row(table.path, [whole], where)
-    return found
+    return is_met
 
 
 def chosen(table: Table, where: Where) -> Table:
@@ -139,7 +139,7 @@ def chosen(table: Table, where: Where) -> Table:
 def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
     """A Parquet table, some rows at a time; see :func:`read`."""
     with one_line(path), _opened(path) as file:
-        names = tuple(file.schema.column(place).path for place in range(len(file.schema)))
+        names = tuple(file.schema.column(index).path for index in range(len(file.schema)))
         wanted, empty = _wanted(path, file, fields, {})
         for part in _parts(file, wanted, None) if file.metadata.num_rows else [empty]:
             yield Table(path, _named(part), part.num_rows, (), names)
@@ -160,9 +160,9 @@ def sentinel_of(path: Path, name: str) -> float | None:
 def _largest_by_statistics(path: Path, name: str) -> float | None:
     """The largest size in a column by the file's statistics; None where they do not tell, or where it is infinite."""
     with one_line(path):
-        found, most = papq.read_metadata(str(path)), 0.0
-    for group in map(found.row_group, range(found.num_row_groups)):
-        columns = {one.path_in_schema: one for one in map(group.column, range(group.num_columns))}
+        largest, most = papq.read_metadata(str(path)), 0.0
+    for group in map(largest.row_group, range(largest.num_row_groups)):
+        columns = {column.path_in_schema: column for column in map(group.column, range(group.num_columns))}
         told = columns[name].statistics if name in columns else None
         if told is None or not told.has_min_max or not isinstance(told.max, int | float):
             return None
@@ -202,7 +202,7 @@ def holds_numbers(path: Path) -> bool:
     with one_line(path), path.open("rb") as file:
         head = file.read(_HEAD)
     lines = [] if b"\0" in head else head.decode("utf-8", errors="replace").splitlines()
-    return any(_begins(lines, place, _separator(lines[place])) for place in range(min(len(lines), _FIRST_ROWS)))
+    return any(_begins(lines, row, _separator(lines[row])) for row in range(min(len(lines), _FIRST_ROWS)))
 
 
 def is_recording(path: Path) -> bool:
@@ -260,17 +260,17 @@ def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None
     if other:
         raise RunError(f"{path}: of such a file the key is '{key}', not '{wrong}'")
     asked = None if fields is None else [*fields, *where]
-    found = recordings.read(path, name, None if asked is None else prefixes(asked))
-    _asked(path, found.names, fields=asked or (), where={})
-    return chosen(found, where)
+    recording = recordings.read(path, name, None if asked is None else prefixes(asked))
+    _asked(path, recording.names, fields=asked or (), where={})
+    return chosen(recording, where)
 
 
 def _asked(path: Path, names: Sequence[str], *, fields: Sequence[str] | Choice, where: Where) -> list[str]:
     """The names of columns, whole or to a field, that have to be read."""
-    asked, known = [*(fields(names) if callable(fields) else fields), *where], set(names)
-    for one in asked:
-        if longest(known, one) is None:
-            raise UnknownNameError(str(path), "column", one, names)
+    asked, columns = [*(fields(names) if callable(fields) else fields), *where], set(names)
+    for column in asked:
+        if longest(columns, column) is None:
+            raise UnknownNameError(str(path), "column", column, names)
     return prefixes(asked)
 
 
@@ -316,7 +316,7 @@ def _refuse_deep_lines(path: Path, text: bytes) -> None:
 def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
     level = [column.type for column in table.columns]
     for _ in range(_DEEPEST):
-        level = [kind.field(place).type for kind in level for place in range(kind.num_fields)]
+        level = [kind.field(index).type for kind in level for index in range(kind.num_fields)]
         if not level:
             return
     raise RunError(f"{path}: nested more than {_DEEPEST} deep: no log")
@@ -330,17 +330,21 @@ def _of_csv(path: Path, text: bytes, choice: Choice | None) -> _Text:
             raise
         table, names, more = _parsed(path, text.decode("cp1252").encode(), choice)
         more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
-    found, twice = _numbered(path, table.column_names)
-    return pa.table([_listed(one) for one in table.columns], found), names or found, [*twice, *more]
+    names_numbered, twice = _numbered(path, table.column_names)
+    return (
+        pa.table([_listed(column) for column in table.columns], names_numbered),
+        names or names_numbered,
+        [*twice, *more],
+    )
 
 
-def _numbered(path: Path, given: Sequence[str]) -> tuple[list[str], list[str]]:
+def _numbered(path: Path, header: Sequence[str]) -> tuple[list[str], list[str]]:
     """Names of columns of which none is empty or there twice, and a note on those that were there twice."""
-    names, count = [name or _column(place) for place, name in enumerate(given)], Counter[str]()
+    names, count = [name or _column(index) for index, name in enumerate(header)], Counter[str]()
     if not (repeated := sorted(_repeated(names))):
         return names, []
-    for place, name in enumerate(names):
-        names[place] = f"{name}.{count[name]}" if count[name] else name  # as pandas calls them
+    for index, name in enumerate(names):
+        names[index] = f"{name}.{count[name]}" if count[name] else name  # as pandas calls them
         count[name] += 1
     twice = ", ".join(map(shortened, repeated))
     return names, [f"{path.name}: headers that are there twice: {twice}; the second of each is called .1"]
@@ -432,30 +436,30 @@ def _turned(text: bytes) -> pa.Table | None:
     """
     if len([*islice(re.finditer(b"\n", text), _MOST_SIGNALS + 1)]) > _MOST_SIGNALS:
         return None
-    lines = [one.strip() for one in text.removeprefix(codecs.BOM_UTF8).split(b"\n")]
-    lines = [one for one in lines if one and not _COMMENT.match(one[:4].decode("latin-1"))]
+    lines = [line.strip() for line in text.removeprefix(codecs.BOM_UTF8).split(b"\n")]
+    lines = [line for line in lines if line and not _COMMENT.match(line[:4].decode("latin-1"))]
     if len(lines) < 2:
         return None
     separator = _separator(lines[0].decode())
-    given = None if separator == " " else separator.encode()
+    delimiter = None if separator == " " else separator.encode()
     least = _LONG * len(lines)
-    if min(len(one) for one in lines) < least or len({len(one.split(given)) for one in lines}) > 1:
+    if min(len(line) for line in lines) < least or len({len(line.split(delimiter)) for line in lines}) > 1:
         return None
-    begins = [_cells(one[:_LONG_LINE].decode(), separator)[0] for one in lines]
+    begins = [_cells(line[:_LONG_LINE].decode(), separator)[0] for line in lines]
     named = not any(map(_NUMBER.fullmatch, begins))
     columns = list[pa.ChunkedArray]()
     for line in lines:
-        below = b"\n".join(line.split(given))
-        one = pacsv.read_csv(
+        below = b"\n".join(line.split(delimiter))
+        table = pacsv.read_csv(
             pa.BufferReader(below),
             pacsv.ReadOptions(use_threads=False, column_names=["one"], skip_rows=int(named), block_size=len(below)),
             pacsv.ParseOptions(delimiter=separator, ignore_empty_lines=False),
             pacsv.ConvertOptions(null_values=BLANK, decimal_point=_point(text[:_HEAD], separator)),
         )
-        columns.append(one.column(0))
-    if not all(pa.types.is_floating(one.type) or pa.types.is_integer(one.type) for one in columns):
+        columns.append(table.column(0))
+    if not all(pa.types.is_floating(column.type) or pa.types.is_integer(column.type) for column in columns):
         return None
-    filled = [one.cast(pa.float64()).fill_null(np.nan).combine_chunks() for one in columns]
+    filled = [column.cast(pa.float64()).fill_null(np.nan).combine_chunks() for column in columns]
     value = np.array(list(map(np.from_dlpack, filled)), dtype=np.float64)
     steps = np.diff(value)
     clocks = (np.mean(steps > 0.0, axis=1) >= _RISES) & ~(steps < 0.0).any(axis=1)
@@ -478,7 +482,7 @@ def _transforms_apart(text: bytes) -> bytes:
     width = header.count(_TRANSFORMS.removeprefix(b"%time"))
     apart = [b",".join(header.split(b",")[: 1 + width])]
     for time, *cells in (line.split(b",") for line in lines):
-        apart += [b",".join([time, *cells[place : place + width]]) for place in range(0, len(cells), width)]
+        apart += [b",".join([time, *cells[first : first + width]]) for first in range(0, len(cells), width)]
     return b"\n".join([*apart, b""])
 
 
@@ -489,15 +493,15 @@ def _short_header(
 
     R leaves out that of its row names, in quotes in front. Rows that count without quotes may be either.
     """
-    if {one.actual_columns for one in rows} != {len(names) + 1}:
+    if {row.actual_columns for row in rows} != {len(names) + 1}:
         return None
     what = f"{path.name}: the header has {counted(len(names), 'name')}, each of {len(rows)} rows {len(names) + 1} cells"
-    first = [_split(one.text, layout.separator)[0].strip() for one in rows[:_BESIDE]]
-    in_front = all(one.startswith('"') for one in first)
+    first = [_split(row.text, layout.separator)[0].strip() for row in rows[:_BESIDE]]
+    in_front = all(label.startswith('"') for label in first)
     if not in_front and first in ([str(begin + n) for n in range(len(first))] for begin in (0, 1)):
         raise RunError(f"{what}: is the name of the first or of the last column missing? Add it to the header")
-    place = 0 if in_front else len(names)
-    whole = [*names[:place], _column(place), *names[place:]]
+    index = 0 if in_front else len(names)
+    whole = [*names[:index], _column(index), *names[index:]]
     skipped = layout.skipped + (layout.names is None)
     return layout._replace(names=whole, skipped=skipped), f"{what}: the {'first' if in_front else 'last'} has no name"
 
@@ -551,16 +555,16 @@ def _layout(text: bytes) -> _Layout:
 
 def _whole_lines(lines: Sequence[str]) -> tuple[list[str], bool]:
     """Lines of a text, those together in which a cell in quotes goes on; and whether there are such."""
-    found, is_open = list[list[str]](), False
+    lines_whole, is_open = list[list[str]](), False
     for line in lines:
         odd = line.count('"') % 2 == 1
         if is_open:
-            found[-1].append(line)
+            lines_whole[-1].append(line)
             is_open = not odd
         else:
-            found.append([line])
+            lines_whole.append([line])
             is_open = odd and _OPEN.search(line) is not None
-    return ["\n".join(parts) for parts in found], len(found) < len(lines)
+    return ["\n".join(parts) for parts in lines_whole], len(lines_whole) < len(lines)
 
 
 def _header(lines: Sequence[str], full: Sequence[int]) -> int:
@@ -574,7 +578,7 @@ def _header(lines: Sequence[str], full: Sequence[int]) -> int:
         return header
     first, *below = (_cells(lines[n], separator) for n in full[: 1 + _BESIDE])
     begin = next(
-        (n for n in full[1:] if any(_begins(lines, n, one) for one in {separator, _separator(lines[n - 1])})),
+        (n for n in full[1:] if any(_begins(lines, n, letter) for letter in {separator, _separator(lines[n - 1])})),
         header + 1,
     )
     between = [_cells(lines[n], separator) for n in full[1:] if n < begin]
@@ -597,15 +601,15 @@ def _told_apart(lines: Sequence[str], header: int, separator: str) -> tuple[int,
         above = _cells(lines[top - 1], separator)
         if len(above) != len(names):
             break
-        top, names = top - 1, [f"{one} {other}".strip() for one, other in zip(above, names, strict=True)]
+        top, names = top - 1, [f"{word} {other}".strip() for word, other in zip(above, names, strict=True)]
     return top, names if top < header else None
 
 
-def _begins(lines: Sequence[str], place: int, separator: str) -> bool:
+def _begins(lines: Sequence[str], number: int, separator: str) -> bool:
     """Whether rows of numbers begin at a line, the same number of them in each of the next few."""
-    rows = [_cells(line, separator) for line in lines[place : place + _BESIDE]]
+    rows = [_cells(line, separator) for line in lines[number : number + _BESIDE]]
     return len(rows) > 1 and all(
-        len(row) == len(rows[0]) > 1 and 2 * sum(_NUMBER.fullmatch(one) is not None for one in row) > len(row)
+        len(row) == len(rows[0]) > 1 and 2 * sum(_NUMBER.fullmatch(cell) is not None for cell in row) > len(row)
         for row in rows
     )
 
@@ -618,17 +622,17 @@ def _is_headless(lines: Sequence[str], first: int, separator: str) -> bool:
     if not _begins(lines, first, separator):
         return False
     row, below = (_cells(lines[first + n], separator) for n in (0, 1))
-    of_numbers = [one for one, other in zip(row, below, strict=True) if _NUMBER.fullmatch(other)]
+    of_numbers = [cell for cell, other in zip(row, below, strict=True) if _NUMBER.fullmatch(other)]
     return all(map(_NUMBER.fullmatch, of_numbers)) and row != list(map(str, range(len(row))))
 
 
-def _column(place: int) -> str:
-    return FIRST.replace("1", str(place + 1))
+def _column(index: int) -> str:
+    return FIRST.replace("1", str(index + 1))
 
 
 def _is_text(row: Sequence[str]) -> bool:
     """Whether a row is no row of data: it has words, and no cell that begins like a number or a date."""
-    return any(one not in BLANK for one in row) and not any(re.match(r"[+-]?[.,]?\d", one) for one in row)
+    return any(cell not in BLANK for cell in row) and not any(re.match(r"[+-]?[.,]?\d", cell) for cell in row)
 
 
 def _point(text: bytes, separator: str) -> str:
@@ -645,7 +649,7 @@ def _separator(line: str) -> str:
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    return [one.strip().strip('"').strip().replace("\0", separator) for one in _split(line, separator)]
+    return [cell.strip().strip('"').strip().replace("\0", separator) for cell in _split(line, separator)]
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -661,12 +665,12 @@ def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa
         wanted, empty = _wanted(path, file, fields, where)
         conditions = _conditions(path, empty, where)
         groups = [
-            place for place in range(file.num_row_groups) if _may_hold(file.metadata.row_group(place), conditions)
+            index for index in range(file.num_row_groups) if _may_hold(file.metadata.row_group(index), conditions)
         ]
         kept = [part.filter(_met(path, part, conditions)) if where else part for part in _parts(file, wanted, groups)]
         if where and not any(part.num_rows for part in kept):
             raise _no_row(path, _parts(file, prefixes(list(where)), None), where)
-        names = [file.schema.column(place).path for place in range(len(file.schema))]
+        names = [file.schema.column(index).path for index in range(len(file.schema))]
         return pa.concat_tables(kept) if kept else empty, names
 
 
@@ -686,9 +690,9 @@ def _wanted(
     schema = file.schema_arrow
     wanted = None if fields is None else _asked(path, schema.names, fields=fields, where=where)
     if wanted is not None:
-        known = set(schema.names)
-        used = {longest(known, one) for one in wanted}
-        schema = pa.schema([one for one in schema if one.name in used])
+        names = set(schema.names)
+        used = {longest(names, path) for path in wanted}
+        schema = pa.schema([field for field in schema if field.name in used])
     empty = _filterable(schema.empty_table())
     columns = _named(empty)
     for field in fields or ():
@@ -703,7 +707,7 @@ def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] 
 
 def _filterable(table: pa.Table) -> pa.Table:
     """A table with plain text for text in views, as polars writes it: pyarrow cannot filter these."""
-    kinds = [one.with_type(pa.string()) if pa.types.is_string_view(one.type) else one for one in table.schema]
+    kinds = [field.with_type(pa.string()) if pa.types.is_string_view(field.type) else field for field in table.schema]
     return table.cast(pa.schema(kinds))
 
 
@@ -716,7 +720,7 @@ def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
 
 def _conditions(path: Path, table: pa.Table, where: Where) -> dict[str, pa.Scalar]:
     """What the columns of ``where`` are compared with: in their own precision, 0.1 is found among float32, too."""
-    columns, found = _named(table), dict[str, pa.Scalar]()
+    columns, conditions = _named(table), dict[str, pa.Scalar]()
     for name, value in where.items():
         kind = find(columns, name, str(path)).type
         text, floating = pa.types.is_string(kind) or pa.types.is_large_string(kind), pa.types.is_floating(kind)
@@ -726,8 +730,8 @@ def _conditions(path: Path, table: pa.Table, where: Where) -> dict[str, pa.Scala
         if not of_type:
             what = f"column '{shortened(name)}' holds {shortened(str(kind))}, never {_written(value)}"
             raise RunError(f"{path}: where: {what}")
-        found[name] = pa.scalar(value, kind) if text or floating else pa.scalar(value)
-    return found
+        conditions[name] = pa.scalar(value, kind) if text or floating else pa.scalar(value)
+    return conditions
 
 
 def _met(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.ChunkedArray:
@@ -739,10 +743,14 @@ def _met(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.
 
 def _may_hold(group: Any, conditions: Mapping[str, pa.Scalar]) -> bool:
     """Whether a part of Parquet may have rows that meet all conditions, by the least and the greatest of its values."""
-    columns = [group.column(place) for place in range(group.num_columns if conditions else 0)]
+    columns = [group.column(index) for index in range(group.num_columns if conditions else 0)]
     for name, value in conditions.items():
-        known = [column.statistics for column in columns if column.path_in_schema == name and column.is_stats_set]
-        if len(known) == 1 and known[0].has_min_max and not known[0].min <= value.as_py() <= known[0].max:
+        statistics = [column.statistics for column in columns if column.path_in_schema == name and column.is_stats_set]
+        if (
+            len(statistics) == 1
+            and statistics[0].has_min_max
+            and not statistics[0].min <= value.as_py() <= statistics[0].max
+        ):
             return False
     return True
 
@@ -753,9 +761,9 @@ def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
     for part in parts:
         columns = _named(part)
         for name, values in held.items():
-            found = {*values, *pc.unique(find(columns, name, str(path), part=True).drop_null()).to_pylist()}
-            known = sorted(found)
-            held[name] = known[:_SOME] if isinstance(where[name], str) else known[:1] + known[1:][-1:]
+            values_seen = {*values, *pc.unique(find(columns, name, str(path), part=True).drop_null()).to_pylist()}
+            ordered = sorted(values_seen)
+            held[name] = ordered[:_SOME] if isinstance(where[name], str) else ordered[:1] + ordered[1:][-1:]
     wanted = " and ".join(f"{shortened(name)} = {_written(value)}" for name, value in where.items())
     ranges = list[str]()
     for name, values in held.items():

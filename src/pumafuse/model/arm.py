@@ -230,10 +230,10 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def _check(self, name: str, axis: AxisModel) -> None:
         """Refuse numbers that no file may have: an arm may be made in Python, too."""
-        plant = [one for one in msgspec.structs.astuple(axis.plant) if isinstance(one, float | int)]
-        optional = [1.0 if one is None else one for one in (axis.gain_recovery, axis.max_speed)]
+        plant = [number for number in msgspec.structs.astuple(axis.plant) if isinstance(number, float | int)]
+        optional = [1.0 if number is None else number for number in (axis.gain_recovery, axis.max_speed)]
         positive = self.update_period, *optional, *plant
-        not_negative = self.delay, *(0.0 if one is None else one for one in (axis.delay, axis.play))
+        not_negative = self.delay, *(0.0 if number is None else number for number in (axis.delay, axis.play))
         if not math.isfinite(sum(positive) + sum(not_negative) + axis.gain.slope + axis.gain.intercept):
             raise ConfigError(f"axes.{name}: period, delay, plant, gain, fastest speed and play must be finite")
         if min(positive) <= 0.0 or min(not_negative) < 0.0:
@@ -308,8 +308,8 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def delay_of(self, axis: str) -> float:
         """Td [s] of one axis: its own, or the arm's."""
-        own = self.axis(axis).delay
-        return self.delay if own is None else own
+        delay = self.axis(axis).delay
+        return self.delay if delay is None else delay
 
     @property
     def later(self) -> dict[str, float]:
@@ -323,7 +323,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def doubts(self) -> list[str]:
         """A sentence if the gain of axes depends on the speed and does not recover."""
-        axes = [name for name, one in self.axes.items() if one.gain.slope and one.gain_recovery is None]
+        axes = [name for name, axis in self.axes.items() if axis.gain.slope and axis.gain_recovery is None]
         if not axes:
             return []
         of = f"axis {axes[0]}" if len(axes) == 1 else f"axes {', '.join(axes)}"
@@ -366,9 +366,9 @@ def _axis(table: Any, where: str, path: str) -> AxisModel:
         raise ConfigError(f"{where}: {path}.plant: unknown plant '{name}'; {suggestion(name, plants)}")
     plant = [field.encode_name for field in msgspec.structs.fields(plants[name])]
     kind: Kind = "angle" if keys.get("kind") == "angle" else "length"
-    own = [field.encode_name for field in msgspec.structs.fields(AxisModel)]
-    accepted = dict.fromkeys(["plant", *plant, *(of_kind(key, kind) for key in own)])
-    for key in keys.keys() - accepted.keys() - {of_kind(key, other) for key in own for other in KINDS}:
+    fields = [field.encode_name for field in msgspec.structs.fields(AxisModel)]
+    accepted = dict.fromkeys(["plant", *plant, *(of_kind(key, kind) for key in fields)])
+    for key in keys.keys() - accepted.keys() - {of_kind(key, other) for key in fields for other in KINDS}:
         raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, accepted)}")
     parameters = {key: keys.pop(key) for key in plant if key in keys}
     made = toml.struct(parameters, plants[name], where, path)

@@ -119,10 +119,10 @@ class DiscreteModel:
 def split_delay(delay: float, period: float) -> tuple[int, float]:
     """Td = d·T + τ′ with 0 ≤ τ′ < T; τ′ within 1e-9·T of 0 or T is taken as exactly there."""
     d = math.floor(delay / period)
-    rest = delay - d * period
-    if rest > period * (1.0 - 1e-9):
+    fraction = delay - d * period
+    if fraction > period * (1.0 - 1e-9):
         return d + 1, 0.0
-    return d, 0.0 if rest < period * 1e-9 else rest
+    return d, 0.0 if fraction < period * 1e-9 else fraction
 
 
 def discretize(

@@ -120,12 +120,12 @@ def unit_response(time: FloatArray | float, q: FloatArray | float, p: FloatArray
     forms = (over_damped & apart, _apart), (over_damped & ~apart, _together), (~over_damped, _swinging)
     needed = [(plants, form) for plants, form in forms if plants.any()]
     time, half, root, p, *masks = np.broadcast_arrays(time, half, root, p, *(plants for plants, _ in needed))
-    found, begun = np.zeros(time.shape), time > 0.0
+    unit_response, begun = np.zeros(time.shape), time > 0.0
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # where T₂ or the swing is next to nothing
         for plants, (_, form) in zip(masks, needed, strict=True):
             chosen = plants & begun
-            found[chosen] = form(time[chosen], half[chosen], root[chosen], p[chosen])
-    return found
+            unit_response[chosen] = form(time[chosen], half[chosen], root[chosen], p[chosen])
+    return unit_response
 
 
 def _apart(t: FloatArray, half: FloatArray, root: FloatArray, p: FloatArray) -> FloatArray:

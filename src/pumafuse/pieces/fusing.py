@@ -62,15 +62,15 @@ def fuse_to(
         with ExitStack() as files:
             names = results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE
             write = [files.enter_context(tables.appending(new / name)) for name in names]
-            for est, own, done in _pieces(Log(path), config, sensors, rate, part):
+            for est, span, done in _pieces(Log(path), config, sensors, rate, part):
                 write[0](results.estimates_table(est))
                 write[1](results.measurements_table(est))
                 if est.reference is not None:
-                    write[2](results.reference_table(est.reference.between(*own), est.config))
+                    write[2](results.reference_table(est.reference.between(*span), est.config))
                 digests.append(digest(est))
                 if progress is not None:
                     progress(done)
-        if not any(one.estimates for one in digests):
+        if not any(digest.estimates for digest in digests):
             raise no_estimates(rate)
         summary = merged(digests)
         results.check_fused(summary.rows, config)
@@ -103,8 +103,8 @@ def _pieces(
         est = _piece(run, config, chosen, rate, *begun, (after, until))
         span = [(instant - est.origin) / 1e9 for instant in (after, until)]
         yield est, (span[0], span[1]), 1.0 if until == NEVER else log.done / log.rows
-        given = [est.segments[0].given(axis)[0] for axis in est.axes]
-        log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in given]))
+        told_at = [est.segments[0].given(axis)[0] for axis in est.axes]
+        log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in told_at]))
         after = until
 
 
@@ -139,9 +139,9 @@ def _piece(
     rate: float | None,
     begun: Segment,
     core: Filter,
-    own: tuple[int, int],
+    span: tuple[int, int],
 ) -> Estimates:
-    """The estimates of the rows after and until the instants ``own`` [int ns], with notes."""
+    """The estimates of the rows after and until the instants ``span`` [int ns], with notes."""
     moved, steps = going_on(run)
     if moved is not run:
         raise RunError(f"{steps[0]}; {_IN_ORDER}")
@@ -149,10 +149,10 @@ def _piece(
     lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
         raise RunError(f"{label}: the clock is set back by {lag.max():.3f} s; {_IN_ORDER}")
-    segment = build(in_place, config, chosen, begun, own)
-    times = output_times(segment, config, rate, own)
-    filtered = filter_piece(segment, core, config, times, own)
-    first = own[0] == ALWAYS
+    segment = build(in_place, config, chosen, begun, span)
+    times = output_times(segment, config, rate, span)
+    filtered = filter_piece(segment, core, config, times, span)
+    first = span[0] == ALWAYS
     if not first:  # for those who ask where the commands lead: the arm rests at what was commanded before
         segment = replace(segment, start={axis: float(segment.given(axis)[1][0]) for axis in segment.axes})
     part = Part(in_place, segment, times, filtered)

@@ -60,25 +60,25 @@ class Digest(NamedTuple):
 
 def digest(est: Estimates) -> Digest:
     """What has to be kept of a piece for the summary of the run."""
-    found = dict[tuple[str, str], Innovations]()
+    innovations = dict[tuple[str, str], Innovations]()
     for axis in est.axes:
         evidence = evidence_of(est, axis)
         for name in est.measurements.sensors:
-            mine = est.measurements.of(name, axis)
-            fused = mine.where(mine.outcome == Outcome.FUSED)
+            of_pair = est.measurements.of(name, axis)
+            fused = of_pair.where(of_pair.outcome == Outcome.FUSED)
             if len(fused.time):
                 mean = float(np.mean(fused.innovation / fused.innovation_sd))
-                found[axis, name] = Innovations(mean, evidence)
+                innovations[axis, name] = Innovations(mean, evidence)
     none = est.measurements.where(np.zeros(len(est.measurements.time), dtype=np.bool_))
     small = replace(est, time=est.time[:: max(len(est.time) - 1, 1)].copy(), axes={}, cartesian=None, measurements=none)
     small = replace(small, reference=None, segment=np.zeros(2, dtype=np.int64), segments=())
     axes = {axis: axis_summary(est, axis) for axis in est.axes}
-    return Digest(small, len(est.time), axes, found, est.reference is not None, orientation_score(est))
+    return Digest(small, len(est.time), axes, innovations, est.reference is not None, orientation_score(est))
 
 
 def merged(digests: Sequence[Digest]) -> Summary:
     """The summary of a run from what is left of its pieces, in their order."""
-    parts = [one.est for one in digests]
+    parts = [digest.est for digest in digests]
     first, config = parts[0], parts[0].config
     axes = {axis: _axis(digests, axis) for axis in digests[0].axes}
     speed: dict[Kind, float] = {kind: max(part.speed[kind] for part in parts) for kind in first.speed}
@@ -98,25 +98,27 @@ def merged(digests: Sequence[Digest]) -> Summary:
         speed=speed,
         notes=tuple(notes),
     )
-    oriented = [one.orientation for one in digests if one.orientation is not None]
-    turned = pooled(oriented, [one.rows for one in oriented])
-    return msgspec.structs.replace(summary_of(whole, axes, turned), estimates=sum(one.estimates for one in digests))
+    oriented = [digest.orientation for digest in digests if digest.orientation is not None]
+    turned = pooled(oriented, [score.rows for score in oriented])
+    return msgspec.structs.replace(
+        summary_of(whole, axes, turned), estimates=sum(digest.estimates for digest in digests)
+    )
 
 
 def _notes(parts: Sequence[Estimates]) -> list[str]:
     """The notes of all pieces: those that differ in their numbers alone once, and in how many pieces they are."""
-    found: dict[str, list[str]] = {}
+    by_note: dict[str, list[str]] = {}
     for part in parts:
         for note in part.notes:
-            found.setdefault(_NUMBER.sub("0", note).replace("row has", "rows have"), []).append(note)
+            by_note.setdefault(_NUMBER.sub("0", note).replace("row has", "rows have"), []).append(note)
     return [
         notes[0] if len(parts) == 1 else f"{notes[0]} [in {len(notes)} of {len(parts)} pieces; numbers of the first]"
-        for notes in found.values()
+        for notes in by_note.values()
     ]
 
 
 def _axis(digests: Sequence[Digest], axis: str) -> AxisSummary:
-    parts = [one.axes[axis] for one in digests]
+    parts = [digest.axes[axis] for digest in digests]
     names = dict.fromkeys(name for part in parts for name in part.sensors)
     sensors = {name: _sensor(digests, axis, name) for name in names}
     fused = sum(_fused(sensor) for sensor in sensors.values())
@@ -124,25 +126,25 @@ def _axis(digests: Sequence[Digest], axis: str) -> AxisSummary:
     return AxisSummary(
         sensors=sensors,
         log_likelihood=sum(part.log_likelihood for part in parts),
-        score=pooled(scores, [one.rows for one in scores]),
+        score=pooled(scores, [score.rows for score in scores]),
         nees_band=chi_square_band(fused) if fused else None,
         kind=parts[0].kind,
     )
 
 
 def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
-    having = [one for one in digests if name in one.axes[axis].sensors]
-    parts = [one.axes[axis].sensors[name] for one in having]
+    having = [digest for digest in digests if name in digest.axes[axis].sensors]
+    parts = [digest_here.axes[axis].sensors[name] for digest_here in having]
     skills = [part.skill for part in parts if part.skill]
-    outcomes, skill = added(part.outcomes for part in parts), pooled(skills, [one.predictions for one in skills])
+    outcomes, skill = added(part.outcomes for part in parts), pooled(skills, [skill.predictions for skill in skills])
     fused = [_fused(part) for part in parts]
     if not sum(fused):
         return SensorSummary(outcomes=outcomes, skill=skill)
-    innovations = [one.innovations.get((axis, name), Innovations(0.0, {})) for one in having]
-    found = _consistency(parts, innovations, digests[0].est.config, name, axis)
+    innovations = [digest.innovations.get((axis, name), Innovations(0.0, {})) for digest in having]
+    consistency = _consistency(parts, innovations, digests[0].est.config, name, axis)
     rms, sd = (pooled_number(key, [getattr(part, key) for part in parts], fused) or 0.0 for key in _SIZES)
     bias = digests[-1].est.biases.get(name, {}).get(axis)
-    return sensor_summary(axis, outcomes, found, rms, sd, bias, skill)
+    return sensor_summary(axis, outcomes, consistency, rms, sd, bias, skill)
 
 
 def _consistency(
@@ -155,16 +157,18 @@ def _consistency(
     fused = [_fused(part) for part in parts]
     count, lags = sum(fused), max(len(part.correlation) for part in parts)
     nis = weighted_mean([part.nis_mean for part in parts], fused) or 0.0
-    mean, power = weighted_mean([one.mean for one in innovations], fused) or 0.0, 0.0
+    mean, power = weighted_mean([innovation.mean for innovation in innovations], fused) or 0.0, 0.0
     products = np.zeros(lags)
-    for part, one, n in zip(parts, innovations, fused, strict=True):
-        within, between = n * ((part.nis_mean or 0.0) - one.mean**2), n * (one.mean - mean) ** 2
+    for part, innovation, n in zip(parts, innovations, fused, strict=True):
+        within, between = n * ((part.nis_mean or 0.0) - innovation.mean**2), n * (innovation.mean - mean) ** 2
         products += between
         products[: len(part.correlation)] += within * np.array(part.correlation)
         power += within + between
     correlation = products / power if power > 0.0 else products
     white = whiteness_of(correlation, count) if lags else 1.0
-    decided = sum(part.outcomes.get(one.word, 0) for part in parts for one in Outcome if one <= Outcome.REACQUIRED)
+    decided = sum(
+        part.outcomes.get(outcome.word, 0) for part in parts for outcome in Outcome if outcome <= Outcome.REACQUIRED
+    )
     return Consistency(
         count,
         nis,
@@ -175,7 +179,7 @@ def _consistency(
         sensor=name,
         kind=config.arm.axes[axis].kind,
         at_bound=config.sensors[name].is_at_bound(axis),
-        evidence=lambda: together(one.evidence for one in innovations),
+        evidence=lambda: together(innovation.evidence for innovation in innovations),
     )
 
 

@@ -51,20 +51,22 @@ class Log:
                 rows: _Rows(self._folder / entry.file, entry, fields[rows], command if command.rows == rows else None)
                 for rows, entry in entries.items()
             }
-        self.rows = sum(tables.row_count(one.path) for one in self._tables.values())
+        self.rows = sum(tables.row_count(table.path) for table in self._tables.values())
 
     @property
     def ended(self) -> bool:
         """Whether everything is read."""
-        return all(one.ended for one in self._tables.values())
+        return all(table.ended for table in self._tables.values())
 
     def read_on(self, rows: int) -> int:
         """Read about as many more ``rows``, from whichever table is behind the others."""
         until = self.done + rows
         while not self.ended and self.done < until:
-            behind = min((one for one in self._tables.values() if not one.ended), key=lambda one: one.frontier)
+            behind = min(
+                (table for table in self._tables.values() if not table.ended), key=lambda table: table.frontier
+            )
             self.done += behind.read_on(self._cut)
-        frontier = min(one.frontier for one in self._tables.values())
+        frontier = min(table.frontier for table in self._tables.values())
         self._cut = NEVER if frontier == NEVER else max(self._cut, frontier - WAIT_NS)
         return self._cut
 
@@ -81,8 +83,8 @@ class Log:
 
     def drop(self, before: int, but: TimeArray) -> None:
         """Let go of rows stamped ``before`` an instant [int ns], ``but`` some stamps, and of those without a stamp."""
-        for one in self._tables.values():
-            one.drop(before, but)
+        for table in self._tables.values():
+            table.drop(before, but)
 
 
 def rows_of(path: Path) -> int:
@@ -118,9 +120,9 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
         return "a cylindrical [frame]" if isinstance(config.frame, Cylindrical) else None
     listed = manifest.load(manifest.file_of(path))
     entries = listed.entries.values()
-    oriented = [one for one in entries if one.orientation or one.joints]
+    oriented = [entry for entry in entries if entry.orientation or entry.joints]
     told = {name for name, entry in listed.sensors.items() if entry in oriented}
-    untold = any(one.marker is not None and name not in told for name, one in config.sensors.items())
+    untold = any(sensor.marker is not None and name not in told for name, sensor in config.sensors.items())
     framed = isinstance(listed.frame or config.frame, Cylindrical)
     needs = {
         "clock = 'regular'": any(entry.clock == "regular" for entry in entries),
@@ -133,7 +135,7 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
         "a marker of a sensor that tells no orientation": oriented and untold,
         "a cylindrical [frame]": framed and any(not set(CARTESIAN).isdisjoint(entry.axes) for entry in entries),
     }
-    return next((what for what, there in needs.items() if there), None)
+    return next((what for what, need in needs.items() if need), None)
 
 
 class _Rows:
@@ -219,12 +221,12 @@ class _Rows:
 
     def _is_command(self, among: BoolArray) -> BoolArray:
         """Which of some rows give a command, (rows,)."""
-        found = np.zeros(len(among), dtype=np.bool_)
+        is_command = np.zeros(len(among), dtype=np.bool_)
         if among.any():
             some = self._table(self._at_hand().filter(_bits(among)))
             for column in self._commands:
-                found[among] |= np.isfinite(some.numbers(column.column, column.ending)[0])
-        return found
+                is_command[among] |= np.isfinite(some.numbers(column.column, column.ending)[0])
+        return is_command
 
     def _at_hand(self) -> pa.Table:
         return pa.concat_tables(self._held) if self._held else pa.table(dict(self._first.columns)).slice(0, 0)

@@ -31,13 +31,13 @@ _SUREST = 1e-5  # s, of half the interval of a lag: no stamps are finer
 _NO_EVIDENCE = 3.0  # times what the arm may be off: commands and sensors share it, and do not bear each other out
 
 
-def arm_of(runs: Sequence[Run], found: Mapping[str, Registration]) -> FusionConfig:
+def arm_of(runs: Sequence[Run], registrations: Mapping[str, Registration]) -> FusionConfig:
     """The arm as the earliest sensor saw it answer."""
-    positions = [one.position for one in found.values() if one.position is not None]
-    response, tool = min(positions, key=lambda one: one.lag.value), reference_orientation(runs[0])
+    positions = [registration.position for registration in registrations.values() if registration.position is not None]
+    response, tool = min(positions, key=lambda position: position.lag.value), reference_orientation(runs[0])
     axes = {axis: AxisModel(plant=_plant(response)) for axis in CARTESIAN}
     if tool is not None:
-        axes |= {axis: _turning(found.values(), response) for axis in TURNING}
+        axes |= {axis: _turning(registrations.values(), response) for axis in TURNING}
     period = period_of(runs[0].command)
     arm = ArmModel(
         name="registered",
@@ -45,91 +45,101 @@ def arm_of(runs: Sequence[Run], found: Mapping[str, Registration]) -> FusionConf
         delay=max(round(response.delay.value, DIGITS), 0.0),
         axes=axes,
     )
-    sensors = {name: Sensor(sd=max(one.rms or 0.0, SD_BOUNDS[0])) for name, one in found.items()}
+    sensors = {
+        name: Sensor(sd=max(registration.rms or 0.0, SD_BOUNDS[0])) for name, registration in registrations.items()
+    }
     turned = None if tool is None else Tool(reference=tool)
     return FusionConfig(arm=arm, sensors=sensors, tool=turned, robot=runs[0].robot)
 
 
 def configuration(
-    runs: Sequence[Run], found: Mapping[str, Registration], latencies: Mapping[str, Quantity], begun: FusionConfig
+    runs: Sequence[Run],
+    registrations: Mapping[str, Registration],
+    latencies: Mapping[str, Quantity],
+    begun: FusionConfig,
 ) -> FusionConfig:
     """A configuration to begin with: the arm that was found, and noise as it looks along the base's axes."""
-    config = as_late(placed_by(begun, found, latencies), found)
+    config = as_late(placed_by(begun, registrations, latencies), registrations)
     placed = [in_base(run, config)[0] for run in runs]
     guessed = first_guess([guess(Survey(Path(run.name), run, relations(run))) for run in placed])
     sensors = {
         name: msgspec.structs.replace(
             guessed.sensors[name],
-            latency=one.latency,
-            frame=one.frame,
-            marker=one.marker,
+            latency=sensor.latency,
+            frame=sensor.frame,
+            marker=sensor.marker,
             scale=1.0,
-            bias_sd=one.bias_sd,
+            bias_sd=sensor.bias_sd,
         )
-        for name, one in config.sensors.items()
+        for name, sensor in config.sensors.items()
         if name in guessed.sensors
     }
     sensors = {**guessed.sensors, **sensors}
-    constants = _constants(guessed.arm, found)
+    constants = _constants(guessed.arm, registrations)
     offsets = {
         axis: max(guessed.start.offset_sd_of(axis), _NO_EVIDENCE * constants.get(axis, 0.0))
         for axis in guessed.arm.axes
     }
-    known = {axis: one for axis, one in config.arm.axes.items() if axis in guessed.arm.axes}
-    arm = msgspec.structs.replace(guessed.arm, delay=config.arm.delay, axes={**guessed.arm.axes, **known})
+    models = {axis: model for axis, model in config.arm.axes.items() if axis in guessed.arm.axes}
+    arm = msgspec.structs.replace(guessed.arm, delay=config.arm.delay, axes={**guessed.arm.axes, **models})
     return msgspec.structs.replace(
         guessed, arm=arm, sensors=sensors, start=Start(offset_sd=offsets), tool=config.tool, robot=config.robot
     )
 
 
 def placed_by(
-    config: FusionConfig, found: Mapping[str, Registration], latencies: Mapping[str, Quantity]
+    config: FusionConfig, registrations: Mapping[str, Registration], latencies: Mapping[str, Quantity]
 ) -> FusionConfig:
     """The configuration with frame, marker, latency and bias of sensors."""
-    constants, count = _constants(config.arm, found), sum(one.frame is not None for one in found.values())
+    constants, count = (
+        _constants(config.arm, registrations),
+        sum(registration.frame is not None for registration in registrations.values()),
+    )
     sensors = {
         name: msgspec.structs.replace(
             config.sensors[name],
-            frame=_placement(one.frame),
-            marker=_placement(one.marker),
+            frame=_placement(registration.frame),
+            marker=_placement(registration.marker),
             latency=round(latencies[name].value, DIGITS) if name in latencies else config.sensors[name].latency,
-            bias_sd=_biases(config.sensors[name], constants, count) if one.frame else config.sensors[name].bias_sd,
+            bias_sd=_biases(config.sensors[name], constants, count)
+            if registration.frame
+            else config.sensors[name].bias_sd,
         )
-        for name, one in found.items()
+        for name, registration in registrations.items()
     }
     return msgspec.structs.replace(config, sensors={**config.sensors, **sensors})
 
 
-def _placement(found: Registered | None) -> Placement | None:
+def _placement(placed: Registered | None) -> Placement | None:
     """A place as a configuration has it; None for one that is where the robot's is."""
-    if found is None:
+    if placed is None:
         return None
-    at, rotation = (_rounded(one) for one in (found.at, found.rotation))
+    at, rotation = (_rounded(vector) for vector in (placed.at, placed.rotation))
     return Placement(at=at, rotation=rotation) if any(at) or any(rotation) else None
 
 
 def _rounded(vector: Vector) -> Vector:
-    x, y, z = (round(one, DIGITS) for one in vector)
+    x, y, z = (round(number, DIGITS) for number in vector)
     return x, y, z
 
 
-def _constants(arm: ArmModel, found: Mapping[str, Registration]) -> dict[str, float]:
+def _constants(arm: ArmModel, registrations: Mapping[str, Registration]) -> dict[str, float]:
     """How far off the arm itself may be by a constant [m or rad], of each axis.
 
     A registration follows the commanded poses, and so has a constant error of the arm's kinematics in it, which no
     motion shows. It is taken to be as large as what changes with the pose, which is what registrations leave.
     """
-    placed = [one for one in found.values() if one.frame is not None]
+    placed = [registration for registration in registrations.values() if registration.frame is not None]
     left: dict[Kind, float] = {
-        "length": max((_beyond_noise(one) for one in placed), default=0.0),
-        "angle": max((one.rms_rotation or 0.0 for one in placed), default=0.0),
+        "length": max((_beyond_noise(registration) for registration in placed), default=0.0),
+        "angle": max((registration.rms_rotation or 0.0 for registration in placed), default=0.0),
     }
     return {axis: left[arm.axes[axis].kind] for axis in (*CARTESIAN, *TURNING) if axis in arm.axes}
 
 
-def _beyond_noise(one: Registration) -> float:
+def _beyond_noise(registration: Registration) -> float:
     """What a registration leaves of positions beyond the white noise of their three coordinates [m]."""
-    return float(np.sqrt(max((one.rms or 0.0) ** 2 - 3.0 * one.noise**2, 0.0)))
+    return float(np.sqrt(max((registration.rms or 0.0) ** 2 - 3.0 * registration.noise**2, 0.0)))
 
 
 def _biases(sensor: Sensor, constants: Mapping[str, float], count: int) -> dict[str, float]:
@@ -137,15 +147,17 @@ def _biases(sensor: Sensor, constants: Mapping[str, float], count: int) -> dict[
 
     They share what the arm is off, while the filter takes their biases to be independent: so each has √n times as much.
     """
-    return {axis: sensor.bias_sd_of(axis) or float(f"{one * count**0.5:.2g}") for axis, one in constants.items()}
+    return {
+        axis: sensor.bias_sd_of(axis) or float(f"{constant * count**0.5:.2g}") for axis, constant in constants.items()
+    }
 
 
-def as_late(config: FusionConfig, found: Mapping[str, Registration]) -> FusionConfig:
+def as_late(config: FusionConfig, registrations: Mapping[str, Registration]) -> FusionConfig:
     """The configuration whose arm is as late as sensors of known latencies saw it: by its delays.
 
     Each counts as its lag is sure.
     """
-    lags = {name: one.position.lag for name, one in found.items() if one.position}
+    lags = {name: registration.position.lag for name, registration in registrations.items() if registration.position}
     of_arm = [lag.value - config.sensors[name].latency for name, lag in lags.items()]
     weight = [max(lag.half, _SUREST) ** -2 for lag in lags.values()]
     later = float(np.average(of_arm, weights=weight)) - lag_in_space(config.arm)
@@ -169,12 +181,12 @@ def lag_in_space(arm: ArmModel) -> float:
     return float(np.mean([arm.lag_of(axis) for axis in CARTESIAN]))
 
 
-def _turning(found: Iterable[Registration], earliest: Response) -> AxisModel:
+def _turning(registrations: Iterable[Registration], earliest: Response) -> AxisModel:
     """How the tool turns: as a sensor saw that tells orientations, less what it is later; else as it moves."""
-    for one in found:
-        if one.rotation is not None and one.position is not None:
-            delay = one.rotation.delay.value - (one.position.lag.value - earliest.lag.value)
-            return AxisModel(kind="angle", plant=_plant(one.rotation), delay=max(round(delay, DIGITS), 0.0))
+    for registration in registrations:
+        if registration.rotation is not None and registration.position is not None:
+            delay = registration.rotation.delay.value - (registration.position.lag.value - earliest.lag.value)
+            return AxisModel(kind="angle", plant=_plant(registration.rotation), delay=max(round(delay, DIGITS), 0.0))
     return AxisModel(kind="angle", plant=_plant(earliest))
 
 

@@ -63,7 +63,7 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
 
     def sentence(self, sensor: str) -> str:
         """What to know of a sensor, and what to do."""
-        size, axis = self.size or 0.0, ", ".join(f"{one:.3f}" for one in self.axis or ())
+        size, axis = self.size or 0.0, ", ".join(f"{number:.3f}" for number in self.axis or ())
         match self.finding:
             case Finding.SHORT:
                 what = (

@@ -48,58 +48,68 @@ def joint_lags(
     """
     later, steps = dict.fromkeys(joints, 0.0), list[_Step]()
     for _ in range(_ROUNDS + 1):
-        found = register(told(later))
-        if found.frame is None:
+        registration = register(told(later))
+        if registration.frame is None:
             return {}
-        steps.append(_step(told, later, sensor, found))
+        steps.append(_step(told, later, sensor, registration))
         by = zip(later.items(), steps[-1].later.tolist(), strict=True)
         later = {name: before + more for (name, before), more in by}
     period = float(np.median(np.diff(told(later)[0].time)))
     half, late = np.hypot(steps[-1].half, _HELD * period), np.array(list(later.values()))
-    known = half < _KNOWN
-    if not known.any() or np.mean(np.log(steps[-1].noise / steps[0].noise)) > np.log(_PAYS):
+    is_known = half < _KNOWN
+    if not is_known.any() or np.mean(np.log(steps[-1].noise / steps[0].noise)) > np.log(_PAYS):
         return {}
-    late = np.where(known, late, late[known].mean())
-    late, half = late - late.min(), np.where(known, half, np.inf)
+    late = np.where(is_known, late, late[is_known].mean())
+    late, half = late - late.min(), np.where(is_known, half, np.inf)
     return dict(zip(joints, map(Quantity.around, late.tolist(), half.tolist()), strict=True))
 
 
-def _step(told: Told, later: Later, sensor: Sequence[Motion], found: Registration) -> _Step:
+def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Registration) -> _Step:
     """How much later each joint is beside a registration."""
     sensor = _seen(told(later), sensor)
-    attitude, mean = found.rms_rotation is not None, np.concatenate([one.position for one in sensor]).mean(axis=0)
-    state = _state(found, mean)
+    attitude, mean = (
+        registration.rms_rotation is not None,
+        np.concatenate([motion.position for motion in sensor]).mean(axis=0),
+    )
+    state = _state(registration, mean)
 
     def beside(commands: Later) -> Rows:
-        return rows_of([one.valid() for one in told(commands)], sensor, mean, attitude=attitude)
+        return rows_of([motion.valid() for motion in told(commands)], sensor, mean, attitude=attitude)
 
     rows = beside(later)
     off = residual(rows, state)
     moved = [residual(beside({**later, name: by + _STEP}), state).blocks for name, by in later.items()]
     by_joint = [
-        (np.stack(there, axis=-1) - here[:, :, None]) / _STEP for *there, here in zip(*moved, off.blocks, strict=True)
+        (np.stack(moved_there, axis=-1) - here[:, :, None]) / _STEP
+        for *moved_there, here in zip(*moved, off.blocks, strict=True)
     ]
     slope = [
-        np.concatenate([one[:, :, _BESIDE], by], axis=2)
-        for one, by in zip(slopes(rows, state, off.poses), by_joint, strict=True)
+        np.concatenate([slope[:, :, _BESIDE], by], axis=2)
+        for slope, by in zip(slopes(rows, state, off.poses), by_joint, strict=True)
     ]
     before = tell(slope, off.blocks, off.noise(), expected=False)
     step = before.step()
-    left = [one + by @ step for one, by in zip(off.blocks, slope, strict=True)]
+    left = [block + by @ step for block, by in zip(off.blocks, slope, strict=True)]
     after = tell(slope, left, off.noise(), expected=True)
-    own = slice(-len(later), None)
-    return _Step(step[own], after.half_widths(np.eye(len(step))[own]), off.noise())
+    of_joints = slice(-len(later), None)
+    return _Step(step[of_joints], after.half_widths(np.eye(len(step))[of_joints]), off.noise())
 
 
 def _seen(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:
     """What the sensor told once it is forgotten how the arm moved before the first command."""
     both = zip(command, sensor, strict=True)
-    return thinned([within(mine.valid(), one.valid().time, _SETTLED) for one, mine in both], _ROWS)
+    return thinned(
+        [within(motion.valid(), command_motion.valid().time, _SETTLED) for command_motion, motion in both], _ROWS
+    )
 
 
-def _state(found: Registration, mean: FloatArray) -> State:
+def _state(registration: Registration, mean: FloatArray) -> State:
     """What was registered, with the plant of positions for orientations, too: what these lag beyond it joints do."""
-    assert found.frame is not None and found.marker is not None and found.position is not None
-    rotation, turn = (Rotation.from_rotvec(one.rotation).as_matrix() for one in (found.frame, found.marker))
-    plant = Plant(found.position.delay.value, found.position.time_constant.value)
-    return State(rotation, found.frame.at + rotation @ mean, np.array(found.marker.at), turn, 1.0, plant, plant)
+    assert registration.frame is not None and registration.marker is not None and registration.position is not None
+    rotation, turn = (
+        Rotation.from_rotvec(placement.rotation).as_matrix() for placement in (registration.frame, registration.marker)
+    )
+    plant = Plant(registration.position.delay.value, registration.position.time_constant.value)
+    return State(
+        rotation, registration.frame.at + rotation @ mean, np.array(registration.marker.at), turn, 1.0, plant, plant
+    )

@@ -31,7 +31,7 @@ _ROUNDING = 1e-12  # m
 
 
 def latencies_of(
-    runs: Sequence[Run], found: Mapping[str, Registration], config: FusionConfig, lag: float | None
+    runs: Sequence[Run], registrations: Mapping[str, Registration], config: FusionConfig, lag: float | None
 ) -> dict[str, Quantity]:
     """The latency of each sensor [s]: that of the surest lag beyond the arm's, those of others beside it.
 
@@ -39,25 +39,29 @@ def latencies_of(
     orientations, if there is one: it tells where the points are that others see.
     """
     lags = {
-        name: one.position.lag for name, one in found.items() if one.position is not None and not one.read_otherwise
+        name: registration.position.lag
+        for name, registration in registrations.items()
+        if registration.position is not None and not registration.read_otherwise
     }
     if not lags:
         return {}
-    best = min(lags, key=lambda name: (found[name].rms_rotation is None, lags[name].half))
-    beside, placed = {best: Quantity.around(0.0)}, placed_by(config, found, {})
-    for name in (one for one in lags if one != best):
+    best = min(lags, key=lambda name: (registrations[name].rms_rotation is None, lags[name].half))
+    beside, placed = {best: Quantity.around(0.0)}, placed_by(config, registrations, {})
+    for name in (lag for lag in lags if lag != best):
         both = [run for run in runs if {name, best} <= run.sensors.keys()]
-        points = [_of_point(run, best, found[best], placed, name) for run in both]
+        points = [_of_point(run, best, registrations[best], placed, name) for run in both]
         told = later(points, [_in_base(run, name, placed) for run in both], lags[name].value - lags[best].value)
         beside[name] = told or _sum(lags[name], -lags[best].value)
     if lag is None:
-        first, known = min(beside, key=lambda name: beside[name].value), Quantity.around(0.0)
+        first, latencies = min(beside, key=lambda name: beside[name].value), Quantity.around(0.0)
     else:
         first = min(lags, key=lambda name: lags[name].half)
-        known = _sum(lags[first], -lag)
+        latencies = _sum(lags[first], -lag)
     return {
-        name: known if name == first else _sum(one, known.value - beside[first].value, beside[first], known)
-        for name, one in beside.items()
+        name: latencies
+        if name == first
+        else _sum(latency, latencies.value - beside[first].value, beside[first], latencies)
+        for name, latency in beside.items()
     }
 
 
@@ -67,31 +71,31 @@ def _in_base(run: Run, name: str, config: FusionConfig) -> Motion:
     return seen._replace(position=Placing(config.sensors[name], config.arm).seen(seen.position))
 
 
-def _of_point(run: Run, name: str, found: Registration, config: FusionConfig, point: str) -> Motion:
+def _of_point(run: Run, name: str, registration: Registration, config: FusionConfig, point: str) -> Motion:
     """What a placed sensor tells of the point that another one sees, and how the tool is turned, if that is told."""
     seen, placing = _in_base(run, name, config), Placing(config.sensors[name], config.arm)
-    if seen.quaternion is not None and found.rms_rotation is not None:
+    if seen.quaternion is not None and registration.rms_rotation is not None:
         turned = placing.oriented(seen.quaternion)
     else:
-        turned = _commanded(run, seen.time, found)
+        turned = _commanded(run, seen.time, registration)
     if turned is None:
         return seen._replace(quaternion=None)
     lever = Placing(config.sensors[point], config.arm).lever(turned) - placing.lever(turned)
     return Motion(seen.time, seen.position + lever, turned)
 
 
-def _commanded(run: Run, time: FloatArray, found: Registration) -> FloatArray | None:
+def _commanded(run: Run, time: FloatArray, registration: Registration) -> FloatArray | None:
     """How the commands have turned the tool when a sensor measures, as quaternions; None where they do not tell."""
-    command, response = motion_of(run.command).valid(), found.rotation or found.position
+    command, response = motion_of(run.command).valid(), registration.rotation or registration.position
     if command.quaternion is None or response is None:
         return None
     plant = Plant(response.delay.value, response.time_constant.value)
     return Answer([command], [time]).quaternions(plant)
 
 
-def _sum(one: Quantity, by: float, *unsure: Quantity) -> Quantity:
+def _sum(quantity: Quantity, by: float, *unsure: Quantity) -> Quantity:
     """A number moved by another one, which is as unsure as some others are together."""
-    return Quantity.around(one.value + by, sum(each.half for each in (one, *unsure)))
+    return Quantity.around(quantity.value + by, sum(each.half for each in (quantity, *unsure)))
 
 
 def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) -> Quantity | None:
@@ -132,7 +136,7 @@ class _Path:
         return (time >= first + 2.0 * _SPEED) & (time <= last - 2.0 * _SPEED)
 
     def _at(self, time: FloatArray) -> FloatArray:
-        columns: list[FloatArray] = [np.interp(time, self._time, one) for one in self._told.T]
+        columns: list[FloatArray] = [np.interp(time, self._time, column) for column in self._told.T]
         return np.column_stack(columns)
 
     def beside(self, other: Motion, late: float) -> tuple[FloatArray, FloatArray]:
@@ -141,9 +145,9 @@ class _Path:
         Before it are those of what is affine, and of the marker.
         """
         time = other.time - late
-        there, ahead, behind = self._at(time), self._at(time + _SPEED), self._at(time - _SPEED)
-        place, turned = there[:, :3], there[:, 3:].reshape(len(there), 3, -1)
-        affine = np.column_stack([place - place.mean(axis=0), np.ones(len(place))])
-        affine = np.einsum("ij,nk->nijk", np.eye(3), affine).reshape(len(place), 3, -1)
+        pose, ahead, behind = self._at(time), self._at(time + _SPEED), self._at(time - _SPEED)
+        position, turned = pose[:, :3], pose[:, 3:].reshape(len(pose), 3, -1)
+        affine = np.column_stack([position - position.mean(axis=0), np.ones(len(position))])
+        affine = np.einsum("ij,nk->nijk", np.eye(3), affine).reshape(len(position), 3, -1)
         speed = (behind - ahead)[:, :3, None] / (2.0 * _SPEED)
-        return other.position - place, np.concatenate([affine, turned, speed], axis=-1)
+        return other.position - position, np.concatenate([affine, turned, speed], axis=-1)

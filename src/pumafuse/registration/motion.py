@@ -89,15 +89,17 @@ class Answer:
     """Where the tool is by the commands of several runs whenever a sensor measures: all rows after one another."""
 
     def __init__(self, command: Sequence[Motion], time: Sequence[FloatArray]) -> None:
-        self.turns = all(one.quaternion is not None for one in command)  # whether the orientation is commanded
+        self.turns = all(motion.quaternion is not None for motion in command)  # whether the orientation is commanded
         self._time = time
-        self._start = [float(one.time[0]) for one in command]
-        self._given: list[TimeArray] = [np.round((one.time - one.time[0]) * _NS).astype(np.int64) for one in command]
-        self._position = [one.position for one in command]
-        rotations = [Rotation.from_quat(one.quaternion) for one in command if one.quaternion is not None]
+        self._start = [float(motion.time[0]) for motion in command]
+        self._given: list[TimeArray] = [
+            np.round((motion.time - motion.time[0]) * _NS).astype(np.int64) for motion in command
+        ]
+        self._position = [motion.position for motion in command]
+        rotations = [Rotation.from_quat(motion.quaternion) for motion in command if motion.quaternion is not None]
         if self.turns:
             self._reference = Rotation.concatenate(rotations).mean()
-            self._angle = [(one * self._reference.inv()).as_rotvec() for one in rotations]
+            self._angle = [(rotation * self._reference.inv()).as_rotvec() for rotation in rotations]
 
     def poses(self, position: Plant, rotation: Plant) -> Poses:
         """The poses under the plants of both."""
@@ -117,20 +119,20 @@ class Answer:
         """How position and orientation [rad along the base's axes] change with dead time [s] and log τ, (n, 3) each."""
         moved, turned = list[FloatArray](), list[FloatArray]()
         for delay, share in ((_STEP, 0.0), (0.0, _STEP)):
-            there = self.poses(position.changed(delay, share), rotation.changed(delay, share))
-            moved.append((there.position - here.position) / _STEP)
-            turn = there.rotation @ here.rotation.swapaxes(1, 2)
+            poses = self.poses(position.changed(delay, share), rotation.changed(delay, share))
+            moved.append((poses.position - here.position) / _STEP)
+            turn = poses.rotation @ here.rotation.swapaxes(1, 2)
             turned.append(0.5 / _STEP * np.stack([turn[:, i - 1, i - 2] - turn[:, i - 2, i - 1] for i in range(3)], -1))
         return moved, turned
 
     def _through(self, levels: Sequence[FloatArray], plant: Plant) -> FloatArray:
         """Three axes of all runs through a plant, (n, 3)."""
-        axis, found = AxisModel(plant=FirstOrder(time_constant=plant.time_constant)), list[FloatArray]()
-        for start, given, level, time in zip(self._start, self._given, levels, self._time, strict=True):
+        axis, responses = AxisModel(plant=FirstOrder(time_constant=plant.time_constant)), list[FloatArray]()
+        for start, told_at, level, time in zip(self._start, self._given, levels, self._time, strict=True):
             at = np.round((time - plant.delay - start) * _NS).astype(np.int64)
             answers = [
-                first + response(axis, _PERIOD, 0.0, given, column, first, at)
+                first + response(axis, _PERIOD, 0.0, told_at, column, first, at)
                 for first, column in zip(level[0].tolist(), level.T, strict=True)
             ]
-            found.append(np.stack(answers, axis=-1))
-        return np.concatenate(found)
+            responses.append(np.stack(answers, axis=-1))
+        return np.concatenate(responses)

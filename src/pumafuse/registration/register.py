@@ -115,12 +115,12 @@ class Registration(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def read_otherwise(self) -> bool:
         """Whether rows had to be read otherwise than run.toml says, which is to be mended first."""
-        return any(found.finding in AS_READ for found in self.findings)
+        return any(finding.finding in AS_READ for finding in self.findings)
 
     @property
     def along_base(self) -> bool:
         """Whether the sensor measures along the base's axes, as far as the motion tells."""
-        return any(found.finding is Finding.ALONG_BASE for found in self.findings)
+        return any(finding.finding is Finding.ALONG_BASE for finding in self.findings)
 
 
 def registered(
@@ -155,22 +155,22 @@ def registered(
     return _fitted(begun, fix_marker, loosely)
 
 
-def within(sensor: Motion, given: FloatArray, settling: float = 0.0) -> Motion:
+def within(sensor: Motion, span: FloatArray, settling: float = 0.0) -> Motion:
     """What a sensor told while there were commands."""
-    if not len(given):
+    if not len(span):
         return sensor.only(np.zeros(0, np.int64))
-    return sensor.only((sensor.time >= given[0] + settling) & (sensor.time <= given[-1]))
+    return sensor.only((sensor.time >= span[0] + settling) & (sensor.time <= span[-1]))
 
 
-def without_gaps(given: FloatArray, sensor: Motion, settling: float) -> Motion:
-    """What a sensor told, but for gaps of the commands, whose instants are ``given`` [s], (n,).
+def without_gaps(span: FloatArray, sensor: Motion, settling: float) -> Motion:
+    """What a sensor told, but for gaps of the commands, whose instants are ``span`` [s], (n,).
 
     Where the tool was told to be in a gap is not known; it may move as was told for ``settling`` [s] after it.
     """
-    interval = np.diff(given)
+    interval = np.diff(span)
     usual, lost = median(interval), np.zeros(len(sensor.time), dtype=np.bool_)
     for row in np.flatnonzero(interval > _GAP * usual).tolist():
-        lost |= (sensor.time > given[row] + usual) & (sensor.time < given[row + 1] + settling)
+        lost |= (sensor.time > span[row] + usual) & (sensor.time < span[row + 1] + settling)
     return sensor.only(~lost) if np.count_nonzero(~lost) >= _FEWEST else sensor
 
 
@@ -181,7 +181,7 @@ def news(command: Motion, sensor: Motion) -> Motion:
     alone tell a lag, would be the outliers.
     """
     ends = [sensor.time - _AROUND_ROW, sensor.time + _AROUND_ROW]
-    before, after = (np.clip(np.searchsorted(command.time, one, side="right") - 1, 0, None) for one in ends)
+    before, after = (np.clip(np.searchsorted(command.time, end, side="right") - 1, 0, None) for end in ends)
     moved = np.linalg.norm(command.position[after] - command.position[before], axis=1)
     if command.quaternion is not None:
         turned = Rotation.from_quat(command.quaternion)
@@ -194,16 +194,16 @@ def news(command: Motion, sensor: Motion) -> Motion:
 
 def thinned(sensor: Sequence[Motion], rows: int) -> list[Motion]:
     """About so many rows at most."""
-    step = -(-sum(len(one.time) for one in sensor) // rows)
-    return [one.only(np.arange(0, len(one.time), step)) for one in sensor]
+    step = -(-sum(len(motion.time) for motion in sensor) // rows)
+    return [motion.only(np.arange(0, len(motion.time), step)) for motion in sensor]
 
 
 def rows_of(command: Sequence[Motion], sensor: Sequence[Motion], mean: FloatArray, *, attitude: bool) -> Rows:
     """Measurements about a point beside the arm's answer."""
-    turned = [Rotation.from_quat(one.quaternion).as_matrix() for one in sensor if one.quaternion is not None]
+    turned = [Rotation.from_quat(motion.quaternion).as_matrix() for motion in sensor if motion.quaternion is not None]
     return Rows(
-        Answer(command, [one.time for one in sensor]),
-        np.concatenate([one.position for one in sensor]) - mean,
+        Answer(command, [motion.time for motion in sensor]),
+        np.concatenate([motion.position for motion in sensor]) - mean,
         np.concatenate(turned) if attitude else None,
     )
 
@@ -225,35 +225,35 @@ def _begun(
 ) -> _Begin:
     """Unit, handedness and reading of orientations, from positions alone at first."""
     ahead = about.scale if np.isfinite(about.scale) and abs(np.log(about.scale)) > np.log(_ANOTHER) else 1.0
-    sensor = [one._replace(position=ahead * one.position) for one in sensor]
+    sensor = [motion._replace(position=ahead * motion.position) for motion in sensor]
     about = about._replace(scale=about.scale / ahead)
-    few, found = thinned(sensor, _COARSE), list[Found]()
-    mean = np.concatenate([despiked(one.position) for one in few]).mean(axis=0)
-    seen = np.concatenate([despiked(one.position) for one in few]) - mean
+    few, findings = thinned(sensor, _COARSE), list[Found]()
+    mean = np.concatenate([despiked(motion.position) for motion in few]).mean(axis=0)
+    seen = np.concatenate([despiked(motion.position) for motion in few]) - mean
     spread = float(np.std(seen))
     begin = partial(_coarse, sensor=few, mean=mean, about=about, marker=marker, fix_marker=fix_marker)
     command, proper, otherwise = _told_as(command, begin, spread)
-    found += otherwise
+    findings += otherwise
     mirrored = begin(command, sign=-1.0)
     spread, left, other = spread * proper.state.scale, proper.left(), mirrored.left()
     state = proper.state
-    none = _Begin(command, sensor, mean, False, other < _EITHER * left, state, found)
+    none = _Begin(command, sensor, mean, False, other < _EITHER * left, state, findings)
     if min(left, other) > _LEFT * spread:
         moves = about.correlation > _MOVES
         if moves:
             by_speeds = (ratio(command, sensor, about.lag, turns=False), _ROUGHLY)
             named = _unit_named(about.scale * ahead) if np.isfinite(about.scale) else _unit_named(*by_speeds)
-            found += [*named, _unexplained(command, sensor, about.lag, min(left, other) / spread)]
+            findings += [*named, _unexplained(command, sensor, about.lag, min(left, other) / spread)]
         else:
-            found.append(Found(finding=Finding.UNRELATED, size=about.correlation))
+            findings.append(Found(finding=Finding.UNRELATED, size=about.correlation))
     elif other < _MIRROR * left:
-        found.append(Found(finding=Finding.MIRRORED))
-    if any(one.prevents for one in found):
+        findings.append(Found(finding=Finding.MIRRORED))
+    if any(finding.prevents for finding in findings):
         return none
     factor, unit_found = _unit_of(proper, ahead, loosely)
-    found += unit_found
+    findings += unit_found
     factor /= ahead
-    sensor = [one._replace(position=factor * one.position) for one in sensor]
+    sensor = [motion._replace(position=factor * motion.position) for motion in sensor]
     state = state._replace(scale=1.0)
     whole = none._replace(sensor=sensor, mean=factor * mean, state=state)
     if sensor[0].quaternion is None or not Answer(command, []).turns:
@@ -276,9 +276,9 @@ def _told_as(command: list[Motion], begin: Callable[..., Fit], spread: float) ->
     fit = min((fit, *(begin(command, first=turn) for turn in _AROUND)), key=left)
     if command[0].quaternion is not None:
         readings = (Reading.INVERSE, Reading.W_FIRST, Reading.W_LAST)
-        others = {one: _read_as(command, [], "command", one)[0] for one in readings}
-        fits = {one: begin(other) for one, other in others.items()}
-        best = min(fits, key=lambda one: left(fits[one]))
+        others = {reading: _read_as(command, [], "command", reading)[0] for reading in readings}
+        fits = {read_as: begin(other) for read_as, other in others.items()}
+        best = min(fits, key=lambda fit: left(fits[fit]))
         if left(fits[best]) < min(_CLEARER * left(fit), _LEFT * spread):
             return others[best], fits[best], [Found(finding=Finding.READING, source="command", reading=best)]
     return command, fit, []
@@ -301,20 +301,20 @@ def _coarse(
     plant = _plant(about.lag)
     rows = rows_of(command, sensor, mean, attitude=False)
     poses, rows = rows.answer.poses(plant, plant), rows._replace(centred=rows.centred * [1.0, 1.0, sign])
-    known = np.array(marker.at)
-    path = poses.position + poses.rotation @ known
-    seen = np.concatenate([despiked(one.position) for one in sensor]) - mean
+    at = np.array(marker.at)
+    path = poses.position + poses.rotation @ at
+    seen = np.concatenate([despiked(motion.position) for motion in sensor]) - mean
     moves = bool(np.std(path, axis=0).max() > _BESIDE)  # else a scale is one of the marker
     scale = about.scale if moves and np.isfinite(about.scale) else 1.0
     rotation = kabsch(unit(path), unit(seen * [1.0, 1.0, sign]))[0]
     turn = Rotation.from_rotvec(marker.rotation).as_matrix()
     markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
-    begin = State(first @ rotation, path.mean(axis=0), known, turn, scale, plant, plant)
-    held, free = (_free(np.eye(3), markers, turn=False, scale=one, own=False) for one in (False, moves))
+    begin = State(first @ rotation, path.mean(axis=0), at, turn, scale, plant, plant)
+    held, free = (_free(np.eye(3), markers, turn=False, scale=is_free, own_lag=False) for is_free in (False, moves))
     nearer = fitted(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
     again = _plant(nearer.position.lag)
-    both = (fitted(rows, one, free) for one in (begin, nearer._replace(position=again, angle=again)))
-    return min(both, key=lambda one: one.left() / one.state.scale)
+    both = (fitted(rows, start, free) for start in (begin, nearer._replace(position=again, angle=again)))
+    return min(both, key=lambda fit: fit.left() / fit.state.scale)
 
 
 def _plant(lag: float) -> Plant:
@@ -333,13 +333,13 @@ def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     return directions[:, ~told], directions[:, told]
 
 
-def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, own: bool) -> FloatArray:
+def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, own_lag: bool) -> FloatArray:
     """The steps that are allowed, as columns, (17, k).
 
     The frame turns about axes (3, r), the marker moves in directions (3, m), and orientations have a plant of their
-    ``own``, or that of positions.
+    ``own_lag``, or that of positions.
     """
-    plants = np.eye(4) if own else np.tile(np.eye(2), (2, 1))
+    plants = np.eye(4) if own_lag else np.tile(np.eye(2), (2, 1))
     of = rotation, np.eye(3), marker, np.eye(3)[:, : 3 * turn], np.eye(1)[:, : int(scale)], plants
     return block_diag(*of)  # in the order of the places in a step
 
@@ -350,8 +350,8 @@ def _unit_of(fit: Fit, ahead: float, loosely: bool) -> tuple[float, list[Found]]
     wide = float(fit.half_widths(np.eye(SIZE)[SCALE])[0])
     if abs(np.log(scale)) < max(_OTHER, wide):
         return 1.0, []
-    found = _unit_named(scale) or ([] if loosely else [Found(finding=Finding.SCALE, size=scale)])
-    return (found[0].size or scale if found else 1.0), found
+    findings = _unit_named(scale) or ([] if loosely else [Found(finding=Finding.SCALE, size=scale)])
+    return (findings[0].size or scale if findings else 1.0), findings
 
 
 def _unit_named(scale: float, within: float = _UNIT) -> list[Found]:
@@ -384,9 +384,9 @@ def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: b
         return begin._replace(findings=[*begin.findings, Found(finding=kind, size=angle, unit=unit)])
     frame = aligned[best].frame
     command, sensor = _read_as(begin.command, begin.sensor, *best)
-    state, found = begin.state, list(begin.findings)
+    state, findings = begin.state, list(begin.findings)
     if best != told:
-        found.append(Found(finding=Finding.READING, source=best[0], reading=best[1]))
+        findings.append(Found(finding=Finding.READING, source=best[0], reading=best[1]))
     few = thinned(sensor, _COARSE)
     if best[0] == "command":
         state = _coarse(command, few, begin.mean, about, marker, fix_marker).state._replace(scale=1.0)
@@ -396,7 +396,7 @@ def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: b
         arm = rows.answer.poses(state.position, state.angle).rotation
         state = state._replace(turn=Rotation.from_matrix(arm.swapaxes(1, 2) @ frame @ rows.turned).mean().as_matrix())
     state = state._replace(rotation=frame)
-    return begin._replace(command=command, sensor=sensor, attitude=True, state=state, findings=found)
+    return begin._replace(command=command, sensor=sensor, attitude=True, state=state, findings=findings)
 
 
 def _read_as(
@@ -406,7 +406,8 @@ def _read_as(
 
     def otherwise(motions: list[Motion]) -> list[Motion]:
         return [
-            one if one.quaternion is None else one._replace(quaternion=read(one.quaternion, reading)) for one in motions
+            motion if motion.quaternion is None else motion._replace(quaternion=read(motion.quaternion, reading))
+            for motion in motions
         ]
 
     return (otherwise(command), sensor) if source == "command" else (command, otherwise(sensor))
@@ -430,7 +431,7 @@ def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) ->
     path, seen = unit(poses.position + poses.rotation @ state.marker), unit(rows.centred)
     turns = aligned_turns(Rotation.from_matrix(poses.rotation), Rotation.from_matrix(rows.turned))
     size = max(float(np.linalg.norm(turns[0])) / np.sqrt(len(turns[0])), _NOTABLE) * np.sqrt(len(turns[0]) / len(path))
-    told, measured = (one / size for one in turns)
+    told, measured = (turn / size for turn in turns)
     frame, left = kabsch(np.vstack([path, told]), np.vstack([seen, measured]))
     rotation = kabsch(np.vstack([_HARDLY * path, told]), np.vstack([_HARDLY * seen, measured]))[0]
     of_path, alone = kabsch(path, seen)[1], kabsch(told, measured)[1]
@@ -442,9 +443,9 @@ def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) ->
 
 def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     """The least squares over all, and what they do not tell."""
-    found = begin.findings
-    if any(one.prevents for one in found):
-        return Registration(findings=tuple(found))
+    findings = begin.findings
+    if any(finding.prevents for finding in findings):
+        return Registration(findings=tuple(findings))
     sensor = thinned(begin.sensor, _ROWS)
     rows, state = rows_of(begin.command, sensor, begin.mean, attitude=begin.attitude), begin.state
     poses = rows.answer.poses(state.position, state.angle)
@@ -452,26 +453,26 @@ def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     if fix_marker:
         blind = told = np.zeros((3, 0))
     elif blind.shape[1] == 3:
-        found.append(Found(finding=Finding.STILL, source=None if rows.answer.turns else "command"))
+        findings.append(Found(finding=Finding.STILL, source=None if rows.answer.turns else "command"))
     elif blind.shape[1] == 1:
-        found.append(Found(finding=Finding.ONE_AXIS, axis=_vector(blind[:, 0])))
+        findings.append(Found(finding=Finding.ONE_AXIS, axis=_vector(blind[:, 0])))
     loose, held = _about(poses.position + poses.rotation @ state.marker, poses.rotation, begin.attitude)
     if loose.shape[1]:
-        found.append(Found(finding=Finding.LINE, axis=_vector(loose[:, 0])))
+        findings.append(Found(finding=Finding.LINE, axis=_vector(loose[:, 0])))
     elif begin.either and not (begin.attitude and told.shape[1]):
-        found.append(Found(finding=Finding.PLANE))
+        findings.append(Found(finding=Finding.PLANE))
     moves = bool(np.std(poses.position, axis=0).max() > _BESIDE)
-    own = begin.attitude and len(told.T) > 0 and moves  # else nothing tells the lag of positions
+    own_lag = begin.attitude and len(told.T) > 0 and moves  # else nothing tells the lag of positions
     turn = begin.attitude and not fix_marker
-    fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own=own))
+    fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own_lag=own_lag))
     spread = float(np.std(rows.centred))
-    odd = any(one.finding is Finding.SCALE and not one.unit for one in found)
+    odd = any(finding.finding is Finding.SCALE and not finding.unit for finding in findings)
     most = (_LOOSELY if loosely else _ODD if odd else _UNEXPLAINED) * spread
     if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > most**2:
-        said = [one for one in found if one.finding is Finding.SCALE and one.unit]
+        said = [finding for finding in findings if finding.finding is Finding.SCALE and finding.unit]
         unexplained = _unexplained(begin.command, begin.sensor, fit.state.angle.lag, fit.left() / spread)
         return Registration(findings=(*said, unexplained))
-    return _told(fit, begin, loose, blind, own)
+    return _told(fit, begin, loose, blind, own_lag)
 
 
 def _unexplained(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, share: float) -> Found:
@@ -493,7 +494,7 @@ def _angles_named(command: Sequence[Motion], sensor: Sequence[Motion], lag: floa
 
 def _jitter(sensor: Sequence[Motion]) -> float:
     """The noise of positions from one row to the next [m], by the median of second differences, all axes together."""
-    change = np.concatenate([np.diff(one.position, 2, axis=0) for one in sensor])
+    change = np.concatenate([np.diff(motion.position, 2, axis=0) for motion in sensor])
     return float(np.sqrt(np.mean(np.median(np.abs(change), axis=0) ** 2 / (6.0 * _OF_NORMAL**2))))
 
 
@@ -513,7 +514,7 @@ def _vector(of: FloatArray) -> Vector:
     return x, y, z
 
 
-def _told(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray, own: bool) -> Registration:
+def _told(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray, own_lag: bool) -> Registration:
     """The numbers with their intervals."""
     state = fit.state
     values, slopes = _numbers(state, begin.mean)
@@ -535,7 +536,7 @@ def _told(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray, own: bo
         frame=_registered(told[:6]),
         marker=_registered(told[6:12]),
         position=position,
-        rotation=rotation if own else None,
+        rotation=rotation if own_lag else None,
         rms=noise[0],
         noise=_jitter(begin.sensor),
         rms_rotation=noise[1] if begin.attitude else None,

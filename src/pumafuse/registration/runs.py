@@ -129,16 +129,16 @@ def register(
     """
     every = [without_strays(run) for run in ([runs] if isinstance(runs, Run) else runs)]
     fixed = list(fix)
-    if unknown := next((one for one in fixed if one not in FIXED), None):
+    if unknown := next((name for name in fixed if name not in FIXED), None):
         raise UnknownNameError("--fix", "number", unknown, FIXED)
     if fixed and config is None:
         raise ConfigError(f"--fix {fixed[0]}: as configured where? Give a configuration (-c)")
     names = _sensors(every, config, sensor)
     left = [] if sensor else [name for name in _known(every, config) if name not in {*names, *along_base}]
-    aside = {name for run in every for name in own_frames(run)} & set(left) if left and config is None else set[str]()
+    framed = {name for run in every for name in own_frames(run)} & set(left) if left and config is None else set[str]()
     instead = _AS_CONFIGURED if config else _ALONG_BASE
-    notes = [_not_registered(every, name, _LEFT_OUT if name in aside else instead) for name in left]
-    every = [_without(run, aside | (_incomplete(run) & set(names))) for run in every]
+    notes = [_not_registered(every, name, _LEFT_OUT if name in framed else instead) for name in left]
+    every = [_without(run, framed | (_incomplete(run) & set(names))) for run in every]
     if config is not None and any(run.command.joints is None for run in every):
         notes += config.arm.joint_doubts()
     joints = _joints([_complete(run) for run in every], names) if config is None else config.arm.joints
@@ -149,28 +149,33 @@ def register(
             notes.append(f"run '{run.name}': {missing}: what sensors saw in a gap is not used")
     every = [replace(run, command=run.command.delayed(later)) for run in every]
     whole = [_complete(run) for run in every]
-    found = {name: _registered(whole, name, config, fixed="marker" in fixed) for name in names}
-    placed = {name: one for name, one in found.items() if one.frame is not None}
-    placed |= {name: _without_frame(one) for name, one in placed.items() if one.along_base}
+    registrations = {name: _registered(whole, name, config, fixed="marker" in fixed) for name in names}
+    placed = {name: registration for name, registration in registrations.items() if registration.frame is not None}
+    placed |= {name: _without_frame(registration) for name, registration in placed.items() if registration.along_base}
     for name in placed.keys() & along_base:
         placed[name] = msgspec.structs.replace(placed[name], frame=None, marker=None)
-    said = {name: [one.sentence(f"sensor '{name}'") for one in mine.findings] for name, mine in found.items()}
+    said = {
+        name: [finding.sentence(f"sensor '{name}'") for finding in registration.findings]
+        for name, registration in registrations.items()
+    }
     if not placed:
-        raise RunError("; ".join(note for mine in said.values() for note in mine))
+        raise RunError("; ".join(note for notes_of in said.values() for note in notes_of))
     begun = arm_of(every, placed) if config is None else with_tool(config, every[0])
     if "latency" in fixed:
         begun = as_late(begun, placed)
-        kept = [name for name, one in placed.items() if not one.read_otherwise]
+        kept = [name for name, registration in placed.items() if not registration.read_otherwise]
         latencies = {name: Quantity.around(begun.sensors[name].latency) for name in kept}
     else:
         latencies = latencies_of(whole, placed, begun, None if config is None else lag_in_space(config.arm))
-    details = {name: _details(one, latencies.get(name), said[name]) for name, one in found.items()}
+    details = {
+        name: _details(registration, latencies.get(name), said[name]) for name, registration in registrations.items()
+    }
     if config is None:
         alone = placed.keys() if sensor else None
         config = configuration([_as_registered(run, placed, alone) for run in every], placed, latencies, begun)
     else:
         config = placed_by(begun, placed, latencies)
-    for note in (*(note for mine in said.values() for note in mine), *notes):
+    for note in (*(note for notes_of in said.values() for note in notes_of), *notes):
         warnings.warn(note, PumafuseWarning, stacklevel=2)
     named = [run.name for run in every]
     summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=named, sensors=details, joints=joints)
@@ -184,21 +189,21 @@ def _complete(run: Run) -> Run:
 
 def _incomplete(run: Run) -> set[str]:
     """The sensors of a run that do not give x, y and z."""
-    return {name for name, one in run.sensors.items() if not set(CARTESIAN) <= one.values.keys()}
+    return {name for name, sensor in run.sensors.items() if not set(CARTESIAN) <= sensor.values.keys()}
 
 
 def _without(run: Run, names: Collection[str]) -> Run:
     """A run without some sensors."""
-    return replace(run, sensors={name: one for name, one in run.sensors.items() if name not in names})
+    return replace(run, sensors={name: sensor for name, sensor in run.sensors.items() if name not in names})
 
 
-def _as_registered(run: Run, found: Mapping[str, Registration], kept: Collection[str] | None) -> Run:
+def _as_registered(run: Run, registrations: Mapping[str, Registration], kept: Collection[str] | None) -> Run:
     """The run without orientations that do not follow the commanded ones, and with some sensors alone, if any are."""
     sensors = dict(run.sensors)
-    for name, one in found.items():
-        if name in sensors and one.rms_rotation is None and run.command.orientation is not None:
+    for name, registration in registrations.items():
+        if name in sensors and registration.rms_rotation is None and run.command.orientation is not None:
             sensors[name] = replace(sensors[name], orientation=None)
-    return replace(run, sensors={name: one for name, one in sensors.items() if kept is None or name in kept})
+    return replace(run, sensors={name: sensor for name, sensor in sensors.items() if kept is None or name in kept})
 
 
 def _joints(runs: Sequence[Run], names: Sequence[str]) -> dict[str, Joint]:
@@ -219,19 +224,19 @@ def _joints(runs: Sequence[Run], names: Sequence[str]) -> dict[str, Joint]:
             continue
         best, late = begun.position.lag.half, joint_lags(told, order, sensor, register)
     return {
-        name: Joint(later=round(one.value, DIGITS), later_ci95=one.ci95 if np.isfinite(one.half) else None)
-        for name, one in late.items()
+        name: Joint(later=round(lag.value, DIGITS), later_ci95=lag.ci95 if np.isfinite(lag.half) else None)
+        for name, lag in late.items()
     }
 
 
 def _apart(runs: Sequence[Run], name: str) -> tuple[Told, list[Motion]]:
     """The commands of the runs that have a sensor, with joints told later, and what the sensor told."""
-    mine = [run for run in runs if name in run.sensors]
+    runs_of_sensor = [run for run in runs if name in run.sensors]
 
     def told(later: Later) -> list[Motion]:
-        return [motion_of(run.command.delayed(later)) for run in mine]
+        return [motion_of(run.command.delayed(later)) for run in runs_of_sensor]
 
-    return told, [measured(run.sensors[name]) for run in mine]
+    return told, [measured(run.sensors[name]) for run in runs_of_sensor]
 
 
 def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | None) -> list[str]:
@@ -242,12 +247,14 @@ def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | Non
                            f" {', '.join(run.command.values) or 'orientations'}")  # fmt: skip
     if config is not None and not set(CARTESIAN) <= config.arm.axes.keys():
         raise ConfigError(f"arm '{config.arm.name}': sensors are registered along axes x, y and z, which it has not")
-    known = _known(runs, config)
-    if sensor is not None and sensor not in known:
-        raise UnknownNameError("--sensor", "sensor", sensor, known)
-    names = [name for name in ([sensor] if sensor else known) if any(name in _complete(run).sensors for run in runs)]
+    configured = _known(runs, config)
+    if sensor is not None and sensor not in configured:
+        raise UnknownNameError("--sensor", "sensor", sensor, configured)
+    names = [
+        name for name in ([sensor] if sensor else configured) if any(name in _complete(run).sensors for run in runs)
+    ]
     if not names:
-        lacking = "; ".join(_lacking(runs, name) for name in ([sensor] if sensor else known))
+        lacking = "; ".join(_lacking(runs, name) for name in ([sensor] if sensor else configured))
         raise RunError(f"no sensor gives x, y and z, by which it could be registered: {lacking or 'there is none'}")
     return names
 
@@ -260,8 +267,8 @@ def _known(runs: Sequence[Run], config: FusionConfig | None) -> list[str]:
 
 def _lacking(runs: Sequence[Run], name: str) -> str:
     """What a sensor lacks to be registered."""
-    given = {axis for run in runs if name in run.sensors for axis in run.sensors[name].values}
-    missing = [axis for axis in CARTESIAN if axis not in given]
+    axes_measured = {axis for run in runs if name in run.sensors for axis in run.sensors[name].values}
+    missing = [axis for axis in CARTESIAN if axis not in axes_measured]
     return f"sensor '{name}' gives no {' and no '.join(missing)}"
 
 
@@ -277,26 +284,30 @@ def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, 
     return registered(told({}), sensor, marker=marker, fix_marker=fixed)
 
 
-def _without_frame(one: Registration) -> Registration:
+def _without_frame(registration: Registration) -> Registration:
     """The same of a sensor that needs no frame, nor a marker where that is the tool point."""
-    seen = one.marker if one.marker and not is_here(one.marker.at, one.marker.rotation) else None
-    return msgspec.structs.replace(one, frame=None, marker=seen)
+    seen = (
+        registration.marker
+        if registration.marker and not is_here(registration.marker.at, registration.marker.rotation)
+        else None
+    )
+    return msgspec.structs.replace(registration, frame=None, marker=seen)
 
 
-def _details(one: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:
+def _details(registration: Registration, latency: Quantity | None, notes: list[str]) -> RegisteredSensor:
     """What was found of one sensor."""
-    names = [found.finding.value for found in one.findings]
-    lag = one.position and one.position.lag
+    names = [finding.finding.value for finding in registration.findings]
+    lag = registration.position and registration.position.lag
     return RegisteredSensor(
-        frame=one.frame,
-        marker=one.marker,
+        frame=registration.frame,
+        marker=registration.marker,
         lag=lag and lag.value,
         lag_ci95=lag and lag.ci95,
         latency=latency and latency.value,
         latency_ci95=latency and latency.ci95,
-        rms=one.rms,
-        angular_rms=one.rms_rotation,
-        rows=one.rows,
+        rms=registration.rms,
+        angular_rms=registration.rms_rotation,
+        rows=registration.rows,
         findings=names,
         notes=notes,
     )

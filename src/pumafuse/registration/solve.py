@@ -48,10 +48,10 @@ class State(NamedTuple):
         """After a step, (17,)."""
         plants = [
             Plant(
-                one.delay + float(np.clip(by[0], -_FASTEST, _FASTEST)),
-                float(np.clip(one.time_constant * np.exp(np.clip(by[1], -1.0, 1.0)), _SHORTEST, _LONGEST)),
+                part.delay + float(np.clip(by[0], -_FASTEST, _FASTEST)),
+                float(np.clip(part.time_constant * np.exp(np.clip(by[1], -1.0, 1.0)), _SHORTEST, _LONGEST)),
             )
-            for one, by in ((self.position, step[POSITION]), (self.angle, step[ANGLE]))
+            for part, by in ((self.position, step[POSITION]), (self.angle, step[ANGLE]))
         ]
         return State(
             Rotation.from_rotvec(step[ROTATION]).as_matrix() @ self.rotation,
@@ -79,18 +79,18 @@ class Off(NamedTuple):
 
     def noise(self) -> FloatArray:
         """The standard deviation of each block, by the median."""
-        return np.array([max(median(_length(one)) / MEDIAN, _LEAST) for one in self.blocks])
+        return np.array([max(median(_length(block)) / MEDIAN, _LEAST) for block in self.blocks])
 
     def rms(self) -> list[float]:
         """Of each block, over rows that are within ten medians."""
-        lengths = [_length(one) for one in self.blocks]
-        kept = [one[one <= 10.0 * median(one) + _LEAST] for one in lengths]
-        return [float(np.sqrt(np.mean(one**2))) for one in kept]
+        lengths = [_length(block) for block in self.blocks]
+        kept = [length[length <= 10.0 * median(length) + _LEAST] for length in lengths]
+        return [float(np.sqrt(np.mean(length**2))) for length in kept]
 
     def cost(self, noise: FloatArray) -> float:
         """Cauchy's sum."""
         pairs = zip(self.blocks, noise.tolist(), strict=True)
-        return float(sum(np.log1p((_length(one) / (CAUCHY * sd)) ** 2).sum() for one, sd in pairs))
+        return float(sum(np.log1p((_length(lengths) / (CAUCHY * sd)) ** 2).sum() for lengths, sd in pairs))
 
 
 class Fit(NamedTuple):
@@ -140,17 +140,17 @@ def residual(rows: Rows, state: State) -> Off:
 def _better(rows: Rows, state: State, step: FloatArray, cost: float, noise: FloatArray) -> tuple[State, Off] | None:
     """After a step, halved until it leads down; None where it does not."""
     for _ in range(_HALVED):
-        there = state.moved(step)
-        off = residual(rows, there)
+        moved = state.moved(step)
+        off = residual(rows, moved)
         if off.cost(noise) < cost:
-            return there, off
+            return moved, off
         step = 0.5 * step
     return None
 
 
 def _normal(rows: Rows, state: State, off: Off, noise: FloatArray, free: FloatArray, *, expected: bool) -> Blocks:
     """The information of the free steps and the slope of half the sum, of each block of rows."""
-    return tell([one @ free for one in slopes(rows, state, off.poses)], off.blocks, noise, expected=expected)
+    return tell([slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, noise, expected=expected)
 
 
 def tell(slope: Sequence[FloatArray], off: Sequence[FloatArray], noise: FloatArray, *, expected: bool) -> Blocks:
@@ -160,11 +160,11 @@ def tell(slope: Sequence[FloatArray], off: Sequence[FloatArray], noise: FloatArr
     the larger one of Gauss and Newton, which leads down more safely.
     """
     parts = list[Blocks]()
-    for inner, one, sd in zip(slope, off, noise.tolist(), strict=True):
-        weight = weights(_length(one), sd)
+    for inner, residual, sd in zip(slope, off, noise.tolist(), strict=True):
+        weight = weights(_length(residual), sd)
         told = curvature(weight) if expected else weight
-        parts.append(blocks(inner, one, told / sd**2, weight / sd**2))
-    return Blocks(*(np.sum(one, axis=0) for one in zip(*parts, strict=True)))
+        parts.append(blocks(inner, residual, told / sd**2, weight / sd**2))
+    return Blocks(*(np.sum(blocks, axis=0) for blocks in zip(*parts, strict=True)))
 
 
 def weights(length: FloatArray, sd: float) -> FloatArray:
@@ -182,20 +182,20 @@ def slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
     moved, turned = rows.answer.slopes(state.position, state.angle, poses)
     seen = state.scale * rows.centred @ state.rotation.T
     arm = poses.rotation @ state.marker
-    place = np.zeros((len(seen), 3, SIZE))
-    place[:, :, ROTATION] = crossed(seen)
-    place[:, :, CENTRE] = -np.eye(3)
-    place[:, :, MARKER] = poses.rotation
-    place[:, :, SCALE] = -seen[:, :, None]
-    place[:, :, POSITION] = np.stack(moved, axis=-1)
-    place[:, :, ANGLE] = np.stack([np.cross(one, arm) for one in turned], axis=-1)
+    jacobian = np.zeros((len(seen), 3, SIZE))
+    jacobian[:, :, ROTATION] = crossed(seen)
+    jacobian[:, :, CENTRE] = -np.eye(3)
+    jacobian[:, :, MARKER] = poses.rotation
+    jacobian[:, :, SCALE] = -seen[:, :, None]
+    jacobian[:, :, POSITION] = np.stack(moved, axis=-1)
+    jacobian[:, :, ANGLE] = np.stack([np.cross(vector, arm) for vector in turned], axis=-1)
     if rows.turned is None:
-        return [place]
+        return [jacobian]
     angle = np.zeros((len(seen), 3, SIZE))
     angle[:, :, ROTATION] = -np.eye(3)
     angle[:, :, TURN] = state.rotation @ rows.turned @ state.turn.T
     angle[:, :, ANGLE] = np.stack(turned, axis=-1)
-    return [place, angle]
+    return [jacobian, angle]
 
 
 def _length(vectors: FloatArray) -> FloatArray:

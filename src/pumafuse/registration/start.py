@@ -43,11 +43,11 @@ def rough(command: Sequence[Motion], sensor: Sequence[Motion]) -> Rough:
     best = Rough(0.0, np.nan, 0.0)
     for window in _WINDOWS:
         steps = round(window / _TICK)
-        told = [_speeds(one, steps, held=True) for one in command]
-        seen = [_speeds(one, steps, held=False) for one in sensor]
+        told = [_speeds(path, steps, held=True) for path in command]
+        seen = [_speeds(path, steps, held=False) for path in sensor]
         starts = [round((b.time[0] - a.time[0]) / _TICK) for a, b in zip(command, sensor, strict=True)]
         for by, of in ((0, 0), (1, 1), (1, 0)):
-            if all(len(one) > by for one in told) and all(len(one) > of for one in seen):
+            if all(len(path) > by for path in told) and all(len(path) > of for path in seen):
                 pairs = [(a[by], b[of], at) for a, b, at in zip(told, seen, starts, strict=True)]
                 for lag in _LAGS:
                     left, right = _beside(pairs, lag)
@@ -69,11 +69,11 @@ def _speeds(motion: Motion, steps: int, *, held: bool) -> list[FloatArray]:
         smooth = despiked(motion.position)
         for axis in range(3):
             path[:, axis] = np.interp(grid, motion.time, smooth[:, axis])
-    found = [np.linalg.norm(path[steps:] - path[:-steps], axis=1)]
+    speeds = [np.linalg.norm(path[steps:] - path[:-steps], axis=1)]
     if motion.quaternion is not None:
         turned = Rotation.from_quat(motion.quaternion[last])
-        found.append((turned[steps:] * turned[:-steps].inv()).magnitude())
-    return [np.minimum(one, np.quantile(one, _QUIET)) for one in found if len(one)]
+        speeds.append((turned[steps:] * turned[:-steps].inv()).magnitude())
+    return [np.minimum(speeds, np.quantile(speeds, _QUIET)) for speeds in speeds if len(speeds)]
 
 
 def despiked(position: FloatArray) -> FloatArray:
@@ -98,7 +98,7 @@ def _ratio(told: Sequence[list[FloatArray]], seen: Sequence[list[FloatArray]], s
     fast = moved >= np.quantile(moved, _FAST)
     if median(moved[fast]) < _MOVED:
         return np.nan
-    if all(len(one) > 1 for one in told):
+    if all(len(path) > 1 for path in told):
         turned = _beside([(a[1], b[0], at) for a, b, at in zip(told, seen, starts, strict=True)], lag)[0]
         moved = np.hypot(moved, _LEVER * turned)
     return median(moved[fast]) / max(median(distance[fast]), _STANDS)
@@ -106,12 +106,12 @@ def _ratio(told: Sequence[list[FloatArray]], seen: Sequence[list[FloatArray]], s
 
 def ratio(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, *, turns: bool) -> float:
     """How far the tool is told to move, or to turn, over how far it is seen to, where it is fast; NaN if untold."""
-    steps, place = round(_OVER[turns] / _TICK), int(turns)
-    told, seen = ([_speeds(one, steps, held=held) for one in of] for of, held in ((command, True), (sensor, False)))
-    if any(len(one) <= place for one in (*told, *seen)):
+    steps, column = round(_OVER[turns] / _TICK), int(turns)
+    told, seen = ([_speeds(path, steps, held=held) for path in of] for of, held in ((command, True), (sensor, False)))
+    if any(len(path) <= column for path in (*told, *seen)):
         return np.nan
     starts = [round((b.time[0] - a.time[0]) / _TICK) for a, b in zip(command, sensor, strict=True)]
-    pairs = [(a[place], b[place], at) for a, b, at in zip(told, seen, starts, strict=True)]
+    pairs = [(a[column], b[column], at) for a, b, at in zip(told, seen, starts, strict=True)]
     moved, distance = _beside(pairs, round(lag / _TICK))
     if not len(moved):
         return np.nan
@@ -119,13 +119,13 @@ def ratio(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, *, tu
     return median(moved[fast]) / max(median(distance[fast]), _STANDS)
 
 
-def _correlation(one: FloatArray, other: FloatArray) -> float:
+def _correlation(first: FloatArray, other: FloatArray) -> float:
     """Of two speeds; 0 where one is constant."""
-    if len(one) < _FEWEST:
+    if len(first) < _FEWEST:
         return 0.0
-    a, b = one - one.mean(), other - other.mean()
+    a, b = first - first.mean(), other - other.mean()
     size = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / size if size > 1e-12 * len(a) * float(one.max() * other.max()) else 0.0
+    return float(a @ b) / size if size > 1e-12 * len(a) * float(first.max() * other.max()) else 0.0
 
 
 def kabsch(to: FloatArray, of: FloatArray) -> tuple[FloatArray, float]:
@@ -149,9 +149,9 @@ def between(turned: Rotation) -> FloatArray:
 
 def aligned_turns(told: Rotation, seen: Rotation) -> tuple[FloatArray, FloatArray]:
     """Rotations between the same rows of both, those of which the axis is sure."""
-    one, other = between(told), between(seen)
-    sure = np.maximum(np.linalg.norm(one, axis=1), np.linalg.norm(other, axis=1)) < _HALF_TURN
-    return one[sure], other[sure]
+    turns, other = between(told), between(seen)
+    sure = np.maximum(np.linalg.norm(turns, axis=1), np.linalg.norm(other, axis=1)) < _HALF_TURN
+    return turns[sure], other[sure]
 
 
 def read(quaternion: FloatArray, reading: Reading) -> FloatArray:

@@ -93,19 +93,19 @@ def simulate_axis(
     white = noises[1].standard_normal((len(interval), _NODES)) * np.sqrt(0.5 * weight)
     white *= np.sqrt(interval * q)[:, None]
     error = error * np.exp(-decay_rate * since / 1e9)
-    distinct, place = np.unique(interval, return_inverse=True)
+    distinct, row = np.unique(interval, return_inverse=True)
     position = np.zeros(len(time))
     for pole, residue in zip(poles, residues, strict=True):
         if pole.imag < 0.0:
             continue  # its conjugate stands for both
         share = residue if pole.imag == 0.0 else 2.0 * residue
-        response = np.exp(pole * 0.5 * (node + 1.0) * distinct[:, None])[place]
+        response = np.exp(pole * 0.5 * (node + 1.0) * distinct[:, None])[row]
         forced = np.zeros(len(interval), dtype=np.complex128)
         if axis.max_speed is None:
-            forced = _response(pole, 0.0, distinct)[place] * level
-            forced = forced + _response(pole, -decay_rate, distinct)[place] * error
+            forced = _response(pole, 0.0, distinct)[row] * level
+            forced = forced + _response(pole, -decay_rate, distinct)[row] * error
         forced += np.einsum("ij,ij->i", response, white)
-        position[1:] += (share * sum_of_decays(np.exp(pole * distinct)[place], forced)).real
+        position[1:] += (share * sum_of_decays(np.exp(pole * distinct)[row], forced)).real
     if axis.max_speed is not None:
         position[1:] += _limited(axis, axis.max_speed, time, level, error, decay_rate)
 

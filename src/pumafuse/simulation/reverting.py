@@ -45,9 +45,9 @@ def smooth(time: TimeArray, sd: float, length: float, rng: np.random.Generator) 
     from scipy.special import gammainc
 
     rate, interval = math.sqrt(3.0) / length, np.diff(time) / 1e9
-    distinct, place = np.unique(interval, return_inverse=True)
+    distinct, row = np.unique(interval, return_inverse=True)
     begun = np.ones((3, 1))  # stationarity is where an endless interval leads
-    p1, p2, p3 = np.hstack((begun, gammainc(np.array([[1.0], [2.0], [3.0]]), 2.0 * rate * distinct)[:, place]))
+    p1, p2, p3 = np.hstack((begun, gammainc(np.array([[1.0], [2.0], [3.0]]), 2.0 * rate * distinct)[:, row]))
     first, second = rng.standard_normal((2, len(time)))
     sd_v = rate * np.sqrt(2.0 * p1)  # the covariance's Cholesky factor [sd_v 0; along across]
     along = np.divide(rate * p2, sd_v, out=np.zeros(len(time)), where=sd_v > 0.0)

@@ -142,9 +142,9 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         if sensor.rate > fastest:
             limit = f"at most {fastest:g} on this arm ({POINTS} rows a command)"
             raise ConfigError(f"{where}.rate_hz: {limit}, got {sensor.rate:g}")
-        for axis, one in self.arm.axes.items():
+        for axis, model in self.arm.axes.items():
             if (wrong := sensor.outliers) and of_axis(wrong.largest, axis) < of_axis(wrong.smallest, axis):
-                smaller, larger = (of_kind(key, one.kind) for key in OF_OUTLIERS)
+                smaller, larger = (of_kind(key, model.kind) for key in OF_OUTLIERS)
                 raise ConfigError(f"{where}.outliers: {larger} is smaller than {smaller}")
         for start, end in sensor.outages:
             if end <= start:
@@ -176,7 +176,8 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         simulated: dict[str, Any] = {
             "start": {"offset_sd_mm": self.start.offset_sd},
             "process": {
-                axis: toml.builtins(self.process.get(axis, PROCESS[one.kind])) for axis, one in self.arm.axes.items()
+                axis: toml.builtins(self.process.get(axis, PROCESS[model.kind]))
+                for axis, model in self.arm.axes.items()
             },
             "sensors": {name: sensor.to_config() for name, sensor in self.sensors.items()},
         }
@@ -189,10 +190,10 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def to_toml(self, seed: int, arm: str) -> str:
         """The text of a ``scenario.toml`` with this ``seed``, and its arm in the file ``arm``."""
-        tree, own = toml.builtins(self), self.arm.axes
+        tree, models = toml.builtins(self), self.arm.axes
         tree["arm"], tree["seed"] = arm, seed
         for key, parts in (("true_arm", self.true_arm), ("process", self.process)):
-            tree[key] = {axis: toml.builtins(one, own[axis].kind) for axis, one in parts.items()}
+            tree[key] = {axis: toml.builtins(part, models[axis].kind) for axis, part in parts.items()}
         tree["trajectory"] = toml.builtins(self.trajectory, _kind_of(self.trajectory.moving, self.arm))
         tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
         screens = {axis: self.arm.screen_of(axis) for axis in self.start.level}
@@ -230,46 +231,46 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 def _with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
     """The tables of a file (SI numbers) with the key names for lengths, where those of angles are."""
-    found = dict(tree)
+    lengths = dict(tree)
     for key, kind in (("true_arm", TrueArm), ("process", Process)):
-        if isinstance(found.get(key), dict):
-            found[key] = by_axis(found[key], kind, arm, where, key)
-    if isinstance(found.get("process"), dict):
-        found["process"] = with_defaults(found["process"], arm)
-    if isinstance(start := found.get("start"), dict):
-        found["start"] = _start(cast(dict[str, Any], start), arm, where)
-    if "reference" in found:
-        found["reference"] = of_all_axes(found["reference"], ReferenceLog, arm, where, "reference", ["sd_mm"])
-    if isinstance(sensors := found.get("sensors"), dict):
+        if isinstance(lengths.get(key), dict):
+            lengths[key] = by_axis(lengths[key], kind, arm, where, key)
+    if isinstance(lengths.get("process"), dict):
+        lengths["process"] = with_defaults(lengths["process"], arm)
+    if isinstance(start := lengths.get("start"), dict):
+        lengths["start"] = _start(cast(dict[str, Any], start), arm, where)
+    if "reference" in lengths:
+        lengths["reference"] = of_all_axes(lengths["reference"], ReferenceLog, arm, where, "reference", ["sd_mm"])
+    if isinstance(sensors := lengths.get("sensors"), dict):
         named = cast(dict[str, Any], sensors)
-        found["sensors"] = {name: _sensor(table, arm, where, f"sensors.{name}") for name, table in named.items()}
-    if isinstance(trajectory := found.get("trajectory"), dict):
+        lengths["sensors"] = {name: _sensor(table, arm, where, f"sensors.{name}") for name, table in named.items()}
+    if isinstance(trajectory := lengths.get("trajectory"), dict):
         table = cast(dict[str, Any], trajectory)
         axes: Any = table.get("axes", [table.get(key) for key in ("along", "across")])
         kind = _kind_of(cast(list[Any], axes) if isinstance(axes, list) else [], arm)
-        found["trajectory"] = toml.struct(table, cast(Any, TRAJECTORIES), where, "trajectory", kind)
-    return found
+        lengths["trajectory"] = toml.struct(table, cast(Any, TRAJECTORIES), where, "trajectory", kind)
+    return lengths
 
 
 def _start(table: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
-    found = of_all_axes(table, TrueStart, arm, where, "start", ["offset_sd_mm"])
-    if isinstance(levels := found.get("level"), dict):
-        named, found["level"] = cast(dict[str, Any], levels), dict[str, Any]()
+    start = of_all_axes(table, TrueStart, arm, where, "start", ["offset_sd_mm"])
+    if isinstance(levels := start.get("level"), dict):
+        named, start["level"] = cast(dict[str, Any], levels), dict[str, Any]()
         for key, level in named.items():
             axis = axis_of(key, where, "start.level")
-            if axis in found["level"]:
+            if axis in start["level"]:
                 raise ConfigError(f"{where}: start.level gives an axis twice")
             if axis in arm.axes and arm.axes[axis].kind != units.kind_of(key):
                 raise ConfigError(f"{where}: start.level.{key}: {axis} is {units.AN[arm.axes[axis].kind]}")
-            found["level"][axis] = level
-    return found
+            start["level"][axis] = level
+    return start
 
 
 def _sensor(table: Any, arm: ArmModel, where: str, path: str) -> Any:
-    found = of_all_axes(table, TrueSensor, arm, where, path, PER_AXIS)
-    if isinstance(found, dict) and "outliers" in found:
-        found["outliers"] = of_all_axes(found["outliers"], Outliers, arm, where, f"{path}.outliers", OF_OUTLIERS)
-    return found  # pyright: ignore[reportUnknownVariableType]
+    sensor = of_all_axes(table, TrueSensor, arm, where, path, PER_AXIS)
+    if isinstance(sensor, dict) and "outliers" in sensor:
+        sensor["outliers"] = of_all_axes(sensor["outliers"], Outliers, arm, where, f"{path}.outliers", OF_OUTLIERS)
+    return sensor  # pyright: ignore[reportUnknownVariableType]
 
 
 def _kind_of(moving: Iterable[object], arm: ArmModel) -> units.Kind:
@@ -296,6 +297,6 @@ def _merged(tree: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, A
     """``tree`` with the entries of ``override`` in their places."""
     merged = dict(tree)
     for key, value in override.items():
-        there = merged.get(key)
-        merged[key] = _merged(there, value) if isinstance(there, Mapping) and isinstance(value, Mapping) else value  # pyright: ignore
+        before = merged.get(key)
+        merged[key] = _merged(before, value) if isinstance(before, Mapping) and isinstance(value, Mapping) else value  # pyright: ignore
     return merged

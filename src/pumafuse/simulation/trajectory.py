@@ -123,12 +123,12 @@ class WhiteNoise(Timed, frozen=True, kw_only=True, tag="white-noise"):
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """0 or the amplitude; the first command is the start level."""
         count = len(ticks(self.duration, period))
-        found: Offsets = {}
+        offsets: Offsets = {}
         for axis in self.axes:
             switches = rng.random(count) < 0.5
             switches[0] = False
-            found[axis] = np.where(np.cumsum(switches) % 2, self.amplitude, 0.0)
-        return found
+            offsets[axis] = np.where(np.cumsum(switches) % 2, self.amplitude, 0.0)
+        return offsets
 
 
 class SineSweep(Timed, frozen=True, kw_only=True, tag="sine-sweep"):
@@ -169,14 +169,14 @@ class PathFromFile(OnAxes, frozen=True, kw_only=True, tag="path"):
         if not np.isfinite(time).all() or (np.diff(time) <= 0.0).any():
             raise ConfigError(f"{self.file}: time_s must ascend from row to row")
         at = ticks(float(time[-1] - time[0]), period) * period + time[0]
-        found: Offsets = {}
+        offsets: Offsets = {}
         for axis in self.axes:
             column = next((name for name in table.columns if name.removesuffix(ending(name) or "") == axis), None)
             values, _ = table.numbers(column or f"{axis}_mm")
             if not np.isfinite(values).all():
                 raise ConfigError(f"{self.file}: {column} has a cell without a number")
-            found[axis] = np.interp(at, time, values) - values[0]
-        return found
+            offsets[axis] = np.interp(at, time, values) - values[0]
+        return offsets
 
 
 TRAJECTORIES: TypeAlias = Raster | Steps | WhiteNoise | SineSweep | Hold | PathFromFile

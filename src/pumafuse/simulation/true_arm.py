@@ -114,6 +114,6 @@ class TrueArm(Imperfections, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         tree = toml.builtins(self)
         if model.__struct_config__.tag == kind:
             tree = toml.builtins(model) | tree
-        given = {key: value for key, value in tree.items() if key in _OF_PLANTS}
+        keys = {key: value for key, value in tree.items() if key in _OF_PLANTS}
         chosen = FirstOrder if kind == "first-order" else SecondOrder
-        return toml.struct(given, chosen, f"{where}, a {kind} plant")
+        return toml.struct(keys, chosen, f"{where}, a {kind} plant")

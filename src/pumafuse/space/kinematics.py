@@ -60,8 +60,8 @@ class Chain:
         """
         if unknown := next((name for name in later if name not in self.kinds), None):
             raise UnknownNameError(f"{where}: joints of the arm", "joint", unknown, self.joints)
-        by = {self.joints.index(name): round(one * 1e9) for name, one in later.items()}
-        return {column: one for column, one in by.items() if one}
+        by = {self.joints.index(name): round(delay * 1e9) for name, delay in later.items()}
+        return {column: delay for column, delay in by.items() if delay}
 
     @classmethod
     def load(cls, path: str | Path, base: str, tip: str) -> Chain:

@@ -28,8 +28,8 @@ def of_quaternions(value: FloatArray, order: Order = "xyzw") -> FloatArray:
     value = value[:, [1, 2, 3, 0]] if order == "wxyz" else value
     with np.errstate(invalid="ignore", over="ignore"):
         norm = np.sqrt(np.sum(value**2, axis=1))
-        known, off = np.abs(norm - 1.0) < _NORM, np.abs(norm - 1.0) > _ROUNDED
-    return np.where(known[:, None], value / np.where(known & off, norm, 1.0)[:, None], np.nan)
+        is_unit, off = np.abs(norm - 1.0) < _NORM, np.abs(norm - 1.0) > _ROUNDED
+    return np.where(is_unit[:, None], value / np.where(is_unit & off, norm, 1.0)[:, None], np.nan)
 
 
 def of_vectors(vector: FloatArray) -> FloatArray:
@@ -43,13 +43,13 @@ def of_angles(angle: FloatArray, letters: str) -> FloatArray:
 
     Capital letters, as in ``ZYX``, turn about axes that turn along, small ones about axes that stay, as in scipy.
     """
-    found = np.tile([0.0, 0.0, 0.0, 1.0], (len(angle), 1))
+    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (len(angle), 1))
     for letter, about in zip(letters, angle.T, strict=True):
         turn = np.zeros((len(angle), 3))
         turn[:, "xyz".index(letter.lower())] = about
         step = of_vectors(turn)
-        found = product(found, step) if letters.isupper() else product(step, found)
-    return found
+        quaternion = product(quaternion, step) if letters.isupper() else product(step, quaternion)
+    return quaternion
 
 
 def mean(quaternion: FloatArray) -> FloatArray:
@@ -57,8 +57,8 @@ def mean(quaternion: FloatArray) -> FloatArray:
 
     The quaternion nearest to all, whatever their signs (Markley et al. 2007).
     """
-    known = quaternion[np.isfinite(quaternion).all(axis=1)]
-    nearest = np.linalg.eigh(known.T @ known)[1][:, -1]
+    valid = quaternion[np.isfinite(quaternion).all(axis=1)]
+    nearest = np.linalg.eigh(valid.T @ valid)[1][:, -1]
     return vectors(nearest[None], np.zeros(3))[0]
 
 
@@ -78,7 +78,7 @@ def quaternions(vector: FloatArray, reference: FloatArray) -> FloatArray:
 
 def product(left: FloatArray, right: FloatArray) -> FloatArray:
     """Quaternions of R_left R_right, row by row, (n, 4); either may be one row for all."""
-    (a, w), (b, v) = ((one[:, :3], one[:, 3:]) for one in (left, right))
+    (a, w), (b, v) = ((quaternion[:, :3], quaternion[:, 3:]) for quaternion in (left, right))
     return np.concatenate([w * b + v * a + cross(a, b), w * v - np.sum(a * b, axis=1, keepdims=True)], axis=1)
 
 
@@ -95,8 +95,8 @@ def turned(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
 
 def cross(left: FloatArray, right: FloatArray) -> FloatArray:
     """The cross products of rows; numpy's own takes three times as long for one row, as of a stream."""
-    one, two = [1, 2, 0], [2, 0, 1]
-    return left.take(one, 1) * right.take(two, 1) - left.take(two, 1) * right.take(one, 1)
+    first, two = [1, 2, 0], [2, 0, 1]
+    return left.take(first, 1) * right.take(two, 1) - left.take(two, 1) * right.take(first, 1)
 
 
 def between(quaternion: FloatArray, row: IntArray, share: FloatArray) -> FloatArray:
@@ -143,10 +143,10 @@ def left_jacobian(vector: FloatArray) -> FloatArray:
     angle = np.sqrt(np.sum(vector**2, axis=1))
     small = angle < _SMALL
     safe = np.where(small, 1.0, angle)
-    one = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)[:, None, None]
+    of_cosine = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)[:, None, None]
     two = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)[:, None, None]
     cross = crossed(vector)
-    return np.eye(3) + one * cross + two * (cross @ cross)
+    return np.eye(3) + of_cosine * cross + two * (cross @ cross)
 
 
 def spread(vector: FloatArray) -> FloatArray:

@@ -77,29 +77,29 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
     first = next(iter(results.values()))
     start = _busiest(first.time, _travelled(first), _ZOOM_S)
     colour = dict(zip(results, colours.several(len(results)), strict=True))
-    positions = {name: one.positions(first.config) for name, one in results.items()}
+    positions = {name: result.positions(first.config) for name, result in results.items()}
     with drawing(2, 2 * len(first.axes), width=13.0, height=2.4, sharex="col") as figure:
         for number, axis in enumerate(first.axes):
             screen = first.config.arm.screen_of(axis)
             whole, zoom, left, left_zoom = figure.axes[4 * number : 4 * number + 4]
             for axes in (whole, zoom):
-                for name, one in results.items():
-                    if axis in one.axes:
+                for name, result in results.items():
+                    if axis in result.axes:
                         position = positions[name][axis] * screen.scale
-                        axes.plot(one.time, position, lw=1.0, color=colour[name], label=name)
+                        axes.plot(result.time, position, lw=1.0, color=colour[name], label=name)
                 _reference(axes, reference, axis, screen.scale)
                 axes.set_ylabel(f"{axis} [{screen.unit}]")
             what, shown = "difference", [np.zeros(1)]
-            for name, one in results.items():
-                if axis not in one.axes or (reference is None and one is first):
+            for name, result in results.items():
+                if axis not in result.axes or (reference is None and result is first):
                     continue
                 if reference is not None and axis in reference.position:
-                    what, apart = "error", interpolated(one.time, one.segment, reference, axis)
+                    what, apart = "error", interpolated(result.time, result.segment, reference, axis)
                 else:
-                    apart = np.interp(one.time, first.time, first.axes[axis].position)
+                    apart = np.interp(result.time, first.time, first.axes[axis].position)
                 shown.append(positions[name][axis] - apart)
                 for axes in (left, left_zoom):
-                    axes.plot(one.time, shown[-1] * screen.scale, lw=0.8, color=colour[name])
+                    axes.plot(result.time, shown[-1] * screen.scale, lw=0.8, color=colour[name])
             limit = _reach(np.concatenate(shown)) * screen.scale
             for axes in (left, left_zoom):
                 axes.set_ylim(-limit, limit)
@@ -116,8 +116,10 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
 
 def path_figure(est: Estimates, run: Run) -> Figure | None:
     """Draw where the tool was commanded to be and was, in the log's x, y, z; None where it has not all three."""
-    own = {name: axis.position for name, axis in est.axes.items()} if in_space(est.config.arm) == CARTESIAN else {}
-    estimated, command = est.cartesian or own, run.command.values
+    positions = (
+        {name: axis.position for name, axis in est.axes.items()} if in_space(est.config.arm) == CARTESIAN else {}
+    )
+    estimated, command = est.cartesian or positions, run.command.values
     if not all(name in estimated for name in CARTESIAN):
         return None
     with drawing(1, width=8.0, height=7.0, projection="3d") as figure:
@@ -154,14 +156,14 @@ def error_figure(est: Estimates) -> Figure | None:
     if est.reference is None:
         raise ValueError("the run has no reference")
     scores = {
-        name: score(est.time, est.segment, one.position, one.position_sd, est.reference, name)
-        for name, one in est.axes.items()
+        name: score(est.time, est.segment, axis.position, axis.position_sd, est.reference, name)
+        for name, axis in est.axes.items()
     }
-    found = {name: one for name, one in scores.items() if one is not None}
-    if not found:
+    scored = {name: score for name, score in scores.items() if score is not None}
+    if not scored:
         return None
-    with _figure(est, len(found), [_TIME], [1.0]) as figure:
-        for axes, (name, one) in zip(figure.axes, found.items(), strict=True):
+    with _figure(est, len(scored), [_TIME], [1.0]) as figure:
+        for axes, (name, scored_axis) in zip(figure.axes, scored.items(), strict=True):
             screen = est.config.arm.screen_of(name)
             error = est[name].position - interpolated(est.time, est.segment, est.reference, name)
             for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
@@ -172,8 +174,8 @@ def error_figure(est: Estimates) -> Figure | None:
             _band(axes, est, name, np.zeros(len(est.time)))
             axes.plot(est.time, error * screen.scale, color=colours.REFERENCE, lw=0.8, label="estimate")
             axes.set_title(
-                f"{name}: RMS error {one.rmse * screen.scale:.3f} {screen.unit}; the 95 % band holds"
-                f" {one.coverage:.1%} of {one.rows} errors",
+                f"{name}: RMS error {scored_axis.rmse * screen.scale:.3f} {screen.unit}; the 95 % band holds"
+                f" {scored_axis.coverage:.1%} of {scored_axis.rows} errors",
                 loc="left",
             )
             axes.set_ylabel(f"error [{screen.unit}]")
@@ -195,31 +197,33 @@ def validation_figure(est: Estimates) -> Figure | None:
     """
     by_sensor = colours.sensor_colours(est.measurements.sensors)
     pairs = [(sensor, axis) for axis in est.axes for sensor in by_sensor]
-    rows = [(sensor, axis, found) for sensor, axis in pairs if (found := consistency(est, sensor, axis)) is not None]
+    rows = [
+        (sensor, axis, checked) for sensor, axis in pairs if (checked := consistency(est, sensor, axis)) is not None
+    ]
     if not rows:
         return None
     at = np.linspace(-4.5, 4.5, 91)
     labels = ["time [s]", "innovation / sd", "lag [measurements]"]
     with _figure(est, len(rows), labels, [3.0, 1.0, 1.0]) as figure:
-        for number, (sensor, axis, found) in enumerate(rows):
+        for number, (sensor, axis, checked) in enumerate(rows):
             series, histogram, correlation = figure.axes[3 * number : 3 * number + 3]
             normalised = innovations(series, est, sensor, axis, by_sensor[sensor])
-            series.set_title(f"{axis}, {sensor}. {sentence(found)}", loc="left")
+            series.set_title(f"{axis}, {sensor}. {sentence(checked)}", loc="left")
             series.set_ylabel("innovation / sd")
             inside = np.clip(normalised, at[0], at[-1])
             histogram.hist(inside, bins=45, range=(at[0], at[-1]), density=True, color=by_sensor[sensor], alpha=0.6)
             histogram.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=colours.REFERENCE, lw=1.0)
             histogram.set_ylabel("density")
-            correlations(correlation, [found], [by_sensor[sensor]])
+            correlations(correlation, [checked], [by_sensor[sensor]])
             correlation.set_ylabel("autocorrelation")
     return figure
 
 
-def lag_figures(found: Latency) -> Markup:
+def lag_figures(latency: Latency) -> Markup:
     """A row for each axis: command, measurements and model where most happens, and the lag over the run."""
-    summary, arm = found.details, found.config.arm
+    summary, arm = latency.details, latency.config.arm
     run = max(
-        found.runs, key=lambda one: len(one.sensors[summary.sensor].stamp) if summary.sensor in one.sensors else 0
+        latency.runs, key=lambda run: len(run.sensors[summary.sensor].stamp) if summary.sensor in run.sensors else 0
     )
     source, origin = run.sensors[summary.sensor], int(np.min(run.command.stamp[run.command.stamp != NO_STAMP]))
     axes = [axis for axis in summary.axes if axis in source.values and axis in run.axes]
@@ -227,15 +231,15 @@ def lag_figures(found: Latency) -> Markup:
     colour = colours.REFERENCE if of_reference else colours.sensor_colours([summary.sensor])[summary.sensor]
     with drawing(2, len(axes), width=12.0, height=2.6, ratios=[3.0, 1.4]) as figure:
         for axis, motion, course in zip(axes, figure.axes[::2], figure.axes[1::2], strict=True):
-            screen, one = SCREEN[run.kinds.get(axis, "length")], summary.axes[axis]
-            given, command = known_rows(run.command.stamp, run.command.values[axis])
+            screen, lag = SCREEN[run.kinds.get(axis, "length")], summary.axes[axis]
+            told_at, command = known_rows(run.command.stamp, run.command.values[axis])
             stamp, value = known_rows(source.stamp, source.values[axis])
-            fine, model, start = np.union1d(given, stamp), arm.axes[axis], float(command[0])
-            moved = start + response(model, arm.update_period, arm.delay_of(axis), given, command, start, fine)
-            scale = found.config.sensors[summary.sensor].scale
+            fine, model, start = np.union1d(told_at, stamp), arm.axes[axis], float(command[0])
+            moved = start + response(model, arm.update_period, arm.delay_of(axis), told_at, command, start, fine)
+            scale = latency.config.sensors[summary.sensor].scale
             apart = value - scale * moved[np.searchsorted(fine, stamp)]
             value = (value - float(np.median(apart))) / scale
-            time, seen, length = seconds(given, origin), seconds(stamp, origin), max(_ZOOM_S, 8.0 * one.lag)
+            time, seen, length = seconds(told_at, origin), seconds(stamp, origin), max(_ZOOM_S, 8.0 * lag.lag)
             begin = _busiest(time, command, length)
             motion.step(time, command * screen.scale, where="post", color=colours.COMMAND, lw=1, label="command")
             motion.plot(seen, value * screen.scale, ".", ms=4, color=colour, label=summary.sensor)
@@ -243,12 +247,12 @@ def lag_figures(found: Latency) -> Markup:
             shown = command[(time >= begin - 1.0) & (time <= begin + length)] * screen.scale
             margin = 0.08 * float(np.ptp(shown)) + 1e-3
             motion.set(xlim=(begin, begin + length), ylim=(float(shown.min()) - margin, float(shown.max()) + margin))
-            motion.set_title(f"{axis}: {one.lag * MS:.1f} ms late", loc="left")
+            motion.set_title(f"{axis}: {lag.lag * MS:.1f} ms late", loc="left")
             motion.set_ylabel(f"{axis} [{screen.unit}]")
-            if one.course:
-                t, shift, sd = np.array([(part.time, part.shift, part.sd) for part in one.course]).T
-                course.errorbar(t, (one.lag + shift) * MS, Z95 * sd * MS, fmt="o", ms=3, color=colours.ESTIMATE, lw=1)
-                course.axhspan(*(end * MS for end in one.lag_ci95), color=colours.ESTIMATE, alpha=0.2, lw=0)
+            if lag.course:
+                t, shift, sd = np.array([(part.time, part.shift, part.sd) for part in lag.course]).T
+                course.errorbar(t, (lag.lag + shift) * MS, Z95 * sd * MS, fmt="o", ms=3, color=colours.ESTIMATE, lw=1)
+                course.axhspan(*(end * MS for end in lag.lag_ci95), color=colours.ESTIMATE, alpha=0.2, lw=0)
             course.set_ylabel("lag [ms]")
         for column in figure.axes[-2:]:
             column.set_xlabel(_TIME)
@@ -275,12 +279,12 @@ def innovations(axes: Axes, est: Estimates, sensor: str, axis: str, colour: str)
 def correlations(axes: Axes, tests: Sequence[Consistency | None], by_test: Sequence[str]) -> None:
     """Draw autocorrelations side by side in their colours, with the narrowest of their bands."""
     highest, band, width = 0.12, 1.0, 0.8 / len(tests)
-    for number, (found, colour) in enumerate(zip(tests, by_test, strict=True)):
-        if found is not None:
-            lags = np.arange(1, len(found.correlation) + 1) + width * (number - 0.5 * (len(tests) - 1))
-            axes.bar(lags, found.correlation, color=colour, width=width)
-            highest = max(highest, 1.1 * float(np.abs(found.correlation).max(initial=0.0)))
-            band = min(band, found.correlation_band)
+    for number, (check, colour) in enumerate(zip(tests, by_test, strict=True)):
+        if check is not None:
+            lags = np.arange(1, len(check.correlation) + 1) + width * (number - 0.5 * (len(tests) - 1))
+            axes.bar(lags, check.correlation, color=colour, width=width)
+            highest = max(highest, 1.1 * float(np.abs(check.correlation).max(initial=0.0)))
+            band = min(band, check.correlation_band)
     axes.axhspan(-band, band, color=colours.ESTIMATE, alpha=0.2, lw=0)
     axes.set_xlim(0, LAGS + 1)
     axes.set_ylim(-highest, highest)
@@ -300,7 +304,7 @@ def _figure(est: Estimates, rows: int, labels: Sequence[str], ratios: Sequence[f
 
 def _travelled(result: Result) -> FloatArray:
     """How far all axes have moved until each estimate, each in units of its range."""
-    parts = [one.position / max(float(np.ptp(one.position)), 1e-12) for one in result.axes.values()]
+    parts = [axis.position / max(float(np.ptp(axis.position)), 1e-12) for axis in result.axes.values()]
     return np.sum([np.cumsum(np.abs(np.diff(part, prepend=part[0]))) for part in parts], axis=0)
 
 
@@ -315,16 +319,16 @@ def _fit_height(axes: Axes, start: float, end: float) -> None:
 
 def _reach(values: FloatArray) -> float:
     """How far an axis has to reach for nearly all of the values: a few at the start would flatten the others."""
-    found = np.abs(values[np.isfinite(values)])
-    if not len(found):
+    distances = np.abs(values[np.isfinite(values)])
+    if not len(distances):
         return _LEAST
-    most, usual = np.quantile(found, [_NEARLY_ALL, 0.75]).tolist()
+    most, usual = np.quantile(distances, [_NEARLY_ALL, 0.75]).tolist()
     return max(min(1.4 * most, 6.0 * usual) if usual > 0.0 else 1.4 * most, _LEAST)
 
 
 def _commands(axes: Axes, est: Estimates, name: str) -> None:
-    given = [(seconds(time, est.origin), value) for time, value in (one.given(name) for one in est.segments)]
-    time, value = (np.concatenate(part) for part in zip(*given, strict=True))
+    told = [(seconds(time, est.origin), value) for time, value in (segment.given(name) for segment in est.segments)]
+    time, value = (np.concatenate(part) for part in zip(*told, strict=True))
     scale = est.config.arm.screen_of(name).scale
     axes.step(time, value * scale, where="post", color=colours.COMMAND, lw=1, label="command")
 
@@ -356,8 +360,8 @@ def _residuals(axes: Axes, est: Estimates, name: str) -> None:
         measured = est.measured_positions(sensor, name)
         left = measured.value.copy()
         for number in np.unique(measured.segment).tolist():
-            mine, here = measured.segment == number, est.segment == number
-            left[mine] -= np.interp(measured.time[mine], est.time[here], est[name].position[here])
+            rows, here = measured.segment == number, est.segment == number
+            left[rows] -= np.interp(measured.time[rows], est.time[here], est[name].position[here])
         _dots(axes, est, sensor, replace(measured, value=left), scale, colour)
         shown.append(left[measured.outcome != Outcome.REJECTED])
         if sensor in est.config.sensors and (sd := est.config.sensors[sensor].sd_of(name)) is not None:

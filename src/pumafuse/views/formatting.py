@@ -70,18 +70,18 @@ def limits(ci95: tuple[float | None, float | None], computed: bool = True) -> st
 def fitted(summary: TuningSummary) -> list[list[str]]:
     """Rows of the lags and the parameters: name, before, fitted, 95 % interval, and what to know of it."""
     lags = [
-        [f"lag of {axis}, ms", f"{one.before_ms:.4g}", f"{one.lag_ms:.4g}", limits(one.lag_ms_ci95), ""]
-        for axis, one in summary.lags.items()
+        [f"lag of {axis}, ms", f"{lag.before_ms:.4g}", f"{lag.lag_ms:.4g}", limits(lag.lag_ms_ci95), ""]
+        for axis, lag in summary.lags.items()
     ]
     return lags + [
         [
-            one.key,
-            "–" if one.before is None else f"{one.before:.4g}",
-            f"{one.value:.4g}",
-            limits(one.ci95, not summary.interrupted),
-            one.notes,
+            parameter.key,
+            "–" if parameter.before is None else f"{parameter.before:.4g}",
+            f"{parameter.value:.4g}",
+            limits(parameter.ci95, not summary.interrupted),
+            parameter.notes,
         ]
-        for one in summary.parameters
+        for parameter in summary.parameters
     ]
 
 
@@ -90,24 +90,24 @@ def p_value(value: float | None) -> str:
     return "–" if value is None else "< 0.001" if value < 1e-3 else f"{value:.3f}"
 
 
-def level(found: Level) -> str:
+def level(level: Level) -> str:
     """A level of a factor with mean, standard deviation and number of its trials."""
-    spread = "" if found.sd is None else f" ± {found.sd:.2g}"
-    return f"{found.level}: {found.mean:.4g}{spread} ({found.trials})"
+    spread = "" if level.sd is None else f" ± {level.sd:.2g}"
+    return f"{level.level}: {level.mean:.4g}{spread} ({level.trials})"
 
 
-def plant(found: PLANTS, first: str = "τ {} ms", second: str = "ω {} rad/s, ζ {}") -> str:
+def plant(plant_shape: PLANTS, first: str = "τ {} ms", second: str = "ω {} rad/s, ζ {}") -> str:
     """A plant's parameters with their intervals, in the words for its order."""
-    if isinstance(found, FirstOrder):
-        return first.format(with_interval(found.time_constant, found.time_constant_ci95, MS))
-    omega = with_interval(found.natural_frequency, found.natural_frequency_ci95)
-    return second.format(omega, with_interval(found.damping, found.damping_ci95))
+    if isinstance(plant_shape, FirstOrder):
+        return first.format(with_interval(plant_shape.time_constant, plant_shape.time_constant_ci95, MS))
+    omega = with_interval(plant_shape.natural_frequency, plant_shape.natural_frequency_ci95)
+    return second.format(omega, with_interval(plant_shape.damping, plant_shape.damping_ci95))
 
 
-def gain(found: Gain) -> str:
+def gain(gain: Gain) -> str:
     """The gain K as a line over the speed s."""
-    line = with_interval(found.intercept, found.intercept_ci95)
-    return f"{line} + ({with_interval(found.slope, found.slope_ci95)}) s" if found.slope else line
+    line = with_interval(gain.intercept, gain.intercept_ci95)
+    return f"{line} + ({with_interval(gain.slope, gain.slope_ci95)}) s" if gain.slope else line
 
 
 def change(values: Sequence[float | None], form: str) -> str:

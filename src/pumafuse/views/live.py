@@ -94,7 +94,9 @@ class LiveView:
         turns = {*CARTESIAN, *TURNING} <= config.arm.axes.keys()
         tool = config.tool.reference if turns and config.tool is not None else None
         header = Header(mode, config.arm.kind_of, self._space, tool, config.sensors, PORT, WEB_PORT)
-        unbiased = [name for name, one in config.sensors.items() if one.scale == 1.0 and not header.is_biased(name)]
+        unbiased = [
+            name for name, sensor in config.sensors.items() if sensor.scale == 1.0 and not header.is_biased(name)
+        ]
         self._in_space = {  # sources that are drawn as positions in space; of a tool that turns the drawer makes these
             "",
             *(unbiased if self._space == CARTESIAN and tool is None else ()),
@@ -169,15 +171,15 @@ class LiveView:
         for moment, axes, cartesian in _taken(self._estimates):
             for axis, now in axes.items():
                 frame.setdefault(f"estimate/{axis}", []).append((moment, now.position, now.position_sd))
-            place = cartesian if self._framed else {axis: now.position for axis, now in axes.items()}
-            self._add_position(frame, "estimate", moment, place or {})
+            positions = cartesian if self._framed else {axis: now.position for axis, now in axes.items()}
+            self._add_position(frame, "estimate", moment, positions or {})
         return frame
 
-    def _add_position(self, frame: Frame, name: str, moment: float, place: Mapping[str, float]) -> None:
+    def _add_position(self, frame: Frame, name: str, moment: float, position: Mapping[str, float]) -> None:
         """Add a position in space to a path, if it is one."""
-        if self._space and all(coordinate in place for coordinate in self._space):
+        if self._space and all(coordinate in position for coordinate in self._space):
             plane = (0.0,) * (3 - len(self._space))
-            row = moment, *(float(place[coordinate]) for coordinate in self._space), *plane
+            row = moment, *(float(position[coordinate]) for coordinate in self._space), *plane
             frame.setdefault(f"path/{name}", []).append(row)
 
     def _add_health(self, frame: Frame, health: Health) -> None:

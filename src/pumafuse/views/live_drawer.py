@@ -67,13 +67,13 @@ class Picture:
 
     def draw(self, frame: Frame) -> None:
         """Send a frame."""
-        for axis, known in self._estimates.items():
+        for axis, estimate in self._estimates.items():
             screen = self._screens[axis]
             time, command = _columns(frame, f"command/{axis}", 2)
             line = styles.line(colours.COMMAND, "command", step=True)
             self._sink.series(f"{axis}/command", line, time, command, screen)
             time, position, sd = estimates = _columns(frame, f"estimate/{axis}", 3)
-            known.add(estimates)
+            estimate.add(estimates)
             self._sink.band(f"{axis}/estimate", "estimate ± sd", time, position, sd, screen)
             self._sink.band(f"residual/{axis}/estimate", "estimate's sd", time, np.zeros(len(time)), sd, screen)
         taken: dict[tuple[str, str], FloatArray] = {}
@@ -185,8 +185,8 @@ class Recent:
         times: FloatArray = self.rows[0]
         values: FloatArray = self.rows[1]
         after = np.clip(np.searchsorted(times, time), 1, len(times) - 1)
-        known = (time >= times[0]) & (times[after] - times[after - 1] <= _LONGEST_GAP)
-        return np.where(known, np.interp(time, times, values), np.nan)
+        is_near = (time >= times[0]) & (times[after] - times[after - 1] <= _LONGEST_GAP)
+        return np.where(is_near, np.interp(time, times, values), np.nan)
 
     def clip(self, position: FloatArray, screen: Screen) -> FloatArray:
         """Positions [SI] with those far off moved to the edge: one wild measurement would flatten the plot."""

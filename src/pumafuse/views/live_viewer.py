@@ -98,12 +98,12 @@ def _url(port: int) -> str:
 
 
 def _arguments(mode: str, port: int, web_port: int | None = None) -> list[str]:
-    given = ["--bind", HOST, "--port", str(port)]
+    options = ["--bind", HOST, "--port", str(port)]
     if mode == "web":
         server = ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _SERVER_MEMORY]
-        return [*given, *server, "--newest-first"]  # oldest first, a browser opened later would begin far behind
+        return [*options, *server, "--newest-first"]  # oldest first, a browser opened later would begin far behind
     limits = ["--memory-limit", _VIEWER_MEMORY, "--server-memory-limit", _BEHIND_VIEWER]
-    return [*given, *limits, "--hide-welcome-screen", "--expect-data-soon"]
+    return [*options, *limits, "--hide-welcome-screen", "--expect-data-soon"]
 
 
 def _start(arguments: list[str], *, keep: bool) -> subprocess.Popen[bytes]:
@@ -122,9 +122,9 @@ def _start(arguments: list[str], *, keep: bool) -> subprocess.Popen[bytes]:
 
 def _program() -> str:
     """The viewer of rerun-sdk itself: its script of the same name would stay behind it, and hide its end."""
-    found = importlib.util.find_spec("rerun_cli")
-    assert found is not None and found.origin is not None
-    folder = Path(found.origin).parent
+    spec = importlib.util.find_spec("rerun_cli")
+    assert spec is not None and spec.origin is not None
+    folder = Path(spec.origin).parent
     bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
     return str(bundled if bundled.exists() else folder / "rerun")
 
@@ -206,6 +206,6 @@ def _copy(source: socket.socket, target: socket.socket) -> None:
     with contextlib.suppress(OSError):
         while part := source.recv(1 << 16):
             target.sendall(part)
-    for one in (source, target):
+    for stream in (source, target):
         with contextlib.suppress(OSError):
-            one.shutdown(socket.SHUT_RDWR)
+            stream.shutdown(socket.SHUT_RDWR)

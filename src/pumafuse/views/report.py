@@ -52,27 +52,29 @@ def _table(items: Iterable[T], cells: Mapping[str, Callable[[T], str]]) -> TextT
     return TextTable(list(cells), [[cell(item) for cell in cells.values()] for item in items])
 
 
-def models(found: Identification) -> TextTable:
+def models(identification: Identification) -> TextTable:
     """The combined model of each axis (the paper's Table II)."""
-    rows, screen = list[list[str]](), SCREEN[found.kind]
-    for axis, one in found.axes.items():
-        delays, plant = one.delays, one.model.plant
+    rows, screen = list[list[str]](), SCREEN[identification.kind]
+    for axis, model in identification.axes.items():
+        delays, plant = model.delays, model.model.plant
         described = formatting.plant(plant).replace(", ", "\n")
         if isinstance(plant, FirstOrder):
-            mean, robust = map(formatting.milliseconds, (one.time_constant_mean, one.time_constant_robust))
+            mean, robust = map(formatting.milliseconds, (model.time_constant_mean, model.time_constant_robust))
             described += f"\ntrials' mean {mean},\nrobust {robust} ms"
-        gain = formatting.gain(one.model.gain).replace(" + ", "\n+ ")
+        gain = formatting.gain(model.model.gain).replace(" + ", "\n+ ")
         times = map(formatting.milliseconds, (delays.lag, delays.fitted, delays.onset))
-        rows.append([axis, str(one.trials), *times, described, gain, f"{_rms(found, axis) * screen.scale:.3f}"])
-    line = f"K at speed s [{_SPEED[found.kind]}]"
+        rows.append(
+            [axis, str(model.trials), *times, described, gain, f"{_rms(identification, axis) * screen.scale:.3f}"]
+        )
+    line = f"K at speed s [{_SPEED[identification.kind]}]"
     headings = ("axis", "trials", "lag, ms", "Td, ms", "onset, ms", "plant", line, f"RMS, {screen.unit}")
     return TextTable(headings, rows)
 
 
-def dependences(found: Identification) -> TextTable:
+def dependences(identification: Identification) -> TextTable:
     """Dependence of each coefficient on each factor (the paper's Table I)."""
     return _table(
-        found.dependences,
+        identification.dependences,
         {
             "coefficient": lambda row: row.coefficient,
             "factor": lambda row: row.factor,
@@ -85,10 +87,10 @@ def dependences(found: Identification) -> TextTable:
     )
 
 
-def scatter(found: Identification) -> TextTable:
+def scatter(identification: Identification) -> TextTable:
     """Scatter of each coefficient on each axis."""
     return _table(
-        found.scatter,
+        identification.scatter,
         {
             "coefficient": lambda row: row.coefficient,
             "axis": lambda row: row.axis,
@@ -101,23 +103,25 @@ def scatter(found: Identification) -> TextTable:
     )
 
 
-def sentences(found: Identification) -> list[str]:
+def sentences(identification: Identification) -> list[str]:
     """Which lag is meant, what was decided for each axis, and which trials were left out."""
-    lines = [formatting.lag(found.arm.update_period)]
-    for axis, one in found.axes.items():
-        lines.append(f"{axis}: {one.choice.why}; {one.gain_words}")
-        if one.delay_spread > 2.0 * one.delay_noise:
-            noise = f"; the noise within a trial explains {one.delay_noise * MS:.2g} ms"
-            moves = f"the delay moves by {one.delay_spread * MS:.2g} ms (sd) from trial to trial"
-            lines.append(f"{axis}: {moves}{noise if found.method == 'fitted' else ''}")
-        lines += [f"{axis}: trial '{trial}' left out: {why}" for trial, why in one.left_out.items()]
-    return [*lines, found.one_delay]
+    lines = [formatting.lag(identification.arm.update_period)]
+    for axis, model in identification.axes.items():
+        lines.append(f"{axis}: {model.choice.why}; {model.gain_words}")
+        if model.delay_spread > 2.0 * model.delay_noise:
+            noise = f"; the noise within a trial explains {model.delay_noise * MS:.2g} ms"
+            moves = f"the delay moves by {model.delay_spread * MS:.2g} ms (sd) from trial to trial"
+            lines.append(f"{axis}: {moves}{noise if identification.method == 'fitted' else ''}")
+        lines += [f"{axis}: trial '{trial}' left out: {why}" for trial, why in model.left_out.items()]
+    return [*lines, identification.one_delay]
 
 
 def verifications(verified: Sequence[AxisVerification]) -> list[TextTable]:
     """Errors of the model on each run, axis and source (the paper's Table III), a table for each kind of axis."""
     return [
-        _verifications(of_kind, kind) for kind in KINDS if (of_kind := [one for one in verified if one.kind == kind])
+        _verifications(of_kind, kind)
+        for kind in KINDS
+        if (of_kind := [result for result in verified if result.kind == kind])
     ]
 
 
@@ -126,132 +130,138 @@ def _verifications(verified: Sequence[AxisVerification], kind: Kind) -> TextTabl
     return _table(
         verified,
         {
-            "run": lambda one: one.run,
-            "axis": lambda one: one.axis,
-            "source": lambda one: one.source,
-            f"motion, {screen.unit}": lambda one: f"{one.amplitude * screen.scale:.4g}",
-            f"error,\n{screen.unit} RMS": lambda one: f"{one.model.rms * screen.scale:.3f}",
-            "of the\nmotion": lambda one: f"{one.model.percent:.1f} %",
-            "explained": lambda one: f"{one.model.fit:.1f} %" if np.isfinite(one.model.fit) else "–",
-            "gain that\nstays": lambda one: f"{one.without_recovery.rms * screen.scale:.3f}",
-            "gain that\nrecovers": lambda one: f"{one.with_recovery.rms * screen.scale:.3f}",
-            "best\npossible": lambda one: f"{one.best_in_class.fit.rms * screen.scale:.3f}",
+            "run": lambda result: result.run,
+            "axis": lambda result: result.axis,
+            "source": lambda result: result.source,
+            f"motion, {screen.unit}": lambda result: f"{result.amplitude * screen.scale:.4g}",
+            f"error,\n{screen.unit} RMS": lambda result: f"{result.model.rms * screen.scale:.3f}",
+            "of the\nmotion": lambda result: f"{result.model.percent:.1f} %",
+            "explained": lambda result: f"{result.model.fit:.1f} %" if np.isfinite(result.model.fit) else "–",
+            "gain that\nstays": lambda result: f"{result.without_recovery.rms * screen.scale:.3f}",
+            "gain that\nrecovers": lambda result: f"{result.with_recovery.rms * screen.scale:.3f}",
+            "best\npossible": lambda result: f"{result.best_in_class.fit.rms * screen.scale:.3f}",
         },
     )
 
 
-def verdict(one: AxisVerification) -> str:
+def verdict(result: AxisVerification) -> str:
     """How far off the model is on one axis, how late the arm is here, and what the best model would be."""
-    best, screen = one.best_in_class, SCREEN[one.kind]
+    best, screen = result.best_in_class, SCREEN[result.kind]
     plant = formatting.plant(best.plant, *_PLANT)
-    left_out = f"; {one.outlying} outlying measurements are left out" if one.outlying else ""
+    left_out = f"; {result.outlying} outlying measurements are left out" if result.outlying else ""
     return (
-        f"{one.run}, {one.axis}: the model is off by {one.model.rms * screen.scale:.3f} {screen.unit} RMS,"
-        f" {one.model.percent:.1f} % of the motion; the best model of its order would be off by"
-        f" {best.fit.rms * screen.scale:.3f}: {one.verdict}; by the model the arm is {one.lag * MS:.1f} ms late,"
+        f"{result.run}, {result.axis}: the model is off by {result.model.rms * screen.scale:.3f} {screen.unit} RMS,"
+        f" {result.model.percent:.1f} % of the motion; the best model of its order would be off by"
+        f" {best.fit.rms * screen.scale:.3f}: {result.verdict}; by the model the arm is {result.lag * MS:.1f} ms late,"
         f" here it is {formatting.with_interval(best.lag, best.lag_ci95, MS)} ms; the best model has a gain of"
         f" {best.gain:.3f}, a dead time of {best.delay * MS:.1f} ms and {plant}; the start level is"
-        f" {one.start * screen.scale:g} {screen.unit} ({one.start_from}){left_out}"
+        f" {result.start * screen.scale:g} {screen.unit} ({result.start_from}){left_out}"
     )
 
 
 # ---- how late -------------------------------------------------------------------------------------------------------
 
 
-def answers(found: LatencySummary) -> list[str]:
+def answers(summary: LatencySummary) -> list[str]:
     """How late each axis and each sensor is, whether that changes, and what the motion was too poor for."""
-    lines = [f"{axis} is {formatting.between(one.lag, one.lag_ci95, MS)} ms late." for axis, one in found.axes.items()]
-    for name, one in found.sensors.items():
-        sign, word = (-1.0, "earlier") if one.latency < 0.0 else (1.0, "later")
-        low, high = sorted(sign * end for end in one.latency_ci95)
-        late = formatting.between(abs(one.latency), (low, high), MS)
+    lines = [
+        f"{axis} is {formatting.between(lag.lag, lag.lag_ci95, MS)} ms late." for axis, lag in summary.axes.items()
+    ]
+    for name, sensor in summary.sensors.items():
+        sign, word = (-1.0, "earlier") if sensor.latency < 0.0 else (1.0, "later")
+        low, high = sorted(sign * end for end in sensor.latency_ci95)
+        late = formatting.between(abs(sensor.latency), (low, high), MS)
         same = ": as late, as far as can be told" if low < 0.0 < high else ""
-        lines.append(f"{name} is {late} ms {word} than {found.sensor}{same}.")
+        lines.append(f"{name} is {late} ms {word} than {summary.sensor}{same}.")
     lines.append(
         "An axis is late behind the held command, at constant velocity; behind the commanded path it is"
-        f" {0.5 * found.update_period * MS:.3g} ms more. The stamps of {found.sensor} are taken to be right: by as much"
-        " as they are late, every axis is less late."
+        f" {0.5 * summary.update_period * MS:.3g} ms more. The stamps of {summary.sensor} are taken to be right: by as"
+        " much as they are late, every axis is less late."
     )
-    return [*lines, *_changes(found), *(f"{axis}: {note}" for axis, one in found.axes.items() for note in one.notes)]
+    return [
+        *lines,
+        *_changes(summary),
+        *(f"{axis}: {note}" for axis, lag in summary.axes.items() for note in lag.notes),
+    ]
 
 
-def _changes(found: LatencySummary) -> list[str]:
+def _changes(summary: LatencySummary) -> list[str]:
     """What is said of the lag over the run."""
     lines: list[str] = []
-    if found.clock_drift is not None:
+    if summary.clock_drift is not None:
         lines.append(
-            f"All axes together become {found.clock_drift * MS:+.1f} ms later over the run: a clock drifts, that of the"
-            f" commands or that of {found.sensor}."
+            f"All axes together become {summary.clock_drift * MS:+.1f} ms later over the run: a clock drifts, that"
+            f" of the commands or that of {summary.sensor}."
         )
-    if found.clock_wander is not None:
+    if summary.clock_wander is not None:
         lines.append(
-            f"All axes wander together by ± {found.clock_wander * MS:.1f} ms (one standard deviation): a clock, not"
+            f"All axes wander together by ± {summary.clock_wander * MS:.1f} ms (one standard deviation): a clock, not"
             " the arm."
         )
-    for axis, one in found.axes.items():
-        if one.drifts and one.drift is not None and found.clock_drift is None:
+    for axis, lag in summary.axes.items():
+        if lag.drifts and lag.drift is not None and summary.clock_drift is None:
             lines.append(
-                f"{axis} becomes {one.drift * MS:+.1f} ms later over the run"
-                f" (± {Z95 * (one.drift_sd or 0.0) * MS:.1f})."
+                f"{axis} becomes {lag.drift * MS:+.1f} ms later over the run"
+                f" (± {Z95 * (lag.drift_sd or 0.0) * MS:.1f})."
             )
-        if one.wander and found.clock_wander is None:
-            lines.append(f"The lag of {axis} wanders by ± {one.wander * MS:.1f} ms (one standard deviation).")
-    told = any(one.course for one in found.axes.values())
+        if lag.wander and summary.clock_wander is None:
+            lines.append(f"The lag of {axis} wanders by ± {lag.wander * MS:.1f} ms (one standard deviation).")
+    told = any(axis.course for axis in summary.axes.values())
     return lines or (["The lag stays the same over the run, as far as can be told."] if told else [])
 
 
-def lags(found: LatencySummary) -> TextTable:
+def lags(summary: LatencySummary) -> TextTable:
     """A row for each axis and each sensor."""
 
     def time(value: float, interval: tuple[float, float], shared: bool = False) -> str:
         return formatting.between(value, interval, MS).replace(" (", f"{' *' if shared else ''}\n(", 1)
 
     rows = list[list[str]]()
-    for axis, one in found.axes.items():
-        delay = time(one.delay, one.delay_ci95, one.shared_delay)
-        rows.append([axis, time(one.lag, one.lag_ci95), delay, _plant_of(one), _gain_of(one)])
-    rows += [[name, time(one.latency, one.latency_ci95), "", "", ""] for name, one in found.sensors.items()]
+    for axis, lag in summary.axes.items():
+        delay = time(lag.delay, lag.delay_ci95, lag.shared_delay)
+        rows.append([axis, time(lag.lag, lag.lag_ci95), delay, _plant_of(lag), _gain_of(lag)])
+    rows += [[name, time(sensor.latency, sensor.latency_ci95), "", "", ""] for name, sensor in summary.sensors.items()]
     return TextTable(("axis,\nsensor", "late, ms", "dead time, ms", "plant", "gain"), rows)
 
 
-def _plant_of(one: AxisLag) -> str:
-    lines, screen = list[str](), SCREEN[one.kind]
-    if one.time_constant is not None:
-        lines.append(f"τ {formatting.between(one.time_constant, one.time_constant_ci95, MS)} ms")
+def _plant_of(lag: AxisLag) -> str:
+    lines, screen = list[str](), SCREEN[lag.kind]
+    if lag.time_constant is not None:
+        lines.append(f"τ {formatting.between(lag.time_constant, lag.time_constant_ci95, MS)} ms")
     else:
-        lines.append(f"ω {formatting.between(one.natural_frequency or 0.0, one.natural_frequency_ci95)} rad/s")
-        lines.append(f"ζ {formatting.between(one.damping or 0.0, one.damping_ci95)}")
-    if one.play:
-        lines.append(f"play {formatting.between(one.play, one.play_ci95, screen.scale)} {screen.unit}")
-    if one.max_speed:
-        lines.append(f"up to {formatting.between(one.max_speed, one.max_speed_ci95, screen.scale)} {screen.unit}/s")
+        lines.append(f"ω {formatting.between(lag.natural_frequency or 0.0, lag.natural_frequency_ci95)} rad/s")
+        lines.append(f"ζ {formatting.between(lag.damping or 0.0, lag.damping_ci95)}")
+    if lag.play:
+        lines.append(f"play {formatting.between(lag.play, lag.play_ci95, screen.scale)} {screen.unit}")
+    if lag.max_speed:
+        lines.append(f"up to {formatting.between(lag.max_speed, lag.max_speed_ci95, screen.scale)} {screen.unit}/s")
     return "\n".join(lines)
 
 
-def _gain_of(one: AxisLag) -> str:
-    gain = "1" if one.gain_ci95 is None else formatting.between(one.gain, one.gain_ci95)
-    if one.gain_recovery is None:
+def _gain_of(lag: AxisLag) -> str:
+    gain = "1" if lag.gain_ci95 is None else formatting.between(lag.gain, lag.gain_ci95)
+    if lag.gain_recovery is None:
         return gain
-    return f"{gain}\nrecovers: {formatting.between(one.gain_recovery, one.gain_recovery_ci95, MS)} ms"
+    return f"{gain}\nrecovers: {formatting.between(lag.gain_recovery, lag.gain_recovery_ci95, MS)} ms"
 
 
-def settings(found: Latency) -> str:
+def settings(latency: Latency) -> str:
     """The lines for ``fusion.toml`` and ``arm.toml``; of a sensor what differs from the defaults."""
     lines = list[str]()
-    for name, one in found.details.sensors.items():
-        numbers = {"latency_ms": one.latency, "latency_sd_ms": one.latency_sd or 0.0, "scale": one.scale}
+    for name, sensor in latency.details.sensors.items():
+        numbers = {"latency_ms": sensor.latency, "latency_sd_ms": sensor.latency_sd or 0.0, "scale": sensor.scale}
         kept = {key: rounded(value) for key, value in numbers.items() if value != _DEFAULTS.get(key)}
         lines.append(toml.text({"sensors": {name: kept}}))
-    return "\n".join([*lines, found.config.arm.to_toml()])
+    return "\n".join([*lines, latency.config.arm.to_toml()])
 
 
-def elsewhere(found: LatencySummary) -> list[str]:
+def elsewhere(summary: LatencySummary) -> list[str]:
     """What to write for other programs, in their units."""
-    latest = max(one.lag for one in found.axes.values()) + 0.5 * found.update_period
-    ends = {axis: [end / _PHYSICS for end in one.delay_ci95] for axis, one in found.axes.items()}
+    latest = max(axis.lag for axis in summary.axes.values()) + 0.5 * summary.update_period
+    ends = {axis: [end / _PHYSICS for end in lag.delay_ci95] for axis, lag in summary.axes.items()}
     steps = ", ".join(f"{axis} {max(math.floor(low), 0)} to {math.ceil(high)}" for axis, (low, high) in ends.items())
-    plants = ", ".join(f"{axis} {max(one.lag - one.delay, 0.0):.4f}" for axis, one in found.axes.items())
-    dead = ", ".join(f"{axis} {one.delay:.4f}" for axis, one in found.axes.items())
+    plants = ", ".join(f"{axis} {max(lag.lag - lag.delay, 0.0):.4f}" for axis, lag in summary.axes.items())
+    dead = ", ".join(f"{axis} {lag.delay:.4f}" for axis, lag in summary.axes.items())
     every = f"{_PHYSICS * MS:g} ms"
     return [
         f"MoveIt Servo, max_expected_latency [s]: {latest:.3f}, of the axis that is latest",
@@ -259,21 +269,21 @@ def elsewhere(found: LatencySummary) -> list[str]:
         f"mjlab, delay_min_lag and delay_max_lag of an actuator [physics steps of {every}]: the same",
         f'MuJoCo, dynprm of dyntype="filterexact" [s]: {plants}; actuator_delay [s]: {dead}',
     ] + [
-        f"LeRobot, {name}: a frame shows what was {one.latency:.3f} s before its stamp; shift its delta_timestamps by"
-        " that, in multiples of 1/fps"
-        for name, one in found.sensors.items()
+        f"LeRobot, {name}: a frame shows what was {sensor.latency:.3f} s before its stamp; shift its delta_timestamps"
+        " by that, in multiples of 1/fps"
+        for name, sensor in summary.sensors.items()
     ]
 
 
-def write_latency(found: Latency, folder: Path, force: bool) -> None:
+def write_latency(latency: Latency, folder: Path, force: bool) -> None:
     """Write ``report.html`` with the answers, a picture of each axis, and what to write where."""
     content = {
-        "summary": found.details,
-        "answers": answers(found.details),
-        "lags": lags(found.details),
-        "figures": lag_figures(found),
-        "settings": settings(found),
-        "elsewhere": elsewhere(found.details),
+        "summary": latency.details,
+        "answers": answers(latency.details),
+        "lags": lags(latency.details),
+        "figures": lag_figures(latency),
+        "settings": settings(latency),
+        "elsewhere": elsewhere(latency.details),
     }
     _write("latency.html", content, folder, force)
 
@@ -283,34 +293,38 @@ def check_writable(folder: Path, force: bool) -> None:
     folders.check_writable(folder, force, (PAGE,), lambda name: name == PAGE)
 
 
-def write_identification(found: Identification, trials: StepTrials, folder: Path, force: bool) -> None:
+def write_identification(identification: Identification, trials: StepTrials, folder: Path, force: bool) -> None:
     """Write ``report.html`` with the paper's tables and figures of an identification."""
-    valleys, contours = step_figures.valleys(found, trials)
+    valleys, contours = step_figures.valleys(identification, trials)
     content = {
-        "found": found,
-        "rms": _rms(found) * SCREEN[found.kind].scale,
-        "unit": SCREEN[found.kind].unit,
-        "models": models(found),
-        "sentences": sentences(found),
-        "jittering": [axis for axis, one in found.axes.items() if one.delay_spread > 2.0 * one.delay_noise > 0.0],
-        "dependences": dependences(found),
-        "strongest": max(found.dependences, key=lambda row: row.i_ratio or 0.0, default=None),
-        "scatter": scatter(found),
-        "outlying": sorted({name for row in found.scatter for name in row.outlying}),
+        "found": identification,
+        "rms": _rms(identification) * SCREEN[identification.kind].scale,
+        "unit": SCREEN[identification.kind].unit,
+        "models": models(identification),
+        "sentences": sentences(identification),
+        "jittering": [
+            axis for axis, model in identification.axes.items() if model.delay_spread > 2.0 * model.delay_noise > 0.0
+        ],
+        "dependences": dependences(identification),
+        "strongest": max(identification.dependences, key=lambda row: row.i_ratio or 0.0, default=None),
+        "scatter": scatter(identification),
+        "outlying": sorted({name for row in identification.scatter for name in row.outlying}),
         "contours": contours,
-        "flat": sum("flat valley" in flag for one in found.trials for flag in one.second.flags),
-        "trials": _trials(found),
-        "flagged": sum(bool(one.first.flags or one.second.flags or one.left_out) for one in found.trials),
+        "flat": sum("flat valley" in flag for trial in identification.trials for flag in trial.second.flags),
+        "trials": _trials(identification),
+        "flagged": sum(
+            bool(trial.first.flags or trial.second.flags or trial.left_out) for trial in identification.trials
+        ),
         "figures": {
-            "responses": step_figures.responses(found, trials),
-            "delays": step_figures.delays(found),
-            "gains": step_figures.gains(found),
-            "histograms": step_figures.histograms(found),
-            "fits": step_figures.fits_by_factor(found, trials),
+            "responses": step_figures.responses(identification, trials),
+            "delays": step_figures.delays(identification),
+            "gains": step_figures.gains(identification),
+            "histograms": step_figures.histograms(identification),
+            "fits": step_figures.fits_by_factor(identification, trials),
             "valleys": valleys,
-            "performance": step_figures.performance(found),
+            "performance": step_figures.performance(identification),
         },
-        "arm": found.arm.to_toml(),
+        "arm": identification.arm.to_toml(),
     }
     _write("identification.html", content, folder, force)
 
@@ -319,35 +333,35 @@ def write_verification(
     verified: Sequence[tuple[AxisVerification, Trace]], arm: ArmModel, folder: Path, force: bool
 ) -> None:
     """Write ``report.html`` with Table III and Figs. 8 and 9."""
-    every = [one for one, _ in verified]
+    every = [result for result, _ in verified]
     content = {
         "arm": arm,
-        "runs": {one.run for one in every},
+        "runs": {result.run for result in every},
         "lag": formatting.lag(arm.update_period),
-        "worst": max(every, key=lambda one: one.model.rms / max(one.best_in_class.fit.rms, 1e-12)),
+        "worst": max(every, key=lambda result: result.model.rms / max(result.best_in_class.fit.rms, 1e-12)),
         "table_iii": verifications(every),
-        "figures": [(step_figures.verification(one, trace), verdict(one)) for one, trace in verified],
+        "figures": [(step_figures.verification(result, trace), verdict(result)) for result, trace in verified],
     }
     _write("verification.html", content, folder, force)
 
 
-def _rms(found: Identification, axis: str | None = None) -> float:
+def _rms(identification: Identification, axis: str | None = None) -> float:
     """Of the combined model over the trials that it is made of [m or rad]; of all axes for None."""
-    used = [one for one in found.trials if one.left_out is None and axis in (None, one.axis)]
-    return float(np.sqrt(np.mean([one.combined_rms**2 for one in used if one.combined_rms is not None])))
+    used = [trial for trial in identification.trials if trial.left_out is None and axis in (None, trial.axis)]
+    return float(np.sqrt(np.mean([trial.combined_rms**2 for trial in used if trial.combined_rms is not None])))
 
 
-def _trials(found: Identification) -> TextTable:
-    factors, screen = list(found.trials[0].factors), SCREEN[found.kind]
+def _trials(identification: Identification) -> TextTable:
+    factors, screen = list(identification.trials[0].factors), SCREEN[identification.kind]
     rows = [
         [
-            *(one.trial, one.axis, f"{one.step * screen.scale:g}", f"{one.speed * screen.fast_scale:.3g}"),
-            *(one.factors[name] for name in factors),
-            *_coefficients(one.first, screen),
-            *_coefficients(one.second, screen),
-            *("–" if one.combined_rms is None else f"{one.combined_rms * screen.scale:.3f}", _flags(one)),
+            *(trial.trial, trial.axis, f"{trial.step * screen.scale:g}", f"{trial.speed * screen.fast_scale:.3g}"),
+            *(trial.factors[name] for name in factors),
+            *_coefficients(trial.first, screen),
+            *_coefficients(trial.second, screen),
+            *("–" if trial.combined_rms is None else f"{trial.combined_rms * screen.scale:.3f}", _flags(trial)),
         ]
-        for one in found.trials
+        for trial in identification.trials
     ]
     rms = f"RMS, {screen.unit}"
     first = ("lag, ms", "K", "Td, ms", "τ, ms", rms)
@@ -356,19 +370,21 @@ def _trials(found: Identification) -> TextTable:
     return TextTable((*settings, *first, *second, f"combined {rms}", "flags"), rows)
 
 
-def _flags(one: TrialResult) -> str:
-    first, second = one.first.flags, one.second.flags
-    found = [] if one.left_out is None else [f"left out: {one.left_out}"]
-    found += [flag if flag in second else f"{flag} (first order)" for flag in first]
-    return "; ".join([*found, *(f"{flag} (second order)" for flag in second if flag not in first)])
+def _flags(trial: TrialResult) -> str:
+    first, second = trial.first.flags, trial.second.flags
+    flags = [] if trial.left_out is None else [f"left out: {trial.left_out}"]
+    flags += [flag if flag in second else f"{flag} (first order)" for flag in first]
+    return "; ".join([*flags, *(f"{flag} (second order)" for flag in second if flag not in first)])
 
 
 def _coefficients(fit: OrderFit, screen: Screen) -> list[str]:
     values = [(fit.lag, fit.lag_ci95, MS), (fit.gain, fit.gain_ci95, 1.0), (fit.delay, fit.delay_ci95, MS)]
     values += [(fit.time_constant, fit.time_constant_ci95, MS)]
     values += [(fit.natural_frequency, fit.natural_frequency_ci95, 1.0), (fit.damping, fit.damping_ci95, 1.0)]
-    found = [formatting.with_interval(value, ci95, unit) for value, ci95, unit in values if value is not None]
-    return [*found, f"{fit.rms * screen.scale:.3f} ({fit.rms_percent:.1f} %)"]
+    coefficients_told = [
+        formatting.with_interval(value, ci95, unit) for value, ci95, unit in values if value is not None
+    ]
+    return [*coefficients_told, f"{fit.rms * screen.scale:.3f} ({fit.rms_percent:.1f} %)"]
 
 
 def _write(template: str, content: Mapping[str, Any], folder: Path, force: bool) -> None:

@@ -135,7 +135,7 @@ def _send(est: Estimates, run: Run, sink: Sink) -> None:
 
 def _measured(est: Estimates) -> list[str]:
     """The axes that sensors give values for."""
-    return [est.measurements.axes[place] for place in np.unique(est.measurements.axis)]
+    return [est.measurements.axes[number] for number in np.unique(est.measurements.axis)]
 
 
 def _sensor(sink: Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
@@ -153,20 +153,20 @@ def _sensor(sink: Sink, est: Estimates, sensor: str, axis: str, colour: str) -> 
 
 def _outcomes(sink: Sink, est: Estimates, sensor: str) -> None:
     """Send what became of a sensor's rows: the worst of its axes, where that changes; and when it falls silent."""
-    mine = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index(sensor))
-    mine = mine.where(np.isfinite(mine.stamp))
-    if not len(mine.stamp):
+    measured = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index(sensor))
+    measured = measured.where(np.isfinite(measured.stamp))
+    if not len(measured.stamp):
         return
-    time, row = np.unique(mine.stamp, return_inverse=True)
+    time, row = np.unique(measured.stamp, return_inverse=True)
     worst = np.zeros(len(time), dtype=np.int64)
-    np.maximum.at(worst, row, np.argsort(_BY_GRAVITY)[mine.outcome])
+    np.maximum.at(worst, row, np.argsort(_BY_GRAVITY)[measured.outcome])
     gap = np.diff(time, append=np.inf)
     usual = float(np.median(gap[:-1])) if len(gap) > 1 else 0.0
     silent = gap > max(_SILENT_S, _SILENT * usual)
     begins = np.flatnonzero((np.diff(worst, prepend=-1) != 0) | np.append(False, silent[:-1]))
-    words = [*(one.word for one in _BY_GRAVITY), "silent"]
-    states = [(float(time[one]), words[int(worst[one])]) for one in begins]
-    states = sorted([*states, *((float(time[one]) + usual, "silent") for one in np.flatnonzero(silent))])
+    words = [*(outcome.word for outcome in _BY_GRAVITY), "silent"]
+    states = [(float(time[begin]), words[int(worst[begin])]) for begin in begins]
+    states = sorted([*states, *((float(time[row]) + usual, "silent") for row in np.flatnonzero(silent))])
     shades = [colours.rgb(colours.OUTCOMES.get(word, colours.COMMAND)) for word in words]
     sink.log(f"outcome/{sensor}", rr.StateConfiguration(values=words, colors=shades))
     changes = rr.StateChange.columns(state=[word for _, word in states])
@@ -196,25 +196,25 @@ def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:
             title = f"{name}: measurement − estimate [{unit}]"
             residuals[name] = _plot(f"/residual/{name}", title, whole, (-limit, limit))
     of_sensors = {"innovations": innovations, "residuals": residuals} if innovations else {}
-    aside = list[tuple[rrb.View | rrb.Container, float]]()  # with their shares of the height
+    columns_beside = list[tuple[rrb.View | rrb.Container, float]]()  # with their shares of the height
     if est.turns:
-        aside += zip(views(est, run), (5.0, 3.0), strict=False)
+        columns_beside += zip(views(est, run), (5.0, 3.0), strict=False)
     elif est.cartesian is not None or in_space(est.config.arm):
-        aside.append((rrb.Spatial3DView(origin="/path", name="path [mm]"), 3.0))
+        columns_beside.append((rrb.Spatial3DView(origin="/path", name="path [mm]"), 3.0))
     if of_sensors and not est.turns:
         tabs = (rrb.Vertical(*plots.values(), name=name) for name, plots in of_sensors.items())
-        aside.append((rrb.Tabs(*tabs), 4.0))
+        columns_beside.append((rrb.Tabs(*tabs), 4.0))
     if of_sensors:
         time = rrb.TimeAxis(view_range=_range(whole))
         outcomes = rrb.StateTimelineView(origin="/outcome", name="outcomes", time_view=time)
-        aside.append((outcomes, 0.6 + 0.4 * len(est.measurements.sensors)))
-    column = rrb.Vertical(*(view for view, _ in aside), row_shares=[share for _, share in aside])
+        columns_beside.append((outcomes, 0.6 + 0.4 * len(est.measurements.sensors)))
+    column = rrb.Vertical(*(view for view, _ in columns_beside), row_shares=[share for _, share in columns_beside])
     if est.turns:
         every = {"positions": positions} | of_sensors
         tabs = (by_kind(plots, est.config.arm.kind_of, name) for name, plots in every.items())
         return rrb.Blueprint(rrb.Horizontal(column, rrb.Tabs(*tabs), column_shares=[1, 1]), collapse_panels=True)
     grid = rrb.Grid(*positions.values(), grid_columns=1 if len(positions) < _TWO_COLUMNS else 2)
-    layout = rrb.Horizontal(grid, column, column_shares=[3, 2]) if aside else grid
+    layout = rrb.Horizontal(grid, column, column_shares=[3, 2]) if columns_beside else grid
     return rrb.Blueprint(layout, collapse_panels=True)
 
 
@@ -254,7 +254,7 @@ def _free_corner(
         return int(np.count_nonzero(beside & level))
 
     corners = (rrb.Corner2D.RightTop, rrb.Corner2D.LeftTop, rrb.Corner2D.RightBottom, rrb.Corner2D.LeftBottom)
-    return min(product(spans, corners), key=lambda one: covered(*one))
+    return min(product(spans, corners), key=lambda corner: covered(*corner))
 
 
 def _span(position: FloatArray, screen: Screen) -> tuple[float, float]:
@@ -267,5 +267,5 @@ def _span(position: FloatArray, screen: Screen) -> tuple[float, float]:
 def _residual_span(est: Estimates, axis: str) -> float:
     """The limit of a plot of measurements less the estimate, in the unit of the screen: far outliers are left out."""
     sds = [est.measurements.of(sensor, axis).innovation_sd for sensor in est.measurements.sensors]
-    known = [float(np.median(one[np.isfinite(one)])) for one in sds if np.isfinite(one).any()]
-    return 4.0 * max(known, default=1e-3) * est.config.arm.screen_of(axis).scale
+    medians = [float(np.median(sd[np.isfinite(sd)])) for sd in sds if np.isfinite(sd).any()]
+    return 4.0 * max(medians, default=1e-3) * est.config.arm.screen_of(axis).scale

@@ -63,8 +63,8 @@ def send_scene(sink: Sink, est: Estimates, run: Run) -> None:
         centre = np.mean(pose.position, axis=0)
         for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
             _measured(sink, est, sensor, colour)
-            if known := est.config.sensors.get(sensor):
-                send_placed(sink, sensor, known, colour, centre, length)
+            if configured := est.config.sensors.get(sensor):
+                send_placed(sink, sensor, configured, colour, centre, length)
     else:
         style = rr.Points3D.from_fields(colors=[colours.rgb(colours.REJECTED)], radii=[-5.0])
         sink.log("path/tool", style)
@@ -74,7 +74,7 @@ def send_scene(sink: Sink, est: Estimates, run: Run) -> None:
 def views(est: Estimates, run: Run) -> list[rrb.Spatial3DView]:
     """Of the path of a tool that turns, and of the cell with the sensors and the robot."""
     path, larger = est.pose.position, _enlargement(est)
-    frames = [known.frame for name in est.measurements.sensors if (known := est.config.sensors.get(name))]
+    frames = [configured.frame for name in est.measurements.sensors if (configured := est.config.sensors.get(name))]
     links = None if run.command.joints is None else _links(run.command, run.command.joints)[1].reshape(-1, 3)
     return two_views("tool", larger, _eye(path), cell_eye(path, frames, links))
 
@@ -85,10 +85,12 @@ def two_views(
     """Views of a scene in mm: of the tool from near by, and below it of the cell, if there is an eye for that."""
     name = f"{name} [mm]; where it is with 95 %" + (f", {larger:.0f} times as large" if larger > 1.0 else "")
     without_sensors, without_markers = (["$origin/**", f"- /path/{other}/**"] for other in ("sensors", "tool/markers"))
-    found = [rrb.Spatial3DView(origin="/path", contents=without_sensors, name=name, eye_controls=near)]
+    two_views = [rrb.Spatial3DView(origin="/path", contents=without_sensors, name=name, eye_controls=near)]
     if cell is not None:
-        found.append(rrb.Spatial3DView(origin="/path", contents=without_markers, name="cell [mm]", eye_controls=cell))
-    return found
+        two_views.append(
+            rrb.Spatial3DView(origin="/path", contents=without_markers, name="cell [mm]", eye_controls=cell)
+        )
+    return two_views
 
 
 def by_kind(plots: Mapping[str, rrb.View], kinds: Mapping[str, Kind], name: str) -> rrb.Container:
@@ -101,8 +103,8 @@ def _eye(points: FloatArray) -> rrb.EyeControls3D:
     """An eye that sees all of the points [m], (n, 3)."""
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-    place = centre + _FAR * radius * _FROM / np.linalg.norm(_FROM)
-    return rrb.EyeControls3D(position=place * MM, look_target=centre * MM, eye_up=[0.0, 0.0, 1.0])
+    eye = centre + _FAR * radius * _FROM / np.linalg.norm(_FROM)
+    return rrb.EyeControls3D(position=eye * MM, look_target=centre * MM, eye_up=[0.0, 0.0, 1.0])
 
 
 def cell_eye(
@@ -168,22 +170,22 @@ def _links(command: Source, joints: Joints) -> tuple[TimeArray, FloatArray]:
     rows = np.flatnonzero(command.stamp != NO_STAMP)
     rows = rows[:: max(1, len(rows) // _ROBOT_POSES)]
     links = joints.chain.frames(joints.values[rows])[:, :, :3, 3]
-    known = np.isfinite(links).all(axis=(1, 2))
-    return command.stamp[rows[known]], links[known]
+    is_known = np.isfinite(links).all(axis=(1, 2))
+    return command.stamp[rows[is_known]], links[is_known]
 
 
 def _measured(sink: Sink, est: Estimates, sensor: str, colour: str) -> None:
     """Send where the measurements of a sensor put the tool."""
     axes = CARTESIAN if est.placed is None else ("tangential", "radial", "vertical")
     parts = [est.measured_positions(sensor, axis) for axis in axes]
-    rows = in_all([np.where(np.isfinite(one.value), one.stamp, np.nan) for one in parts])
+    rows = in_all([np.where(np.isfinite(part.value), part.stamp, np.nan) for part in parts])
     rows = [row[:: max(1, len(row) // _PATH_POINTS)] for row in rows]
     if not len(rows[0]):
         return
-    value = [one.value[row] for one, row in zip(parts, rows, strict=True)]
+    value = [part.value[row] for part, row in zip(parts, rows, strict=True)]
     if est.placed is not None:
         value[:2] = est.placed.to_log(value[0], value[1])
-    outcome = np.stack([one.outcome[row] for one, row in zip(parts, rows, strict=True)])
+    outcome = np.stack([part.outcome[row] for part, row in zip(parts, rows, strict=True)])
     rejected = (outcome == Outcome.REJECTED).any(axis=0)
     sink.log(measured(sensor), seen(_points(value) * sink.scale, rejected, colour))
 
@@ -215,10 +217,10 @@ def send_placed(sink: Sink, name: str, sensor: Sensor, colour: str, tool: FloatA
         _frame(sink, f"path/tool/markers/{name}", sensor.marker, _OF_MARKER * length, colour, name)
 
 
-def _frame(sink: Sink, path: str, place: Placement, length: float, colour: str, label: str) -> None:
+def _frame(sink: Sink, path: str, placement: Placement, length: float, colour: str, label: str) -> None:
     """Send a frame within that of the entity above it: its axes, and its name at their origin."""
-    turned = rotations.of_vectors(np.array([place.rotation]))[0]
-    sink.log(path, rr.Transform3D(translation=np.array(place.at) * sink.scale, quaternion=turned))
+    turned = rotations.of_vectors(np.array([placement.rotation]))[0]
+    sink.log(path, rr.Transform3D(translation=np.array(placement.at) * sink.scale, quaternion=turned))
     sink.log(path, rr.TransformAxes3D(length * sink.scale))
     sink.log(path, rr.Points3D([0.0, 0.0, 0.0], colors=[colours.rgb(colour)], radii=[-4.0], labels=label))
 
@@ -233,6 +235,6 @@ def _strip(sink: Sink, path: str, points: FloatArray, colour: str, radius: float
 
 def _points(coordinates: list[FloatArray]) -> FloatArray:
     """Positions in space of two or three coordinates, (n, 3)."""
-    found = np.zeros((len(coordinates[0]), 3))
-    found[:, : len(coordinates)] = np.column_stack(coordinates)
-    return found
+    points = np.zeros((len(coordinates[0]), 3))
+    points[:, : len(coordinates)] = np.column_stack(coordinates)
+    return points

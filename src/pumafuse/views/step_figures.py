@@ -22,17 +22,17 @@ _GRID = 40  # points each way of a contour plot
 _SPREAD = 4.0  # factor by which it reaches above and below ω and ζ
 
 
-def responses(found: Identification, trials: StepTrials) -> str:
+def responses(identification: Identification, trials: StepTrials) -> str:
     """Every trial over its own gain, from its own delay on, beside the combined plant."""
-    measured = {trial.name: trial.cut(found.samples) for trial in trials.trials}
+    measured = {trial.name: trial.cut(identification.samples) for trial in trials.trials}
 
     def draw(axes: Axes, axis: str) -> None:
-        plant, longest = found.axes[axis].model.plant, 0.0
-        for one in found.trials:
-            if one.axis != axis or one.common_delay is None or not one.common_gain:
+        plant, longest = identification.axes[axis].model.plant, 0.0
+        for trial in identification.trials:
+            if trial.axis != axis or trial.common_delay is None or not trial.common_gain:
                 continue
-            t, height = measured[one.trial].time - one.common_delay, one.common_gain * one.step
-            position = measured[one.trial].position
+            t, height = measured[trial.trial].time - trial.common_delay, trial.common_gain * trial.step
+            position = measured[trial.trial].position
             zero = float(np.mean(position - height * plant.step_response(t)))
             axes.plot(t * MS, (position - zero) / height, color=colours.BAND, lw=0.6, alpha=0.7)
             longest = max(longest, float(t[-1]))
@@ -40,40 +40,44 @@ def responses(found: Identification, trials: StepTrials) -> str:
         axes.plot(t * MS, plant.step_response(t), color=colours.REFERENCE, lw=1.4)
         axes.set_ylim(-0.15, 1.3)
 
-    return _panels(found.axes, draw, "share of the final value", "time since the trial's own delay [ms]")
+    return _panels(identification.axes, draw, "share of the final value", "time since the trial's own delay [ms]")
 
 
-def delays(found: Identification) -> str:
+def delays(identification: Identification) -> str:
     """Td of each trial in the order of the campaign."""
 
     def draw(axes: Axes, axis: str) -> None:
-        values = [one.common_delay for one in found.trials if one.axis == axis and one.common_delay is not None]
+        values = [
+            trial.common_delay
+            for trial in identification.trials
+            if trial.axis == axis and trial.common_delay is not None
+        ]
         axes.plot(np.arange(1, len(values) + 1), np.array(values) * MS, ".", color=colours.ESTIMATE, ms=4)
-        fitted = found.axes[axis].delays.fitted
+        fitted = identification.axes[axis].delays.fitted
         axes.axhline(fitted.value * MS, color=colours.REFERENCE, lw=1.0)
         axes.axhspan(fitted.ci95[0] * MS, fitted.ci95[1] * MS, color=colours.ESTIMATE, alpha=0.2, lw=0)
 
-    return _panels(found.axes, draw, "delay [ms]", "trial, in the order of the list")
+    return _panels(identification.axes, draw, "delay [ms]", "trial, in the order of the list")
 
 
-def gains(found: Identification) -> str:
+def gains(identification: Identification) -> str:
     """K of each trial against speed, with the line."""
-    screen = SCREEN[found.kind]
+    screen = SCREEN[identification.kind]
 
     def draw(axes: Axes, axis: str) -> None:
-        used = [one for one in found.trials if one.axis == axis and one.common_gain is not None]
-        speed = np.array([one.speed for one in used])
-        gain = [one.common_gain or np.nan for one in used]
+        used = [trial for trial in identification.trials if trial.axis == axis and trial.common_gain is not None]
+        speed = np.array([trial.speed for trial in used])
+        gain = [trial.common_gain or np.nan for trial in used]
         axes.plot(speed * screen.fast_scale, gain, ".", color=colours.ESTIMATE, ms=4)
         at = np.linspace(0.0, 1.05 * float(speed.max()), 50)
-        axes.plot(at * screen.fast_scale, found.axes[axis].model.gain.at(at), color=colours.REFERENCE, lw=1.0)
+        axes.plot(at * screen.fast_scale, identification.axes[axis].model.gain.at(at), color=colours.REFERENCE, lw=1.0)
 
-    return _panels(found.axes, draw, "gain K", f"speed [{screen.fast}]")
+    return _panels(identification.axes, draw, "gain K", f"speed [{screen.fast}]")
 
 
-def histograms(found: Identification) -> str:
+def histograms(identification: Identification) -> str:
     """Delay, gain and τ of first-order fits (the paper's Fig. 5)."""
-    used = [one.first for one in found.trials if one.left_out is None]
+    used = [trial.first for trial in identification.trials if trial.left_out is None]
     columns = {
         "delay [ms]": [fit.delay * MS for fit in used],
         "gain": [fit.gain for fit in used],
@@ -87,20 +91,20 @@ def histograms(found: Identification) -> str:
     return _panels(columns, draw, "trials")
 
 
-def fits_by_factor(found: Identification, trials: StepTrials) -> str:
+def fits_by_factor(identification: Identification, trials: StepTrials) -> str:
     """RMS of both orders by each factor, with two standard deviations (the paper's Fig. 6); empty without factors."""
-    used = [one for one in found.trials if one.left_out is None]
-    names = {one.trial for one in used}
-    period, screen = found.arm.update_period, SCREEN[found.kind]
-    factors = factors_of([trial for trial in trials.trials if trial.name in names], period, found.kind)
+    used = [trial for trial in identification.trials if trial.left_out is None]
+    names = {trial.trial for trial in used}
+    period, screen = identification.arm.update_period, SCREEN[identification.kind]
+    factors = factors_of([trial for trial in trials.trials if trial.name in names], period, identification.kind)
     orders = {
-        "first order": (np.array([one.first.rms for one in used]) * screen.scale, colours.COMMAND, -0.15),
-        "second order": (np.array([one.second.rms for one in used]) * screen.scale, colours.ESTIMATE, 0.15),
+        "first order": (np.array([trial.first.rms for trial in used]) * screen.scale, colours.COMMAND, -0.15),
+        "second order": (np.array([trial.second.rms for trial in used]) * screen.scale, colours.ESTIMATE, 0.15),
     }
 
     def draw(axes: Axes, factor: str) -> None:
-        for order, (rms, colour, aside) in orders.items():
-            _levels(axes, levels_of(rms, factors[factor]), colour, order, aside)
+        for order, (rms, colour, offset) in orders.items():
+            _levels(axes, levels_of(rms, factors[factor]), colour, order, offset)
         axes.set_ylim(bottom=0.0)
         if factor == next(iter(factors)):
             axes.legend(frameon=False)
@@ -108,10 +112,13 @@ def fits_by_factor(found: Identification, trials: StepTrials) -> str:
     return _panels(factors, draw, f"RMS of each trial's own fit [{screen.unit}]")
 
 
-def performance(found: Identification) -> str:
+def performance(identification: Identification) -> str:
     """RMS of the combined model by each factor (the paper's Fig. 7); empty without factors."""
-    levels, screen = {one.factor: one.levels for one in found.performance}, SCREEN[found.kind]
-    tolerance = found.tolerance * screen.scale
+    levels, screen = (
+        {performance.factor: performance.levels for performance in identification.performance},
+        SCREEN[identification.kind],
+    )
+    tolerance = identification.tolerance * screen.scale
 
     def draw(axes: Axes, factor: str) -> None:
         _levels(axes, levels[factor], colours.ESTIMATE, "combined model", 0.0)
@@ -123,25 +130,25 @@ def performance(found: Identification) -> str:
     return _panels(levels, draw, f"RMS of the combined model [{screen.unit}]")
 
 
-def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
+def valleys(identification: Identification, trials: StepTrials) -> tuple[str, list[str]]:
     """RMS over ω and ζ of one trial of each axis (the paper's Fig. 4), and which trials those are.
 
     The trial is the one whose ω is known worst, so that a long flat valley shows where there is any.
     """
-    measured = {trial.name: trial.cut(found.samples) for trial in trials.trials}
+    measured = {trial.name: trial.cut(identification.samples) for trial in trials.trials}
 
-    def width(one: TrialResult) -> float:
-        low, high = one.second.natural_frequency_ci95 or (1.0, np.inf)
+    def width(trial: TrialResult) -> float:
+        low, high = trial.second.natural_frequency_ci95 or (1.0, np.inf)
         return high / max(low, 1e-9)
 
-    every = [one for one in found.trials if one.left_out is None]
-    chosen = [max((one for one in every if one.axis == axis), key=width) for axis in found.axes]
-    named = {f"{one.axis}, trial {one.trial}": one for one in chosen}
+    every = [trial for trial in identification.trials if trial.left_out is None]
+    chosen = [max((trial for trial in every if trial.axis == axis), key=width) for axis in identification.axes]
+    named = {f"{trial.axis}, trial {trial.trial}": trial for trial in chosen}
 
     def draw(axes: Axes, name: str) -> None:
         _valley(axes, named[name], measured[named[name].trial])
 
-    return _panels(named, draw, "damping ζ", "natural frequency ω [rad/s]"), [one.trial for one in chosen]
+    return _panels(named, draw, "damping ζ", "natural frequency ω [rad/s]"), [trial.trial for trial in chosen]
 
 
 def verification(verified: AxisVerification, trace: Trace) -> str:
@@ -174,8 +181,8 @@ def _panels(names: Iterable[str], draw: Callable[[Axes, str], None], ylabel: str
         return svg(figure)
 
 
-def _valley(axes: Axes, one: TrialResult, trial: Trial) -> None:
-    fit = one.second
+def _valley(axes: Axes, result: TrialResult, trial: Trial) -> None:
+    fit = result.second
     omega, zeta = fit.natural_frequency or 1.0, fit.damping or 1.0
     omega, zeta = (omega, zeta) if zeta < 5.0 else (omega * 5.0 / zeta, 5.0)  # the valley runs off to infinity
     across = np.geomspace(omega / _SPREAD, omega * _SPREAD, _GRID)
@@ -200,9 +207,9 @@ def _valley(axes: Axes, one: TrialResult, trial: Trial) -> None:
     axes.set_ylim(up[0], up[-1])
 
 
-def _levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, aside: float) -> None:
+def _levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, offset: float) -> None:
     """Means with bars of two standard deviations, one for each level."""
-    at = np.arange(len(levels)) + aside
+    at = np.arange(len(levels)) + offset
     bars = [2.0 * (level.sd or 0.0) for level in levels]
     axes.errorbar(
         at, [level.mean for level in levels], bars, fmt="o", ms=4, capsize=3, color=colour, lw=1.0, label=label

@@ -69,9 +69,9 @@ class Sink:
         self, path: str, style: Style, time: FloatArray, value: FloatArray, screen: Screen | None = None
     ) -> None:
         """Send the finite values of an entity, with a screen from SI."""
-        there = np.isfinite(time) & np.isfinite(value)
+        is_known = np.isfinite(time) & np.isfinite(value)
         scale = 1.0 if screen is None else screen.scale
-        self._send(path, style, time[there], rr.Scalars.columns(scalars=value[there] * scale))
+        self._send(path, style, time[is_known], rr.Scalars.columns(scalars=value[is_known] * scale))
 
     def band(self, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, screen: Screen) -> None:
         """Send values [SI] with their variances: a line with a translucent band of a standard deviation each way."""

@@ -33,21 +33,25 @@ _SMOOTH = 100  # points of a profile's curve
 _DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number before
 
 
-def page(found: Tuning, runs: Sequence[Run]) -> str:
+def page(tuning: Tuning, runs: Sequence[Run]) -> str:
     """The text of ``report.html``: the fitted parameters, their intervals, and the validation."""
-    summary = found.details
-    fitted = {one.key: one for one in summary.parameters}
-    before, after = (fused(runs[0], config) for config in (found.before, found.config))
+    summary = tuning.details
+    fitted = {parameter.key: parameter for parameter in summary.parameters}
+    before, after = (fused(runs[0], config) for config in (tuning.before, tuning.config))
     pairs = [(sensor, axis) for axis in after.axes for sensor in after.measurements.sensors]
     tests = {pair: (consistency(before, *pair), consistency(after, *pair)) for pair in pairs}
     tests = {pair: both for pair, both in tests.items() if any(both)}
-    intervals = found.conf_int()
-    known = [(one.before, *intervals[one.key]) for one in summary.parameters if one.before is not None]
-    validated = [one.axis for one in summary.validation or ()]
+    intervals = tuning.conf_int()
+    configured = [
+        (parameter.before, *intervals[parameter.key])
+        for parameter in summary.parameters
+        if parameter.before is not None
+    ]
+    validated = [check.axis for check in summary.validation or ()]
     content = {
         "answer": _answer(summary),
         "axes": [_axis(summary, axis) for axis in dict.fromkeys([*summary.lags, *validated])],
-        "predicted": any(one.after.rmse is None for one in summary.validation or ()),
+        "predicted": any(check.after.rmse is None for check in summary.validation or ()),
         "tuning": summary,
         "notes": [
             *summary.notes,
@@ -55,22 +59,22 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
             *map(formatting.together, summary.correlations),
             *formatting.chosen(summary.orders),
         ],
-        "lag_words": formatting.lag(found.config.arm.update_period),
+        "lag_words": formatting.lag(tuning.config.arm.update_period),
         "fitted": formatting.fitted(summary),
-        "config": found.config,
-        "known": known,
-        "outside": sum(not low <= value <= high for value, low, high in known),
-        "zero": sum(one.value == 0.0 for one in summary.parameters),
-        "open": not summary.interrupted and any(None in one.ci95 for one in summary.parameters),
-        "two_maxima": [one.key for one in found.profiles if one.bimodal],
-        "profiles": profile_figure(found.profiles, fitted) if found.profiles else None,
-        "validation": [(formatting.validated(one), one) for one in summary.validation or ()],
+        "config": tuning.config,
+        "known": configured,
+        "outside": sum(not low <= value <= high for value, low, high in configured),
+        "zero": sum(parameter.value == 0.0 for parameter in summary.parameters),
+        "open": not summary.interrupted and any(None in parameter.ci95 for parameter in summary.parameters),
+        "two_maxima": [profile.key for profile in tuning.profiles if profile.bimodal],
+        "profiles": profile_figure(tuning.profiles, fitted) if tuning.profiles else None,
+        "validation": [(formatting.validated(check), check) for check in summary.validation or ()],
         "innovations": [
             (innovation_figure(before, after, *pair, both), _sentence(*pair, both)) for pair, both in tests.items()
         ],
         "nearer": sum(abs(np.log(new.nis)) < abs(np.log(old.nis)) for old, new in tests.values() if old and new),
         "white": [
-            sum(one is not None and one.whiteness > _WHITE for one in some)
+            sum(test is not None and test.whiteness > _WHITE for test in some)
             for some in zip(*tests.values(), strict=True)
         ],
         "white_p": _WHITE,
@@ -82,19 +86,19 @@ def _answer(summary: TuningSummary) -> str:
     """What the tuning is good for, in a sentence or two."""
     checks = summary.validation
     if not checks:
-        gain = sum(one.after - one.before for one in summary.likelihood.values())
+        gain = sum(likelihood.after - likelihood.before for likelihood in summary.likelihood.values())
         return f"Not validated: the log-likelihood of what it was fitted on rose by {gain:.1f}."
-    better, worse = ([one for one in checks if one.change == change] for change in ("better", "worse"))
-    holding = sum(one.holds for one in checks)
+    better, worse = ([check for check in checks if check.change == change] for change in ("better", "worse"))
+    holding = sum(check.holds for check in checks)
     axes = "axis" if len(checks) == 1 else "axes"
-    found = f"Better on {len(better)} of {len(checks)} {axes}, on measurements that nothing had been fitted on"
-    found += f", worse on {len(worse)}" if worse else ""
-    return f"{found}. The error bars hold on {holding} of {len(checks)}."
+    answer = f"Better on {len(better)} of {len(checks)} {axes}, on measurements that nothing had been fitted on"
+    answer += f", worse on {len(worse)}" if worse else ""
+    return f"{answer}. The error bars hold on {holding} of {len(checks)}."
 
 
 def _axis(summary: TuningSummary, axis: str) -> Mapping[str, Any]:
     """An axis's error and lag before and after, and what the validation says."""
-    check = next((one for one in summary.validation or () if one.axis == axis), None)
+    check = next((check for check in summary.validation or () if check.axis == axis), None)
     error, verdict, late = "–", "not validated", "–"
     if check is not None:
         pair = (check.before, check.after)
@@ -102,12 +106,12 @@ def _axis(summary: TuningSummary, axis: str) -> Mapping[str, Any]:
         if verdict == "better" and not check.holds:
             verdict = "better, but its error bars do not hold"
         if check.after.rmse is not None:
-            error = formatting.change_of_positions([one.rmse for one in pair], check.kind)
+            error = formatting.change_of_positions([state.rmse for state in pair], check.kind)
         else:
             skills = {
-                name: [getattr(one.sensors.get(name), "skill", None) for one in pair]
-                for name, one in check.after.sensors.items()
-                if one.skill is not None
+                name: [getattr(state.sensors.get(name), "skill", None) for state in pair]
+                for name, sensor in check.after.sensors.items()
+                if sensor.skill is not None
             }
             error = "; ".join(f"{name} {formatting.change(both, '.2f')}" for name, both in skills.items()) or "–"
     if lag := summary.lags.get(axis):
@@ -118,20 +122,20 @@ def _axis(summary: TuningSummary, axis: str) -> Mapping[str, Any]:
 
 def _sentence(sensor: str, axis: str, tests: _Pair) -> str:
     """NIS and whiteness of one sensor on one axis, before and after."""
-    nis = formatting.change([None if one is None else one.nis for one in tests], ".2f")
-    white = " → ".join("–" if one is None else formatting.p_value(one.whiteness) for one in tests)
+    nis = formatting.change([None if test is None else test.nis for test in tests], ".2f")
+    white = " → ".join("–" if test is None else formatting.p_value(test.whiteness) for test in tests)
     after = tests[1]
     expected = "" if after is None else f" (expected {after.nis_band[0]:.2f} to {after.nis_band[1]:.2f})"
     return f"{axis}, {sensor}: NIS {nis}{expected}; whiteness p {white}."
 
 
-def profile_figure(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> Markup:
+def profile_figure(profiles: Sequence[Profile], fitted: Mapping[str, Fitted]) -> Markup:
     """Draw the log-likelihood along each parameter, with its 95 % interval and its value before, as SVG text."""
-    rows = -(-len(found) // _COLUMNS)
+    rows = -(-len(profiles) // _COLUMNS)
     with drawing(_COLUMNS, rows, width=_WIDTH, height=1.95) as figure:
-        for axes, one in zip(figure.axes, found, strict=False):
-            _profile(axes, one, fitted[one.key])
-        for axes in figure.axes[len(found) :]:
+        for axes, profile in zip(figure.axes, profiles, strict=False):
+            _profile(axes, profile, fitted[profile.key])
+        for axes in figure.axes[len(profiles) :]:
             axes.set_visible(False)
         for axes in figure.axes[::_COLUMNS]:
             axes.set_ylabel("log-likelihood")
@@ -158,39 +162,39 @@ def innovation_figure(before: Estimates, after: Estimates, sensor: str, axis: st
         return svg(figure)
 
 
-def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
-    low, high = float(one.values[0]), float(one.values[-1])
-    if one.log:
+def _profile(axes: Axes, profile: Profile, fitted: Fitted) -> None:
+    low, high = float(profile.values[0]), float(profile.values[-1])
+    if profile.log:
         axes.set_xscale("log")
     axes.set_xlim(low, high)
-    axes.set_ylim(_DEEPEST, max(0.5, 1.1 * float(one.drop.max())))
+    axes.set_ylim(_DEEPEST, max(0.5, 1.1 * float(profile.drop.max())))
     ends = [edge if end is None else end for end, edge in zip(fitted.ci95, (low, high), strict=True)]
     axes.axvspan(*ends, color=colours.ESTIMATE, alpha=0.15, lw=0)
     axes.axhline(-0.5 * Z95**2, color=colours.COMMAND, lw=0.8, ls="--")
-    axes.plot(*_smooth(one), color=colours.ESTIMATE, lw=1.2)
+    axes.plot(*_smooth(profile), color=colours.ESTIMATE, lw=1.2)
     before = fitted.before
     if before is not None and low <= before <= high:
         axes.plot([before, before], [_DEEPEST, -5.0], color=colours.REJECTED, lw=1.6)
     elif before is not None:
         at, side, text = (0.02, "left", f"← {before:.4g}") if before < low else (0.98, "right", f"{before:.4g} →")
         axes.text(at, 0.02, text, transform=axes.transAxes, ha=side, va="bottom", fontsize=8, color=colours.REJECTED)
-    wide = one.log and high > _WITHIN_REACH * low
+    wide = profile.log and high > _WITHIN_REACH * low
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)) if wide else MaxNLocator(3))
     axes.xaxis.set_major_formatter(FormatStrFormatter("%.4g"))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_locator(FixedLocator([-4.0, -2.0, 0.0]))
     axes.tick_params(labelsize=8)
-    parts = one.key.split(".")
+    parts = profile.key.split(".")
     axes.set_title("\n".join(_cut(".".join(half)) for half in (parts[:2], parts[2:])), loc="left", fontsize=8)
 
 
-def _smooth(one: Profile) -> tuple[FloatArray, FloatArray]:
+def _smooth(profile: Profile) -> tuple[FloatArray, FloatArray]:
     """A curve through a profile's points: the root of its drop is nearly a straight line."""
-    peak = int(np.argmax(one.drop))
-    root: FloatArray = np.sqrt(one.drop[peak] - one.drop) * np.sign(np.arange(len(one.drop)) - peak)
-    places: FloatArray = np.log(one.values) if one.log else one.values
+    peak = int(np.argmax(profile.drop))
+    root: FloatArray = np.sqrt(profile.drop[peak] - profile.drop) * np.sign(np.arange(len(profile.drop)) - peak)
+    places: FloatArray = np.log(profile.values) if profile.log else profile.values
     at = np.linspace(float(places[0]), float(places[-1]), _SMOOTH)
-    return np.exp(at) if one.log else at, one.drop[peak] - np.interp(at, places, root) ** 2
+    return np.exp(at) if profile.log else at, profile.drop[peak] - np.interp(at, places, root) ** 2
 
 
 def _cut(text: str) -> str:
