@@ -196,6 +196,13 @@ def test_what_cannot_be_read_says_how_to_convert_it(tmp_path: Path, monkeypatch:
     assert "pip install 'pumafuse[formats]'" in refusal("later.xlsx")
 
 
+def test_objects_beside_arrays_are_named_and_not_loaded(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    objects = np.array([{"tool": 1}, None], dtype=object)
+    np.savez(tmp_path / "log.npz", seen=TIME, about=objects)
+    assert tables.read(tmp_path / "log.npz").plain("seen")[0].tolist() == TIME.tolist()
+    assert ["log.npz: about: objects of Python" in str(one.message) for one in recwarn] == [True]
+
+
 def test_a_file_is_read_again_when_it_was_written_again(tmp_path: Path) -> None:
     assert len(formats.names(npz(tmp_path))) == 2
     np.savez(tmp_path / "log.npz", time_s=TIME)

@@ -114,8 +114,22 @@ def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
         value = _matlab(path, file)
     else:
         loaded: Any = np.load(file, allow_pickle=False)
-        value = dict(loaded) if path.suffix == ".npz" else loaded
+        value = _of_numbers(path, loaded) if path.suffix == ".npz" else loaded
     return _of_value(value)
+
+
+def _of_numbers(path: Path, loaded: Mapping[str, npt.NDArray[Any]]) -> Arrays:
+    """The arrays of a file without those of objects, which are named."""
+    found, objects = Arrays(), list[str]()
+    for name in loaded:
+        try:
+            found[name] = loaded[name]
+        except ValueError:
+            objects.append(name)
+    if objects:
+        what = f"{path.name}: {', '.join(objects)}: objects of Python, which are not loaded, as they may run code"
+        warn([f"{what}; save arrays of numbers"])
+    return found
 
 
 def _loaded(folder: Path) -> Arrays:
