@@ -1730,3 +1730,21 @@ def test_what_is_asked_about_a_sensor_is_not_sure(late: float, tmp_path: Path) -
     (sure,) = [sure for what, _, sure in decisions(found) if what == "actual follows"]
     assert sure == ("sure" if late > 0.0 else "a question")
     assert any("ahead of the commands on x" in one for one in asked(found)) is (late < 0.0)
+def test_many_axes_are_matched_by_what_follows_the_words_that_all_share(tmp_path: Path) -> None:
+    """Of 24 joints, too many to compare each with each by their motion; with a word before those of one source."""
+    rng, t = np.random.default_rng(6), 0.02 * np.arange(500)
+    joints = [f"{part}_{side}" for part in ("hip", "knee", "ankle", "toe", "jaw", "hand") for side in "abcd"]
+    speed, phase = rng.uniform(0.4, 1.5, 24), rng.uniform(0.0, 6.0, 24)
+
+    def at(t: FloatArray) -> FloatArray:
+        return 0.4 * np.sin(t[:, None] * speed + phase)
+
+    seen = at(t - LAG) + rng.normal(scale=1e-4, size=(500, 24))
+    columns = {f"wanted_rover_{joint}": values for joint, values in zip(joints, at(t).T, strict=True)}
+    columns |= {f"encoder_{joint}": values for joint, values in zip(joints[::-1], seen.T[::-1], strict=True)}
+    write(tmp_path / "log.csv", {"t_s": t, **columns})
+    found = survey(tmp_path / "log.csv")
+    assert [axis for _, axis in found.relations] == [f"rover_{joint}" for joint in joints]
+    assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.005)] * 24
+
+

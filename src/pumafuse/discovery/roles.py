@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from itertools import count, permutations, product
+from itertools import count, permutations, product, takewhile
 from typing import TypeAlias
 
 import numpy as np
@@ -624,23 +624,30 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     """Axes of a stream by the names that the commands give them, by name or else by how they move; or why none is."""
     fits = {axis: signals for axis, signals in stream.axes.items() if axis in command.axes}
     fits = {axis: signals for axis, signals in fits.items() if _same_kind(command, axis, stream, axis)}
-    few = len(command.axes) * len(stream.axes) <= _MOST_PAIRS
-    others = [own for own in stream.axes if few and own not in fits and own not in command.axes]
-    pairs = {
-        (own, axis): abs(one.correlation)
+    few, told, seen = len(command.axes) * len(stream.axes) <= _MOST_PAIRS, _bare(command.axes), _bare(stream.axes)
+    others = [own for own in stream.axes if own not in fits and own not in command.axes]
+    alike = [
+        (own, axis)
         for own, axis in product(others, [axis for axis in command.axes if axis not in fits])
-        if _same_kind(command, axis, stream, own) and (one := _relation(command, axis, stream, own)) is not None
+        if (few or seen[own] == told[axis]) and _same_kind(command, axis, stream, own)
+    ]
+    pairs = {
+        pair: abs(one.correlation)
+        for pair in alike
+        if (one := _relation(command, pair[1], stream, pair[0])) is not None
     }
     points = [own for own in others if own in CARTESIAN]
     pairs = {pair: one for pair, one in pairs.items() if one >= _OF_POINT or len(points) < 2 or pair[0] not in points}
-    named = {pair for pair in pairs if pair[0].rpartition("_")[2] == pair[1]}  # p_RS_R_x is x, if that moves alike
+    named = {(own, axis) for own, axis in pairs if axis in (seen[own], own.rpartition("_")[2])}  # as p_RS_R_x is x
     for own, axis in sorted(pairs, key=lambda pair: (pair in named, pairs[pair]), reverse=True):
         if pairs[own, axis] >= _SAME and axis not in fits and own in others:
             fits[axis] = stream.axes[own]
             others.remove(own)
     if fits or not pairs:
         kinds = sorted({AN[stream.kind(axis)] for axis in stream.axes})
-        return fits, f"none of the commands that were taken is {' or '.join(kinds)}, as {', '.join(stream.axes)} are"
+        none = f"none of the commands that were taken is {' or '.join(kinds)}, as {', '.join(stream.axes)} are"
+        many = f"no axis is called as one of the commands', and {len(others)} are too many to compare how they move"
+        return fits, none if few else many
     most = max(pairs, key=pairs.__getitem__)
     alike = f"at most {pairs[most]:.2f}, {most[1]}"
     return fits, f"its axes are called otherwise than the commands', and follow none ({alike})"
@@ -650,6 +657,14 @@ def _same_kind(command: Stream, axis: str, stream: Stream, own: str) -> bool:
     """Whether two axes can be the same by their units."""
     both = (*command.axes[axis], *stream.axes[own])
     return command.kind(axis) == stream.kind(own) or any(one.basis == "range" for one in both)
+
+def _bare(axes: Iterable[str]) -> dict[str, str]:
+    """Axes without the words that all begin with: ``left_arm_wrist`` and ``left_arm_elbow`` are wrist and elbow."""
+    apart = {axis: axis.split("_") for axis in axes}
+    places = zip(*(words[:-1] for words in apart.values()), strict=False)
+    shared = sum(1 for _ in takewhile(lambda alike: len({*alike}) == 1, places))
+    return {axis: "_".join(words[shared:]) for axis, words in apart.items()}
+
 
 
 def _renamed(streams: Sequence[Stream]) -> list[Stream]:
