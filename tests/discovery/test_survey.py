@@ -1617,7 +1617,24 @@ def test_files_that_each_are_a_whole_run_are_not_one(tmp_path: Path) -> None:
     assert found.roles.command.part.label == "take_0.csv"
     assert sorted(one.part.label for one in found.roles.sensors) == ["take_0.csv", "tracker.csv"]
     (note,) = [note for part in found.parts for note in part.notes if "a run each" in note]
-    assert note.startswith("2 other files of the same columns") and "take_1.csv" in note
+    assert note == "2 other tables, a run each, left out: take_1.csv …"
+
+
+@pytest.mark.parametrize(("told", "seen"), [("goal", "encoder"), ("ref", "q"), ("goal", "q")])
+def test_of_lists_of_trials_the_first_trial_is_used(told: str, seen: str, tmp_path: Path) -> None:
+    """Two lists, each trial with what it was told beside what was seen of it: none of another one is its sensor."""
+    t = 0.02 * np.arange(400)
+    trials = [
+        {"t": t.tolist(), told: turn.tolist(), seen: np.interp(t - LAG, t, turn).tolist()}
+        for turn in (path(t + 3.0 * number)[:, 1] for number in range(6))
+    ]
+    log = tmp_path / "log.json"
+    log.write_text(json.dumps({"monday": trials[:3], "tuesday": trials[3:]}))
+    found = survey(log)
+    assert found.roles is not None
+    assert [one.part.label for one in found.roles.streams] == ["monday[0]", "monday[0]"]
+    assert found.roles.command.part.notes == ("5 other tables, a run each, left out: monday[1] …",)
+    assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.01)]
 
 
 def test_a_clock_may_be_any_column_that_alone_goes_on(log: Path) -> None:

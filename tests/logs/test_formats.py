@@ -219,7 +219,7 @@ def test_each_of_a_list_of_trials_is_a_table(tmp_path: Path) -> None:
     assert formats.names(path)[:20] == [f"data[{place}]" for place in range(20)]
     assert tables.read(path, topic="data[3]").plain("sensor")[0].tolist() == (0.9 * told).tolist()
     first = next(part for part in parts_of(path, 50.0) if part.signals)
-    assert first.notes == ("19 tables of other trials left out: data[1] …",)
+    assert first.notes == ("19 other tables, a run each, left out: data[1] …",)
     path.write_text(json.dumps([{"t": 0.1 * place, "q": told[:26].tolist()} for place in range(300)]))
     assert formats.names(path) == [""] and tables.read(path).rows == 300
 

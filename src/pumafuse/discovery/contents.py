@@ -78,7 +78,7 @@ _OF_WAY = 0.1
 # Shares of the variance of the ways that a velocity explains as it is, as a correlation of 0.95 does, and the most that
 # the other way round may: on a circle at 1 rad/s each coordinate is the velocity of the other.
 _IS_VELOCITY, _EITHER = 0.9, 0.5
-_TRIAL = re.compile(r"([^\[]*)\[(\d+)\]")  # of a list of trials
+_TRIAL = re.compile(r"[^\[]*\[(\d+)\]")  # of a list of trials
 _ECHO = re.compile(r"^field\.(transforms0\.)?")
 _ECHOED = re.compile(r"field\..*(position|translation|point)\.[xyz]$")  # of a message by `rostopic echo -p`: in m, too
 _RADIANS = ("JointState", "JointTrajectory", "JointTrajectoryControllerState")
@@ -95,7 +95,7 @@ _PX4 = "PX4"  # whose numbers are in SI units; of its hundred topics those have 
 _PX4_TOPICS = names.words_in("position attitude odometry trajectory pose gimbal joint joints angle angles servo")
 _PX4_OTHERS = names.words_in("gps global estimator status rates triplet sensor selector")  # and by none of these
 _PX4_PLACE = re.compile(r"position\[([012])\]")
-_WHOLE = {"command", "sensor"}  # roles in a table by which it is a run of its own
+_TOLD = {"command", "reference"}  # roles in a table by which it is a run of its own, where others are beside them
 _CHILD = "child_frame_id"
 _BASES = names.words_in("base world map odom root origin")  # words of frames that stand still
 _TOOLS = names.words_in("tool tcp ee eef effector flange hand gripper")
@@ -206,19 +206,22 @@ def _of_one_run(parts: Sequence[Part]) -> list[Part]:
     def columns(part: Part) -> set[str]:
         return {*part.left_out, *(one.column for one in part.signals)}
 
-    whole = [one for one in parts if {names.column_role(signal.name) for signal in one.signals} >= _WHOLE]
-    if whole and (trial := _TRIAL.match(whole[0].topic)):  # others may have other columns
-        listed = [(one, _TRIAL.match(one.topic)) for one in parts if one.file == whole[0].file]
-        again = [one for one, other in listed if other and other[1] == trial[1] and other[2] != trial[2]]
-        what = f"{counted(len(again), 'table')} of other trials left out"
-    else:
-        again = [one for one in whole if one.file != whole[0].file and columns(one) == columns(whole[0])]
-        what = f"{counted(len(again), 'other file')} of the same columns left out, a run each"
-    if not again:
+    def is_whole(part: Part) -> bool:
+        roles = {names.column_role(signal.name) for signal in part.signals}
+        return len(roles) > 1 and not roles.isdisjoint(_TOLD)
+
+    def is_another(part: Part, first: Part) -> bool:
+        trial, mine = _TRIAL.match(part.topic), _TRIAL.match(first.topic)
+        if part.file == first.file and (trial is None or mine is None or trial[1] != mine[1]):
+            return trial is not None and mine is not None  # it may have other columns
+        return part is not first and columns(part) == columns(first)
+
+    first = next(filter(is_whole, parts), None)
+    again = [] if first is None else [one for one in parts if is_another(one, first)]
+    if first is None or not again:
         return list(parts)
-    kept = [one for one in parts if one not in again]
-    notes = (*whole[0].notes, f"{what}: {again[0].label} …")
-    return [replace(one, notes=notes) if one is whole[0] else one for one in kept]
+    notes = (*first.notes, f"{counted(len(again), 'other table')}, a run each, left out: {again[0].label} …")
+    return [replace(one, notes=notes) if one is first else one for one in parts if one not in again]
 
 
 def _files(log: Path) -> list[Path]:
