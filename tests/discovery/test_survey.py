@@ -621,6 +621,22 @@ def test_a_clock_of_its_own_is_shifted_and_said(begins: float, log: Path, tmp_pa
         assert found.relations["take1", axis].lag == pytest.approx(LAG, abs=0.065)  # less what nobody can tell
 
 
+@pytest.mark.parametrize("late", [0.9, 4.9])
+def test_a_lag_that_may_be_a_period_longer_is_asked(late: float, tmp_path: Path) -> None:
+    """A motion that goes up and down each 4 s, not quite as far each time, seen on the commands' clock."""
+    t = 0.04 * np.arange(1500)
+    height = np.random.default_rng(8).uniform(0.8, 1.2, 30)
+
+    def at(t: FloatArray) -> FloatArray:
+        return 0.02 * np.interp(t, 4.0 * np.arange(30), height) * np.cos(0.25 * np.pi * np.maximum(t, 0.0)) ** 4
+
+    write(tmp_path / "log.csv", {"t_s": t, "chest_goal_m": at(t), "chest_state_m": at(t - late)})
+    found = survey(tmp_path / "log.csv")
+    assert found.relations["state", "chest"].lag == pytest.approx(0.9, abs=0.05)
+    asked = [one for one in questions(found, {}) if " s late? " in one]
+    assert [one[:20] for one in asked] == (["is state 4.9 s late?"] if late > 4.0 else [])
+
+
 def test_a_clock_that_nothing_tells_from_the_lag_is_said_to_be_a_guess(log: Path) -> None:
     """A sensor that is recorded for the middle of a run, 5.5 s ahead: its shift is found, its lag is called a guess."""
     t, u, s, z = recorded(2000)

@@ -282,6 +282,7 @@ def another_clock(source: Source, command: Source) -> str:
     return ""
 
 
+    On one clock it stays as it is: of a motion that repeats itself the lag may be a period longer, which is asked.
 def _on_one_clock(command: Stream, stream: Stream) -> Stream:
     """A stream on the commands' clock, where it has another one by which it follows nothing, with a question.
 
@@ -291,10 +292,17 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
     told, source = command.source, stream.source
     axes = [axis for axis in stream.axes if axis in command.axes and _same_kind(command, axis, stream, axis)]
     one, other = command.part.clock, stream.part.clock
-    if not axes or one is None or other is None or (one.time == other.time and command.part.file == stream.part.file):
+    if not axes or one is None or other is None:
         return stream
     led, measured = ({axis: rows.series(axis) for axis in axes} for rows in (told, source))
     if min(len(stamp) for stamp, _ in (*led.values(), *measured.values())) < _FEWEST:
+    if one.time == other.time and command.part.file == stream.part.file:
+        doubt = (
+            f"is {stream.name} {late:.1f} s late? That explains its motion far better than a lag up to {_NEAR[1]:g} s:"
+            f" one that repeats itself looks alike a period sooner. If so, add shift_s = {GUESSED_LAG - late:.1f} to"
+            f" its time (run.toml); what is left of the lag, {GUESSED_LAG * 1e3:.0f} ms, is a guess"
+        )
+        return replace(stream, part=replace(stream.part, clock=replace(other, doubt=doubt)))
         return stream
     if (late := far_shift(led, measured, _NEAR)) is None:
         return stream
