@@ -226,7 +226,7 @@ def test_tables_without_stamps_need_a_rate(stamps: str, log: Path, tmp_path: Pat
     for name, value in (("goal", u), ("camera", z)):
         write(log / f"{name}.csv", {**clock[stamps], **xyz(value[kept])})
     said = one_line(RunError, lambda: survey(log))
-    assert "if rows come at a constant rate, give it to init as --rate HZ, else say in run.toml" in said
+    assert "if rows come at a constant rate, give it to init as --rate HZ; or say in run.toml" in said
     stands = "pc_ts is no clock: 20 distinct stamps, one every 1 s, in 1000 rows"
     assert (stands in said) == (stamps == "seconds")
     check_fuses(log, tmp_path / "out", rate=50.0)
@@ -1120,6 +1120,28 @@ def test_commands_that_never_move_are_named(tmp_path: Path) -> None:
     assert "None is called" not in text
 
 
+def test_what_has_no_clock_is_named_where_nothing_tells_the_commands(tmp_path: Path) -> None:
+    """Arrays of a loop that was stopped are shorter than its stamps; a rate makes up for that."""
+    t = 0.02 * np.arange(600)
+    np.savez(tmp_path / "log.npz", time=t, plan=path(t), seat=path(t - LAG)[:570])
+    text = one_line(RunError, lambda: survey(tmp_path / "log.npz"))
+    assert "joint0, joint1, joint2; seat (no clock for its 570 rows)); if rows come" in text
+    assert "at a constant rate, give it to init as --rate HZ; or say it in run.toml" in text
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv", "csv of nan"])
+def test_columns_without_a_number_beside_commands_are_named(kind: str, tmp_path: Path) -> None:
+    t, u, _ = recorded_at_once()
+    none = np.full(len(t), np.nan)
+    log = tmp_path / f"log.{kind[:3]}"
+    columns = {"t_s": t, "boom_goal_m": u[:, 0], "boom_seen_m": none if kind != "csv" else [""] * len(t)}
+    if kind == "npz":
+        np.savez(log, **columns)
+    else:
+        write(log, columns)
+    assert "lead: boom_seen_m (no number)" in one_line(RunError, lambda: survey(log))
+
+
 def test_a_folder_with_many_topics_lists_what_it_does_not_use(tmp_path: Path) -> None:
     t, u, s, z = recorded(100)
     write(tmp_path / "goal.csv", {"time_s": t, "x_m": u[:, 0], "z_m": np.zeros(100)})
@@ -1717,6 +1739,24 @@ def test_the_best_pairs_of_axes_come_first(tmp_path: Path) -> None:
     assert found.parts[0].left_out == {f"cmd_qd{place}": "velocity" for place in range(3)}
 
 
+def test_many_axes_are_matched_by_what_follows_the_words_that_all_share(tmp_path: Path) -> None:
+    """Of 24 joints, too many to compare each with each by their motion; with a word before those of one source."""
+    rng, t = np.random.default_rng(6), 0.02 * np.arange(500)
+    joints = [f"{part}_{side}" for part in ("hip", "knee", "ankle", "toe", "jaw", "hand") for side in "abcd"]
+    speed, phase = rng.uniform(0.4, 1.5, 24), rng.uniform(0.0, 6.0, 24)
+
+    def at(t: FloatArray) -> FloatArray:
+        return 0.4 * np.sin(t[:, None] * speed + phase)
+
+    seen = at(t - LAG) + rng.normal(scale=1e-4, size=(500, 24))
+    columns = {f"wanted_rover_{joint}": values for joint, values in zip(joints, at(t).T, strict=True)}
+    columns |= {f"encoder_{joint}": values for joint, values in zip(joints[::-1], seen.T[::-1], strict=True)}
+    write(tmp_path / "log.csv", {"t_s": t, **columns})
+    found = survey(tmp_path / "log.csv")
+    assert [axis for _, axis in found.relations] == [f"rover_{joint}" for joint in joints]
+    assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.005)] * 24
+
+
 def test_an_axis_whose_name_ends_as_that_of_a_command_is_that(tmp_path: Path) -> None:
     """``p_RS_R_x`` is x, if it moves alike, though another command moves more alike."""
     t, u, z = recorded_at_once()
@@ -1763,21 +1803,3 @@ def test_what_is_asked_about_a_sensor_is_not_sure(late: float, tmp_path: Path) -
     (sure,) = [sure for what, _, sure in decisions(found) if what == "actual follows"]
     assert sure == ("sure" if late > 0.0 else "a question")
     assert any("ahead of the commands on x" in one for one in asked(found)) is (late < 0.0)
-def test_many_axes_are_matched_by_what_follows_the_words_that_all_share(tmp_path: Path) -> None:
-    """Of 24 joints, too many to compare each with each by their motion; with a word before those of one source."""
-    rng, t = np.random.default_rng(6), 0.02 * np.arange(500)
-    joints = [f"{part}_{side}" for part in ("hip", "knee", "ankle", "toe", "jaw", "hand") for side in "abcd"]
-    speed, phase = rng.uniform(0.4, 1.5, 24), rng.uniform(0.0, 6.0, 24)
-
-    def at(t: FloatArray) -> FloatArray:
-        return 0.4 * np.sin(t[:, None] * speed + phase)
-
-    seen = at(t - LAG) + rng.normal(scale=1e-4, size=(500, 24))
-    columns = {f"wanted_rover_{joint}": values for joint, values in zip(joints, at(t).T, strict=True)}
-    columns |= {f"encoder_{joint}": values for joint, values in zip(joints[::-1], seen.T[::-1], strict=True)}
-    write(tmp_path / "log.csv", {"t_s": t, **columns})
-    found = survey(tmp_path / "log.csv")
-    assert [axis for _, axis in found.relations] == [f"rover_{joint}" for joint in joints]
-    assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.005)] * 24
-
-

@@ -449,7 +449,8 @@ def _signal(
         return printable(str(error).removeprefix(f"{table.path}: "))
     known = values[np.isfinite(values)]
     if len(known) < _FEWEST_ROWS:
-        return "hardly any number" if len(known) else ""
+        is_text = not len(known) and pa.types.is_string(table.column(path).type)
+        return "" if is_text else "hardly any number" if len(known) else "no number"
     if known.min() == known.max() and not names.has_word(path, names.PARTS):
         return f"{RESTS} {known[0]:g}"
     kind = _RADIANS[0] if joint else place.type.rpartition("/")[2]
@@ -488,9 +489,9 @@ def _numeric_paths(table: Table) -> Iterator[str]:
     """Paths of all numbers in the first cells of a table, and columns of text, which may be numbers, too."""
     for name, column in table.columns.items():
         first = column.drop_null()[:1]
-        if not len(first):
+        if not len(first) and names.words(name)[:1] in ([], NAMELESS):  # a separator at the end of each line
             continue
-        if pa.types.is_string(first.type):
+        if not len(first) or pa.types.is_string(first.type):
             yield name
         else:
             beside = table.columns.get("name")
@@ -773,7 +774,16 @@ def _counted(table: Table, rate: float) -> Clock:
 
 def without_clock(part: Part) -> str:
     """Why a part that has positions has no clock."""
-    return next((note for note in part.notes if " is no clock: " in note), "no clock")
+    return next((note for note in part.notes if " is no clock: " in note), f"no clock for its {part.rows} rows")
+
+
+def unused(parts: Iterable[Part]) -> list[str]:
+    """What of a log is taken for nothing, each with the reason: first what has no clock, then columns, then files."""
+    parts = list(parts)
+    found = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
+    found += [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
+    found += [f"{part.label} ({part.notes[0]})" for part in parts if part.notes and not part.rows]
+    return [printable(one, 200) for one in dict.fromkeys(found)]
 
 
 def _no_clock(table: Table, name: str) -> str:
@@ -958,8 +968,10 @@ def _wanted(topic: Topic) -> list[str]:
 
 
 def no_commands(parts: Iterable[Part]) -> str:
-    """What may be the commands and is no positions, and what to do, in words; empty without any."""
-    found = list[str]()
+    """What may be the commands and is none, and what to do, in words; empty without any."""
+    parts = list(parts)
+    clockless = any(part.signals and part.clock is None for part in parts)
+    found = ["if rows come at a constant rate, give it to init as --rate HZ"] if clockless else list[str]()
     for part in parts:
         speeds = [one for one, why in part.left_out.items() if why in _SPEEDS and names.column_role(one) == "command"]
         if _ARE_VELOCITIES in part.notes or speeds:

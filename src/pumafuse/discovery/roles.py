@@ -21,7 +21,7 @@ from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
 from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
-from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, without_clock
+from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, unused
 from .following import LATEST, Following, following
 from .matching import far_shift
 from .names import Role
@@ -41,7 +41,7 @@ _MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that an arm is late where its clock is s
 _FEWEST = 20  # rows
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
 _MOST_APART = 40  # axes of a table that is taken apart by their names
-_MOST_LISTED, _LONGEST = 8, 200  # columns in an error, letters of each
+_MOST_LISTED, _LONGEST = 8, 200  # columns in an error, letters of all of them
 _NUMBERED = re.compile(r"joint\d+|position")
 _AXIS_WORD = re.compile(r"[xyz]|\d+|")
 _Group: TypeAlias = tuple[str, str, str, bool]  # words of roles, list, copy, whether they are desired values
@@ -143,16 +143,12 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     parts = list(parts)
     streams = [stream for part in parts for stream in streams_of(part)]
     if not streams:
-        others = [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
-        clockless = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
-        unread = [f"{part.label} ({part.notes[0]})" for part in parts if part.notes and not part.rows]
-        there = ", ".join(printable(one, _LONGEST) for one in [*clockless, *others, *unread][:_MOST_LISTED])
-        at_a_rate = " if rows come at a constant rate, give it to init as --rate HZ, else" if clockless else ""
+        there = ", ".join(unused(parts)[:_MOST_LISTED])
         why = f"no columns of positions with a clock beside them{', but ' if there else ''}{there}"
-        advice = f"{at_a_rate} {no_commands(parts)}say in run.toml where they are"
+        advice = f"{no_commands(parts)}say in run.toml where they are"
         if all(part.clock is None for part in parts):
-            raise RunError(f"{log}: {why};{advice}")
-        raise UndecidedError(log, f"{why};{advice}", parts)
+            raise RunError(f"{log}: {why}; {advice}")
+        raise UndecidedError(log, f"{why}; {advice}", parts)
     named = dict[str, Stream]()
     for one in _apart(streams[0]) if len(streams) == 1 else streams:
         name = _free(one.name, named.keys())
@@ -165,7 +161,8 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         called = "None is called command, goal, target, desired, setpoint or action"
         called = f"What is called so never moves: {printable('; '.join(still[:3]), _LONGEST)}" if still else called
         advice = f"{no_commands(parts)}say it in run.toml"
-        why = f"{called}, and none runs ahead of others ({what}); {advice}"
+        beside = "".join(f"; {one}" for one in unused(part for part in parts if part.clock is None)[:_MOST_LISTED])
+        why = f"{called}, and none runs ahead of others ({what}{beside}); {advice}"
         raise UndecidedError(log, f"which numbers are the commands? {why}", parts)
     command, why = known
     resting = {names.axis_of(column, []) for column, what in command.part.left_out.items() if what.startswith(RESTS)}
@@ -282,10 +279,10 @@ def another_clock(source: Source, command: Source) -> str:
     return ""
 
 
-    On one clock it stays as it is: of a motion that repeats itself the lag may be a period longer, which is asked.
 def _on_one_clock(command: Stream, stream: Stream) -> Stream:
     """A stream on the commands' clock, where it has another one by which it follows nothing, with a question.
 
+    On one clock it stays as it is: of a motion that repeats itself the lag may be a period longer, which is asked.
     How late it follows is the difference of the clocks and the arm's lag together. Where both begin, or end, at once,
     or differ by whole hours, that difference is known; else the lag is not.
     """
@@ -296,6 +293,9 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
         return stream
     led, measured = ({axis: rows.series(axis) for axis in axes} for rows in (told, source))
     if min(len(stamp) for stamp, _ in (*led.values(), *measured.values())) < _FEWEST:
+        return stream
+    if (late := far_shift(led, measured, _NEAR)) is None:
+        return stream
     if one.time == other.time and command.part.file == stream.part.file:
         doubt = (
             f"is {stream.name} {late:.1f} s late? That explains its motion far better than a lag up to {_NEAR[1]:g} s:"
@@ -303,9 +303,6 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
             f" its time (run.toml); what is left of the lag, {GUESSED_LAG * 1e3:.0f} ms, is a guess"
         )
         return replace(stream, part=replace(stream.part, clock=replace(other, doubt=doubt)))
-        return stream
-    if (late := far_shift(led, measured, _NEAR)) is None:
-        return stream
     (begun, ended), (begins, ends) = (
         (min(int(at[0]) for at, _ in rows.values()), max(int(at[-1]) for at, _ in rows.values()))
         for rows in (led, measured)
@@ -661,11 +658,6 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     return fits, f"its axes are called otherwise than the commands', and follow none ({alike})"
 
 
-def _same_kind(command: Stream, axis: str, stream: Stream, own: str) -> bool:
-    """Whether two axes can be the same by their units."""
-    both = (*command.axes[axis], *stream.axes[own])
-    return command.kind(axis) == stream.kind(own) or any(one.basis == "range" for one in both)
-
 def _bare(axes: Iterable[str]) -> dict[str, str]:
     """Axes without the words that all begin with: ``left_arm_wrist`` and ``left_arm_elbow`` are wrist and elbow."""
     apart = {axis: axis.split("_") for axis in axes}
@@ -673,6 +665,11 @@ def _bare(axes: Iterable[str]) -> dict[str, str]:
     shared = sum(1 for _ in takewhile(lambda alike: len({*alike}) == 1, places))
     return {axis: "_".join(words[shared:]) for axis, words in apart.items()}
 
+
+def _same_kind(command: Stream, axis: str, stream: Stream, own: str) -> bool:
+    """Whether two axes can be the same by their units."""
+    both = (*command.axes[axis], *stream.axes[own])
+    return command.kind(axis) == stream.kind(own) or any(one.basis == "range" for one in both)
 
 
 def _renamed(streams: Sequence[Stream]) -> list[Stream]:

@@ -19,7 +19,7 @@ from ..logs.manifest import refuse_twice
 from ..logs.run import REFERENCE, Run, Source
 from ..space.rotations import TURNING
 from ..units import MS
-from .contents import Part, parts_of, period_of, without_clock
+from .contents import Part, parts_of, period_of, unused
 from .following import LATEST, Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
@@ -219,7 +219,5 @@ def soonest(found: Survey) -> float:
 
 
 def _reasons(roles: Roles, parts: Sequence[Part]) -> str:
-    reasons = [f"{stream.name}: {why}" for stream, why in roles.left_out]
-    reasons += [f"{part.label}: {without_clock(part)}" for part in parts if part.signals and part.clock is None]
-    reasons += [f"{part.label}: {why}" for part in parts if not part.signals for why in part.left_out.values()]
+    reasons = [*(f"{stream.name}: {why}" for stream, why in roles.left_out), *unused(parts)]
     return "; ".join([*dict.fromkeys(reasons)][:_MOST_REASONS]) or "nothing else is in the log"
