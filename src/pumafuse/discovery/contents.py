@@ -338,12 +338,8 @@ def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
         1.0 - (power - sign * 2.0 * both) / np.maximum(spread, 1e-30)[:, None] for sign in (1.0, -1.0)
     )
     found = (as_it_is > _IS_VELOCITY) & ~(np.maximum(as_it_is, mirrored).T > _EITHER)
-    return {
-        signals[
-            second
-        ].name: f"velocity: it adds up to {signals[int(np.argmax(as_it_is[:, second]))].name} by the clock"
-        for second in map(int, np.flatnonzero(found.any(axis=0)))
-    }
+    sums_of = {int(place): signals[int(np.argmax(as_it_is[:, place]))] for place in np.flatnonzero(found.any(axis=0))}
+    return {signals[place].name: f"velocity: it adds up to {one.name} by the clock" for place, one in sums_of.items()}
 
 
 def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:

@@ -83,9 +83,7 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         return replace(found, interpolation=interpolation(found))
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
-    if not roles.sensors:
-        why = f"commands, but nothing that measures where they lead: {_reasons(roles, parts)}"
-        raise UndecidedError(str(log), why, parts, roles)
+    _refuse_alone(log, parts, roles, "nothing that measures where they lead")
     run = without_strays(roles.run)
     aside = own_frames(run)
     run = _along_axes(run, aside)
@@ -100,9 +98,7 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
             bad[key] = _ahead(one)
     bad |= {(name, axis): why for name, why in _without_lag(related).items() for axis in (*run.axes, *TURNING)}
     roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
-    if not roles.sensors:
-        why = f"commands, but nothing that surely follows them: {_reasons(roles, parts)}"
-        raise UndecidedError(str(log), why, parts, roles)
+    _refuse_alone(log, parts, roles, "nothing that surely follows them")
     kept = {(name, axis) for name, one in roles.measured.items() for axis in (*one.axes, *TURNING)}
     related = {key: one for key, one in related.items() if key in kept}
     run, related = _followed(_along_axes(without_strays(roles.run), aside), related)
@@ -218,6 +214,9 @@ def soonest(found: Survey) -> float:
     return min((float(np.median(mine)) for mine in lags.values()), default=math.inf)
 
 
-def _reasons(roles: Roles, parts: Sequence[Part]) -> str:
-    reasons = [*(f"{stream.name}: {why}" for stream, why in roles.left_out), *unused(parts)]
-    return "; ".join([*dict.fromkeys(reasons)][:_MOST_REASONS]) or "nothing else is in the log"
+def _refuse_alone(log: Path, parts: Sequence[Part], roles: Roles, what: str) -> None:
+    """Refuse commands without a sensor, with why anything else is none."""
+    if not roles.sensors:
+        reasons = dict.fromkeys([*(f"{stream.name}: {why}" for stream, why in roles.left_out), *unused(parts)])
+        there = "; ".join([*reasons][:_MOST_REASONS]) or "nothing else is in the log"
+        raise UndecidedError(str(log), f"commands, but {what}: {there}", parts, roles)
