@@ -1719,7 +1719,7 @@ def test_columns_without_words_are_what_their_file_is_called(log: Path) -> None:
     for name in ("encoder", "time_series"):
         (log / f"{name}.csv").unlink()
     said = one_line(RunError, lambda: survey(log))
-    assert "nothing that measures where they lead: measured_load.csv: load, as measured_load.csv is called; tor" in said
+    assert "measures where they lead: value (load, as measured_load.csv is called); value (torque, as torque" in said
 
 
 def test_the_best_pairs_of_axes_come_first(tmp_path: Path) -> None:
