@@ -1129,6 +1129,18 @@ def test_what_has_no_clock_is_named_where_nothing_tells_the_commands(tmp_path: P
     assert "at a constant rate, give it to init as --rate HZ; or say it in run.toml" in text
 
 
+@pytest.mark.parametrize("has_positions", [True, False])
+def test_velocities_are_to_be_integrated_only_where_no_positions_are_commanded(
+    has_positions: bool, tmp_path: Path
+) -> None:
+    _, u, z = recorded_at_once()
+    columns = {"lathe_vel_demand": np.gradient(u[:, 0]), "lathe_pos_encoder": z[:, 0]}
+    write(tmp_path / "log.csv", columns | ({"lathe_pos_demand": u[:, 0]} if has_positions else {}))
+    text = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    assert ("integrate them" in text) is not has_positions
+    assert "give it to init as --rate HZ" in text
+
+
 @pytest.mark.parametrize("kind", ["npz", "csv", "csv of nan"])
 def test_columns_without_a_number_beside_commands_are_named(kind: str, tmp_path: Path) -> None:
     t, u, _ = recorded_at_once()

@@ -968,8 +968,10 @@ def no_commands(parts: Iterable[Part]) -> str:
     parts = list(parts)
     clockless = any(part.signals and part.clock is None for part in parts)
     found = ["if rows come at a constant rate, give it to init as --rate HZ"] if clockless else list[str]()
+    told = any(names.column_role(one.name) == "command" for part in parts for one in part.signals)  # positions, too
     for part in parts:
         speeds = [one for one, why in part.left_out.items() if why in _SPEEDS and names.column_role(one) == "command"]
+        speeds = [] if told else speeds
         if _ARE_VELOCITIES in part.notes or speeds:
             what = f"{part.label} are" if not speeds else f"{', '.join(speeds[:3])} of {part.label} are"
             found.append(
