@@ -61,6 +61,24 @@ def test_every_room_is_known() -> None:
     assert {path.name for path in SOURCE.iterdir() if (path / "__init__.py").exists()} == set(ROOMS)
 
 
+def test_names_say_the_thing() -> None:
+    """No variable or parameter is called by a word that says nothing of what it holds."""
+    silent = {"found", "one", "known", "given", "rest", "own", "place", "like", "aside", "mine", "there"}
+    for path in SOURCE.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        fields = {
+            id(line.target)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ClassDef)
+            for line in node.body
+            if isinstance(line, ast.AnnAssign)
+        }
+        for node in ast.walk(tree):
+            is_set = isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and id(node) not in fields
+            name = node.arg if isinstance(node, ast.arg) else node.id if is_set else ""
+            assert name not in silent, f"{path}, line {node.lineno}: {name}"
+
+
 def test_no_room_hides_a_public_name() -> None:
     """A module that is imported becomes an attribute of the package: none is called what a function or class is."""
     assert {path.stem for path in SOURCE.iterdir()}.isdisjoint(pf.__all__)

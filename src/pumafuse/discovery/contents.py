@@ -177,51 +177,53 @@ class Part:
 
 def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
     """What a log has: a table, a recording, or a folder of them; ``rate`` is that of rows without stamps [Hz], or 0."""
-    found: list[Part] = []
+    parts: list[Part] = []
     for path in _files(log):
         is_known = path.name.endswith(_TABLES) or formats.has_tables(path) or tables.is_recording(path)
         if path != log and not is_known:
             with suppress(RunError):  # it may be anything, if it is no table of positions with a clock of its own
-                found += [one for one in _tabled(path, rate) if one.clock and not one.clock.time.rate and one.signals]
+                parts += [
+                    part for part in _tabled(path, rate) if part.clock and not part.clock.time.rate and part.signals
+                ]
         elif tables.is_recording(path):
-            found += _recorded(path)
+            parts += _recorded(path)
         else:
             try:
                 several = formats.names(path) if formats.has_tables(path) else ("",)
             except RunError as error:  # beside others it may be anything
                 if path == log:
                     raise
-                found.append(Part(path, notes=(str(error).removeprefix(f"{path}: "),)))
+                parts.append(Part(path, notes=(str(error).removeprefix(f"{path}: "),)))
                 continue
-            found += [part for name in several for part in _tabled(path, rate, name)]
-        if len(found) > _MOST_PARTS:
+            parts += [part for name in several for part in _tabled(path, rate, name)]
+        if len(parts) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
-    found = _of_one_run(found)
-    return [one if one.clock is None else replace(one, clock=_beside(one, one.clock, found)) for one in found]
+    parts = _of_one_run(parts)
+    return [part if part.clock is None else replace(part, clock=_beside(part, part.clock, parts)) for part in parts]
 
 
 def _of_one_run(parts: Sequence[Part]) -> list[Part]:
     """The parts of a log; of files of the same columns, or of trials, that each hold a whole run the first alone."""
 
     def columns(part: Part) -> set[str]:
-        return {*part.left_out, *(one.column for one in part.signals)}
+        return {*part.left_out, *(signal.column for signal in part.signals)}
 
     def is_whole(part: Part) -> bool:
         roles = {names.column_role(signal.name) for signal in part.signals}
         return len(roles) > 1 and not roles.isdisjoint(_TOLD)
 
     def is_another(part: Part, first: Part) -> bool:
-        trial, mine = _TRIAL.match(part.topic), _TRIAL.match(first.topic)
-        if part.file == first.file and (trial is None or mine is None or trial[1] != mine[1]):
-            return trial is not None and mine is not None  # it may have other columns
+        trial, first_trial = _TRIAL.match(part.topic), _TRIAL.match(first.topic)
+        if part.file == first.file and (trial is None or first_trial is None or trial[1] != first_trial[1]):
+            return trial is not None and first_trial is not None  # it may have other columns
         return part is not first and columns(part) == columns(first)
 
     first = next(filter(is_whole, parts), None)
-    again = [] if first is None else [one for one in parts if is_another(one, first)]
+    again = [] if first is None else [part for part in parts if is_another(part, first)]
     if first is None or not again:
         return list(parts)
     notes = (*first.notes, f"{counted(len(again), 'other table')}, a run each, left out: {again[0].label} …")
-    return [replace(one, notes=notes) if one is first else one for one in parts if one not in again]
+    return [replace(part, notes=notes) if part is first else part for part in parts if part not in again]
 
 
 def _files(log: Path) -> list[Path]:
@@ -239,34 +241,34 @@ def _files(log: Path) -> list[Path]:
         return [log]  # a bag
     if (log / "meta" / "info.json").is_file():  # LeRobot: many files of many episodes
         inside = [path for path in inside if log / "data" in path.parents][:1]
-    found = [path for path in inside if path.name.endswith(_TABLES + _TEXTS) or tables.is_recording(path)]
-    found = found or _gathered([path for path in inside if path.name.endswith(formats.ENDINGS)])
-    found = found or [path for path in inside if tables.holds_numbers(path)]
-    if not found:
+    files = [path for path in inside if path.name.endswith(_TABLES + _TEXTS) or tables.is_recording(path)]
+    files = files or _gathered([path for path in inside if path.name.endswith(formats.ENDINGS)])
+    files = files or [path for path in inside if tables.holds_numbers(path)]
+    if not files:
         raise RunError(f"{log}: no log in it that can be read; {_ACCEPTED}")
-    return found
+    return files
 
 
 def _gathered(files: Sequence[Path]) -> list[Path]:
     """Files; for the arrays of a folder, of which one alone is a clock of others as long, the folder: a table."""
-    found = list(files)
-    for folder in sorted({one.parent for one in files if one.suffix == formats.ARRAY}):
+    kept = list(files)
+    for folder in sorted({file.parent for file in files if file.suffix == formats.ARRAY}):
         with suppress(RunError):  # none of them is an array
             every = [tables.read(folder, topic=name) for name in formats.names(folder)]
-            clocks = [len(_risers(one, one.columns)) for one in every if len(one.columns) > 1]
-            inside = {folder / f"{name}{formats.ARRAY}" for one in every for name in one.columns}
-            if max(clocks, default=0) == 1 and inside <= {*found}:
-                found = [folder, *(one for one in found if one not in inside)]
-    return found
+            clocks = [len(_risers(table, table.columns)) for table in every if len(table.columns) > 1]
+            inside = {folder / f"{name}{formats.ARRAY}" for table in every for name in table.columns}
+            if max(clocks, default=0) == 1 and inside <= {*kept}:
+                kept = [folder, *(path for path in kept if path not in inside)]
+    return kept
 
 
-def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
+def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
     signals, left_out, times, paths = list[Signal](), dict[str, str](), list[str](), list(_numeric_paths(table))
     joints, counts = _joints(table, paths), {name for name in table.columns if _counts(table, name) is not None}
     rows = _axes_in_rows(table)
     told = attitudes_in(table, paths) if rows == [{}] else []
-    attitudes = [one for one in told if one.turns]
-    turning = {path for one in attitudes for path in one.columns.columns}
+    attitudes = [attitude for attitude in told if attitude.turns]
+    turning = {path for attitude in attitudes for path in attitude.columns.columns}
     paths = paths if len(paths) <= _MOST_COLUMNS else names.likeliest_first(paths)
     for path, where in product(paths, rows):
         name, listed = _called(path, where), labels.get(leaf(path), [])
@@ -280,74 +282,86 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: floa
             left_out[name] = why
         elif len(signals) == _MOST_COLUMNS:
             left_out[name] = f"more than {_MOST_COLUMNS} columns"
-        elif isinstance(found := _signal(table, path, where, place, listed, joints.get(path)), Signal):
-            signals.append(found)
-        elif found:
-            left_out[name] = found
-    signals = [_placed(one, told) for one in _without_quaternions(signals, left_out)]
-    if signals and (why := names.no_position_by_place(place.stem, [one.column for one in signals])):
-        left_out |= {one.name: f"{why}, as {place.label} is called" for one in signals}
+        elif isinstance(signal_or_why := _signal(table, path, where, source, listed, joints.get(path)), Signal):
+            signals.append(signal_or_why)
+        elif signal_or_why:
+            left_out[name] = signal_or_why
+    signals = [_placed(signal, told) for signal in _without_quaternions(signals, left_out)]
+    if signals and (why := names.no_position_by_place(source.stem, [signal.column for signal in signals])):
+        left_out |= {signal.name: f"{why}, as {source.label} is called" for signal in signals}
         signals = []
     notes = list[str]()
     if len(table.names) > _MOST_READ:
         read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
         notes = [f"{table.path.name}: of {len(table.names)} columns {read}"]
-    beside = [names.role_words(one.column) for one in signals if one.axis in CARTESIAN]
-    left_out |= {path: "turning" for one in attitudes if one.role_words not in beside for path in one.columns.columns}
+    beside = [names.role_words(signal.column) for signal in signals if signal.axis in CARTESIAN]
+    left_out |= {
+        path: "turning"
+        for attitude in attitudes
+        if attitude.role_words not in beside
+        for path in attitude.columns.columns
+    }
     clock, why_none = _clock(table, signals, sorted(counts))
     if clock is None or (rate and clock.counts):
         clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts)
     used = () if clock is None else tuple(clock.time.columns)
     if clock and is_nameless(signals, clock):
-        left_out |= _velocities([one for one in signals if one.column not in used], clock.stamp)
-        signals = [one for one in signals if one.name not in left_out]
+        left_out |= _velocities([signal for signal in signals if signal.column not in used], clock.stamp)
+        signals = [signal for signal in signals if signal.name not in left_out]
     left_out |= {path: "another clock" if clock else _no_clock(table, path) for path in times}
-    mine = {path for path in left_out if path in used or path.startswith(tuple(f"{one}." for one in used))}
+    accounted = {path for path in left_out if path in used or path.startswith(tuple(f"{path}." for path in used))}
     return replace(
-        place,
+        source,
         rows=table.rows,
         clock=clock,
-        signals=_with_units([one for one in signals if one.column not in used]),
-        left_out={path: why for path, why in left_out.items() if path not in mine},
-        notes=(*why_none, *(() if clock is None else clock.notes), *place.notes, *table.notes, *notes),
-        attitudes=tuple(one for one in attitudes if one.role_words in beside),
+        signals=_with_units([signal for signal in signals if signal.column not in used]),
+        left_out={path: why for path, why in left_out.items() if path not in accounted},
+        notes=(*why_none, *(() if clock is None else clock.notes), *source.notes, *table.notes, *notes),
+        attitudes=tuple(attitude for attitude in attitudes if attitude.role_words in beside),
     )
 
 
 def is_nameless(signals: Iterable[Signal], clock: Clock) -> bool:
     """Whether no column has a name: those of a table without a header, or of an array that has its clock in it."""
     array, bracket, _ = clock.time.column.partition("[")
-    mine = [one.column for one in signals]
-    return all(names.words(one)[:1] == NAMELESS or (bracket and one.startswith(f"{array}[")) for one in mine)
+    columns = [signal.column for signal in signals]
+    return all(
+        names.words(column)[:1] == NAMELESS or (bracket and column.startswith(f"{array}[")) for column in columns
+    )
 
 
 def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
     """Columns that add up to another by the clock, and to which: they are its velocity, and no positions."""
-    there = stamp != NO_STAMP
-    steps = np.diff(stamp[there]) / 1e9
+    stamped = stamp != NO_STAMP
+    steps = np.diff(stamp[stamped]) / 1e9
     rows = max(1, round(_OF_WAY / max(median(steps), 1e-6))) if len(steps) else 1
     if len(signals) < 2 or len(steps) - rows < _FEWEST_ROWS:
         return {}
-    plain = np.stack([one.plain[there] for one in signals])
+    plain = np.stack([signal.plain[stamped] for signal in signals])
     sums = np.pad(np.cumsum(0.5 * (plain[:, 1:] + plain[:, :-1]) * steps, axis=1), ((0, 0), (1, 0)))
-    ways, added = (one[:, rows:] - one[:, :-rows] for one in (plain, sums))
+    ways, added = (sums_of_rows[:, rows:] - sums_of_rows[:, :-rows] for sums_of_rows in (plain, sums))
     # by adding up the second, of the variance of the first
     spread, power = np.var(ways, axis=1), np.mean(ways**2, axis=1)[:, None] + np.mean(added**2, axis=1)
     both = ways @ added.T / ways.shape[1]
     as_it_is, mirrored = (
         1.0 - (power - sign * 2.0 * both) / np.maximum(spread, 1e-30)[:, None] for sign in (1.0, -1.0)
     )
-    found = (as_it_is > _IS_VELOCITY) & ~(np.maximum(as_it_is, mirrored).T > _EITHER)
-    sums_of = {int(place): signals[int(np.argmax(as_it_is[:, place]))] for place in np.flatnonzero(found.any(axis=0))}
-    return {signals[place].name: f"velocity: it adds up to {one.name} by the clock" for place, one in sums_of.items()}
+    is_velocity = (as_it_is > _IS_VELOCITY) & ~(np.maximum(as_it_is, mirrored).T > _EITHER)
+    sums_of = {
+        int(column): signals[int(np.argmax(as_it_is[:, column]))] for column in np.flatnonzero(is_velocity.any(axis=0))
+    }
+    return {
+        signals[column].name: f"velocity: it adds up to {position.name} by the clock"
+        for column, position in sums_of.items()
+    }
 
 
 def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
     """A column beside an orientation as the axis that it is by that."""
-    for one in attitudes:
-        if axis := one.place.get(signal.column):
-            known = {"unit": one.place_unit, "basis": "name"} if one.place_unit else {}
-            return replace(signal, axis=axis, **known)
+    for attitude in attitudes:
+        if axis := attitude.place.get(signal.column):
+            unit = {"unit": attitude.place_unit, "basis": "name"} if attitude.place_unit else {}
+            return replace(signal, axis=axis, **unit)
     return signal
 
 
@@ -358,13 +372,13 @@ def _likeliest(columns: Sequence[str]) -> list[str]:
 def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
     """Columns that are no quaternion, which are four of one list, of length 1 in each row."""
     lists = dict[str, list[Signal]]()
-    for one in signals:
-        if one.column.endswith("]"):
-            lists.setdefault(leaf(one.column), []).append(one)
+    for signal in signals:
+        if signal.column.endswith("]"):
+            lists.setdefault(leaf(signal.column), []).append(signal)
     for four in lists.values():
-        if len(four) == 4 and are_units(np.column_stack([one.plain for one in four])):
-            left_out |= {one.name: "of a quaternion" for one in four}
-    return [one for one in signals if one.name not in left_out]
+        if len(four) == 4 and are_units(np.column_stack([signal.plain for signal in four])):
+            left_out |= {signal.name: "of a quaternion" for signal in four}
+    return [signal for signal in signals if signal.name not in left_out]
 
 
 def _joints(table: Table, paths: Sequence[str]) -> dict[str, str]:
@@ -375,15 +389,15 @@ def _joints(table: Table, paths: Sequence[str]) -> dict[str, str]:
     column = table.columns.get("joint_names")
     listed: Any = None if column is None or not len(column) else column[0].as_py()
     joints = cast(list[Any], listed if isinstance(listed, list) else [])
-    found = {
+    joints_by_path = {
         path: names.plain(str(joints[int(match[1])]))
         for path in paths
         if (match := _OF_JOINT.search(path)) and int(match[1]) < len(joints)
     }
     for name, column in table.columns.items():
         if (match := _NAMED.fullmatch(name)) and pa.types.is_string(column.type) and column.null_count < len(column):
-            found[f"{match[1]}position{match[2]}"] = names.plain(column.drop_null()[0].as_py())
-    return found
+            joints_by_path[f"{match[1]}position{match[2]}"] = names.plain(column.drop_null()[0].as_py())
+    return joints_by_path
 
 
 def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
@@ -400,12 +414,14 @@ def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
         if not (whose and pa.types.is_integer(column.type)) and not (words and (whose or not names.no_position(name))):
             continue
         counts = pc.value_counts(column.drop_null())
-        keys = {one["values"].as_py(): one["counts"].as_py() for one in counts} if len(counts) <= _MOST_KEYS else {}
+        keys = (
+            {entry["values"].as_py(): entry["counts"].as_py() for entry in counts} if len(counts) <= _MOST_KEYS else {}
+        )
         if len(keys) < 2 or min(keys.values()) < _FEWEST_ROWS:
             continue
         changed = pc.fill_null(pc.not_equal(column[1:], column[:-1]), True).cast(pa.uint8())
         changes = np.from_dlpack(changed.combine_chunks())
-        others = [one for one in table.columns if one != name]
+        others = [column for column in table.columns if column != name]
         is_below = changes.sum() == len(keys) - 1 and (whose or not any(map(names.role_words, others)))
         if changes.mean() > _IN_TURNS or (is_below and _begins_anew(table, others, np.flatnonzero(changes) + 1)):
             return [{name: key} for key in keys]
@@ -434,7 +450,7 @@ def _called(column: str, where: Mapping[str, Any]) -> str:
 
 
 def _signal(
-    table: Table, path: str, where: Mapping[str, Any], place: Part, labels: list[str], joint: str | None
+    table: Table, path: str, where: Mapping[str, Any], source: Part, labels: list[str], joint: str | None
 ) -> Signal | str:
     """A column as positions, or why it is none; empty for text."""
     try:
@@ -443,17 +459,17 @@ def _signal(
         values = np.where(tables.meets(table, where), values, np.nan) if where else values
     except RunError as error:
         return printable(str(error).removeprefix(f"{table.path}: "))
-    known = values[np.isfinite(values)]
-    if len(known) < _FEWEST_ROWS:
-        is_text = not len(known) and pa.types.is_string(table.column(path).type)
-        return "" if is_text else "hardly any number" if len(known) else "no number"
-    if known.min() == known.max() and not names.has_word(path, names.PARTS):
-        return f"{RESTS} {known[0]:g}"
-    kind = _RADIANS[0] if joint else place.type.rpartition("/")[2]
+    finite = values[np.isfinite(values)]
+    if len(finite) < _FEWEST_ROWS:
+        is_text = not len(finite) and pa.types.is_string(table.column(path).type)
+        return "" if is_text else "hardly any number" if len(finite) else "no number"
+    if finite.min() == finite.max() and not names.has_word(path, names.PARTS):
+        return f"{RESTS} {finite[0]:g}"
+    kind = _RADIANS[0] if joint else source.type.rpartition("/")[2]
     sliding = kind in _RADIANS and names.has_word(joint or path, names.SLIDING)
     metres = kind in _METRES or sliding or _ECHOED.match(path)
     of_type = "m" if metres else "rad" if kind in _RADIANS or path.startswith(f"{PATH}.") else ""
-    unit = names.unit_of(path) or names.unit_of(place.topic or place.entity)
+    unit = names.unit_of(path) or names.unit_of(source.topic or source.entity)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
     axis = joint or names.axis_of(_called(_ECHO.sub("", path), where), labels)
     if kind == _PX4:
@@ -467,18 +483,18 @@ def _signal(
 
 def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
     """Signals without a unit get the likeliest one for their range, those of joints apart from the others."""
-    found = list[Signal]()
-    for one in signals:
-        if not one.unit:
-            turns = names.turns(one.column, one.axis)
+    in_units = list[Signal]()
+    for signal in signals:
+        if not signal.unit:
+            turns = names.turns(signal.column, signal.axis)
             alike = [other for other in signals if not other.unit and names.turns(other.column, other.axis) == turns]
             small, large, most = RANGES["angle" if turns else "length"]
             largest = max(float(np.nanmax(np.abs(other.plain))) for other in alike)
-            one = replace(one, unit=large if largest > most else small)
-        if kind_of(f"_{one.unit}") == "angle" and len(wraps(one.value)):
-            one = replace(one, turns=True, basis="turn" if one.basis == "range" else one.basis)
-        found.append(one)
-    return tuple(found)
+            signal = replace(signal, unit=large if largest > most else small)
+        if kind_of(f"_{signal.unit}") == "angle" and len(wraps(signal.value)):
+            signal = replace(signal, turns=True, basis="turn" if signal.basis == "range" else signal.basis)
+        in_units.append(signal)
+    return tuple(in_units)
 
 
 def _numeric_paths(table: Table) -> Iterator[str]:
@@ -518,7 +534,7 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
         yield from (_clock_of(table, name, stroke, coarse) for name in counts if _counts(table, name) != 1.0)
 
     for clock in filter(None, candidates()):
-        source = Source(clock.stamp, {one.name: one.plain for one in signals}, table.path.name)
+        source = Source(clock.stamp, {signal.name: signal.plain for signal in signals}, table.path.name)
         if not signals or not (stands := standing_clock(source)):
             others = filter(None, (_clock_of(table, name, stroke) for name in called if name not in clock.time.columns))
             return _numbered(table, _spread(table, _or_another(table, clock, others), counts), counts), notes
@@ -530,7 +546,7 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
 def _or_another(table: Table, clock: Clock, others: Iterable[Clock]) -> Clock:
     """A clock, with a question where another one in the table tells another time; the other one if this one is even."""
     for other in others:
-        spans = [float(np.ptp(one.stamp[one.stamp != NO_STAMP])) / 1e9 for one in (clock, other)]
+        spans = [float(np.ptp(timed.stamp[timed.stamp != NO_STAMP])) / 1e9 for timed in (clock, other)]
         if max(spans) > _ALIKE_SPANS * min(spans) > 0.0:
             steps = np.diff(clock.stamp)
             counted = np.abs(steps - np.median(steps)).max() <= _OF_STEP * np.median(steps)
@@ -546,9 +562,9 @@ def _or_another(table: Table, clock: Clock, others: Iterable[Clock]) -> Clock:
 
 def _spread(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
     """A clock whose rows come in packets spread by what counts them, or with a question."""
-    if (found := packets(clock.stamp)) is None or _axes_in_rows(table) != [{}]:
+    if (sent := packets(clock.stamp)) is None or _axes_in_rows(table) != [{}]:
         return clock
-    each, every = found
+    each, every = sent
     what = f"{table.path.name}: rows arrive {each:.3g} at a time, every {every:.3g} s"
     for counter in (name for name in counts if name not in clock.time.columns and _counts(table, name) == 1.0):
         even = Clock.of(table, structs.replace(clock.time, counter=counter), f"{clock.basis}, spread by {counter}")
@@ -590,14 +606,14 @@ def _stroke(signals: Sequence[Signal]) -> float:
 
     That tells noise, which crosses in a few rows, from motion, and needs no unit; 0 without a column.
     """
-    found = list[float]()
-    for one in signals:
-        value = one.plain[np.isfinite(one.plain)]
+    ends = list[float]()
+    for signal in signals:
+        value = signal.plain[np.isfinite(signal.plain)]
         low, high = np.quantile(value, [0.05, 0.95])
         side = np.where(value > high - (high - low) / 3.0, 1, np.where(value < low + (high - low) / 3.0, -1, 0))
         side = side[side != 0]
-        found.append(len(value) / (np.count_nonzero(np.diff(side)) + 1))
-    return float(np.median(found)) if found else 0.0
+        ends.append(len(value) / (np.count_nonzero(np.diff(side)) + 1))
+    return float(np.median(ends)) if ends else 0.0
 
 
 def _stamp_columns(table: Table) -> Iterator[str]:
@@ -605,12 +621,12 @@ def _stamp_columns(table: Table) -> Iterator[str]:
 
     def inside(path: str, kind: pa.DataType, depth: int) -> Iterator[str]:
         if pa.types.is_struct(kind):
-            fields = {one.name for one in kind}
+            fields = {field.name for field in kind}
             if fields & {"nanosec", "nsecs", "nsec", "nanos"}:
                 yield path
             else:
-                for one in kind if depth else ():
-                    yield from inside(f"{path}.{one.name}", one.type, depth - 1)
+                for field in kind if depth else ():
+                    yield from inside(f"{path}.{field.name}", field.type, depth - 1)
         elif pa.types.is_timestamp(kind) or (not pa.types.is_nested(kind) and names.is_time(path)):
             yield path
 
@@ -655,11 +671,13 @@ def _beside(part: Part, clock: Clock, parts: Iterable[Part]) -> Clock:
     """A clock; where its unit is a guess in which no other table tells the same time, in one in which one does."""
     if not clock.basis.endswith(_GUESSED):
         return clock
-    apart = [one.clock for one in parts if one.clock and (one.file, one.clock.time) != (part.file, clock.time)]
-    others, mine = [_ends(one) for one in apart], _ends(clock)
+    apart = [
+        other.clock for other in parts if other.clock and (other.file, other.clock.time) != (part.file, clock.time)
+    ]
+    others, own_ends = [_ends(other) for other in apart], _ends(clock)
 
     def shares(size: float) -> bool:
-        first, last = size * mine
+        first, last = size * own_ends
         return any(
             min(last, to) - max(first, since) > _SHARED * (max(last, to) - min(first, since)) for since, to in others
         )
@@ -674,8 +692,8 @@ def _beside(part: Part, clock: Clock, parts: Iterable[Part]) -> Clock:
 
 def _ends(clock: Clock) -> FloatArray:
     """The first and the last stamp [ns], (2,)."""
-    known = clock.stamp[clock.stamp != NO_STAMP]
-    return np.array([known.min(initial=2**62), known.max(initial=-(2**62))], dtype=np.float64)
+    stamps = clock.stamp[clock.stamp != NO_STAMP]
+    return np.array([stamps.min(initial=2**62), stamps.max(initial=-(2**62))], dtype=np.float64)
 
 
 def _runs(stamp: TimeArray) -> bool:
@@ -694,9 +712,9 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
     first, *others = table.columns
     try:
         numbers = table.plain(first)[0]
-        rest = table.plain(others[0])[0] if others else np.full(len(numbers), np.nan)
-        whole = (numbers % 1.0 == 0.0) & (rest % 1.0 == 0.0) & (rest >= 0.0) & (rest < 1e9)
-        if whole.all() and rest.max(initial=0.0) > 1e6:
+        other_values = table.plain(others[0])[0] if others else np.full(len(numbers), np.nan)
+        whole = (numbers % 1.0 == 0.0) & (other_values % 1.0 == 0.0) & (other_values >= 0.0) & (other_values < 1e9)
+        if whole.all() and other_values.max(initial=0.0) > 1e6:
             return Clock.of(table, Time(first, nanoseconds=others[0]), "seconds and nanoseconds")
     except RunError:
         return None
@@ -708,9 +726,9 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
 def _rising(table: Table, stroke: float, counts: Container[str]) -> Clock | None:
     """The one column but counts that goes on from row to row, whatever it is called; None of none or several."""
     within = table.columns if len(table.columns) > 1 else _numeric_paths(table)  # of one array its elements
-    found = [name for name in _risers(table, within, below=_axes_in_rows(table) != [{}]) if name not in counts]
-    clock = _clock_of(table, found[0], stroke) if len(found) == 1 else None
-    what = f"is {found[0]} the clock of {table.path.name}? It alone rises from row to row" if clock else ""
+    rising = [name for name in _risers(table, within, below=_axes_in_rows(table) != [{}]) if name not in counts]
+    clock = _clock_of(table, rising[0], stroke) if len(rising) == 1 else None
+    what = f"is {rising[0]} the clock of {table.path.name}? It alone rises from row to row" if clock else ""
     return clock and replace(clock, doubt=clock.doubt or what)
 
 
@@ -719,7 +737,7 @@ def _risers(table: Table, columns: Iterable[str], *, below: bool = False) -> lis
 
     With signals one ``below`` another they may begin anew.
     """
-    found = list[str]()
+    risers = list[str]()
     for name in columns:
         with suppress(RunError):
             values = table.plain(name)[0]
@@ -728,8 +746,8 @@ def _risers(table: Table, columns: Iterable[str], *, below: bool = False) -> lis
             enough = len(steps) >= max(fewest, _IN_ORDER * table.rows)
             goes_on = (steps >= 0.0).all() or (below and len(falls_back(values)))
             if enough and goes_on and (steps > 0.0).mean() >= _IN_ORDER:
-                found.append(name)
-    return [name for name in found if names.is_time(name)] or found
+                risers.append(name)
+    return [name for name in risers if names.is_time(name)] or risers
 
 
 def falls_back(stamp: TimeArray | FloatArray) -> IntArray:
@@ -749,8 +767,8 @@ def _ticks(steps: FloatArray) -> bool:
 
     Then all ticks are about as long, with about as many rows in each: no position goes on like that.
     """
-    place = np.flatnonzero(steps)
-    ticks, rows = steps[place], np.diff(place)
+    changes = np.flatnonzero(steps)
+    ticks, rows = steps[changes], np.diff(changes)
     if len(rows) < _FEWEST_ROWS or ticks.min() <= 0.0:
         return False
     alike = (np.abs(ticks / np.median(ticks) - 1.0) < _OF_TICK).mean() >= _IN_ORDER
@@ -776,10 +794,10 @@ def without_clock(part: Part) -> str:
 def unused(parts: Iterable[Part]) -> list[str]:
     """What of a log is taken for nothing, each with the reason: first what has no clock, then columns, then files."""
     parts = list(parts)
-    found = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
-    found += [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
-    found += [f"{part.label} ({part.notes[0]})" for part in parts if part.notes and not part.rows]
-    return [printable(one, 200) for one in dict.fromkeys(found)]
+    sentences = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
+    sentences += [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
+    sentences += [f"{part.label} ({part.notes[0]})" for part in parts if part.notes and not part.rows]
+    return [printable(fromkey, 200) for fromkey in dict.fromkeys(sentences)]
 
 
 def _no_clock(table: Table, name: str) -> str:
@@ -793,10 +811,10 @@ def _no_clock(table: Table, name: str) -> str:
 
 def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str, str]:
     """The unit of stamps, by what it is known, and a question where that may be wrong."""
-    known = values[np.isfinite(values)]
-    if len(known) < 2:
+    finite = values[np.isfinite(values)]
+    if len(finite) < 2:
         return "s", "default", ""
-    middle, steps = float(np.median(known)), np.diff(known)
+    middle, steps = float(np.median(finite)), np.diff(finite)
     interval = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
     stroke *= float((steps > 0.0).mean())  # in stamps: several rows may have one
     for unit, (low, high) in _EPOCHS.items():
@@ -806,12 +824,12 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
         return "days", "range", ""
     for unit, most in _INTERVALS.items():
         second = most / _INTERVALS["s"]
-        if span and 1.0 / _ALIKE_SPANS < float(np.ptp(known)) / second / span < _ALIKE_SPANS:
+        if span and 1.0 / _ALIKE_SPANS < float(np.ptp(finite)) / second / span < _ALIKE_SPANS:
             return unit, _ANOTHER, ""
         if not span and interval <= most:
             if interval <= _SLOW * most or stroke * interval <= _LONGEST_STROKE * second:
                 return unit, "interval", ""
-            slow = f"{float(np.ptp(known)) / second:.4g} s, and a stroke takes {stroke * interval / second:.3g} s"
+            slow = f"{float(np.ptp(finite)) / second:.4g} s, and a stroke takes {stroke * interval / second:.3g} s"
             finer = {"s": "ms", "ms": "us", "us": "ns"}[unit]
             return finer, "motion", f"in {finer}? In {unit} the log lasts {slow} (run.toml, time)"
     return "ns", "interval", ""
@@ -829,7 +847,9 @@ def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
         return
     if path.suffix == ".parquet":
         with tables.one_line(path):
-            fields = _likeliest([one.name for one in papq.read_schema(path) if "binary" not in str(one.type)])  # images
+            fields = _likeliest(
+                [field.name for field in papq.read_schema(path) if "binary" not in str(field.type)]
+            )  # images
         some = [name for name in names.EPISODES if name in fields]
         where = _first_run(read(fields=some)) if some else {}
         table = read(fields=fields, where=where)
@@ -843,11 +863,11 @@ def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
         table = tables.chosen(table, valid)
         notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
     type_ = _PX4 if px4 else ""
-    for place, rows in _by_frame(table, Part(path, topic, where=where, type=type_, notes=tuple(notes))):
-        yield _part(rows, place, _labels(path), rate)
+    for source, rows in _by_frame(table, Part(path, topic, where=where, type=type_, notes=tuple(notes))):
+        yield _part(rows, source, _labels(path), rate)
 
 
-def _by_frame(table: Table, place: Part) -> Iterator[tuple[Part, Table]]:
+def _by_frame(table: Table, source: Part) -> Iterator[tuple[Part, Table]]:
     """Of transforms of many frames those that move as seen from a base, of tools where there are any, each as a part.
 
     Joints turn links: these keep their place in the frame of the link before. Any other table as it is.
@@ -855,24 +875,24 @@ def _by_frame(table: Table, place: Part) -> Iterator[tuple[Part, Table]]:
     child = next((name for name in table.columns if name.endswith(_CHILD)), "")
     parent, translation = child.replace(_CHILD, "header.frame_id"), child.replace(_CHILD, "transform.translation.")
     if not child or longest(table.columns, translation + "x") is None:
-        yield place, table
+        yield source, table
         return
     frames = list(zip(table.texts(parent), table.texts(child), strict=True))
     at = np.stack([table.plain(translation + axis)[0] for axis in "xyz"])
-    rows = {pair: np.array([one == pair for one in frames]) for pair in dict.fromkeys(frames)}
+    rows = {pair: np.array([frame == pair for frame in frames]) for pair in dict.fromkeys(frames)}
     links = {name for _, name in rows}
-    moving = [pair for pair, mine in rows.items() if np.ptp(at[:, mine], axis=1).max() > 0.0]
+    moving = [pair for pair, here in rows.items() if np.ptp(at[:, here], axis=1).max() > 0.0]
     chosen = [pair for pair in moving if pair[0] not in links or names.has_word(_NUMBERS.sub("", pair[0]), _BASES)]
     chosen = [pair for pair in chosen if names.has_word(_NUMBERS.sub("", pair[1]), _TOOLS)] or chosen
     if not chosen:
-        yield replace(place, notes=(*place.notes, "no frame in it moves as seen from a base: links only turn")), table
-    others = [f"{one} → {name}" for one, name in rows if (one, name) not in chosen]
+        yield replace(source, notes=(*source.notes, "no frame in it moves as seen from a base: links only turn")), table
+    others = [f"{frame} → {name}" for frame, name in rows if (frame, name) not in chosen]
     notes = [f"transforms of {counted(len(others), 'other frame')} left out: {', '.join(others[:3])}"] if others else []
-    for one, name in chosen:
-        where = {child: name, **({parent: one} if sum(name == each for _, each in rows) > 1 else {})}
+    for frame, name in chosen:
+        where = {child: name, **({parent: frame} if sum(name == each for _, each in rows) > 1 else {})}
         where = where if others or len(chosen) > 1 else {}
-        mine = replace(place, where={**place.where, **where}, notes=(*place.notes, *notes))
-        yield mine, tables.chosen(table, where)
+        own_part = replace(source, where={**source.where, **where}, notes=(*source.notes, *notes))
+        yield own_part, tables.chosen(table, where)
 
 
 def _validity(table: Table) -> dict[str, Any]:
@@ -906,17 +926,19 @@ class _Info(msgspec.Struct):
 
 def _labels(path: Path) -> dict[str, list[str]]:
     """What the elements of lists are called, by column, in a data set of LeRobot."""
-    found, info = dict[str, list[str]](), _Info({})
+    labels, info = dict[str, list[str]](), _Info({})
     with suppress(msgspec.MsgspecError, OSError, StopIteration):
-        about = next(one for above in path.resolve().parents[:4] if (one := above / "meta" / "info.json").is_file())
+        about = next(
+            info_path for above in path.resolve().parents[:4] if (info_path := above / "meta" / "info.json").is_file()
+        )
         info = msgspec.json.decode(about.read_bytes(), type=_Info)
     for key, feature in info.features.items():
         inside: Any = feature.get("names")
         while isinstance(inside, dict | list) and inside:  # a list in a list, as Unitree's converter writes it
             listed = cast(list[Any], inside)
             inside = cast(Any, inside[0] if isinstance(inside, list) else next(iter(cast(Any, inside).values())))
-            found[key] = [str(label) for label in listed]  # also of { x = 0, y = 1 }
-    return found
+            labels[key] = [str(label) for label in listed]  # also of { x = 0, y = 1 }
+    return labels
 
 
 # Topics and entities.
@@ -929,16 +951,16 @@ def _recorded(path: Path) -> Iterator[Part]:
             f"{path}: has {len(topics)} topics or entities, more than {_MOST_PARTS}; describe it in run.toml"
         )
     for topic in topics:
-        place = Part(path, "", topic.name) if path.suffix == ".rrd" else Part(path, topic.name)
-        place = replace(place, type=topic.type, rows=topic.count)
+        source = Part(path, "", topic.name) if path.suffix == ".rrd" else Part(path, topic.name)
+        source = replace(source, type=topic.type, rows=topic.count)
         if why := _unread(topic):
-            yield replace(place, notes=(why,))
+            yield replace(source, notes=(why,))
             continue
         try:
-            for part, table in _by_frame(recordings.read(path, topic.name, _wanted(topic)), place):
+            for part, table in _by_frame(recordings.read(path, topic.name, _wanted(topic)), source):
                 yield _part(table, part, {})
         except RunError as error:
-            yield replace(place, notes=(str(error).removeprefix(f"{path}: "),))
+            yield replace(source, notes=(str(error).removeprefix(f"{path}: "),))
 
 
 def _unread(topic: Topic) -> str:
@@ -967,24 +989,28 @@ def no_commands(parts: Iterable[Part]) -> str:
     """What may be the commands and is none, and what to do, in words; empty without any."""
     parts = list(parts)
     clockless = any(part.signals and part.clock is None for part in parts)
-    found = ["if rows come at a constant rate, give it to init as --rate HZ"] if clockless else list[str]()
-    told = any(names.column_role(one.name) == "command" for part in parts for one in part.signals)  # positions, too
+    advice = ["if rows come at a constant rate, give it to init as --rate HZ"] if clockless else list[str]()
+    told = any(
+        names.column_role(signal.name) == "command" for part in parts for signal in part.signals
+    )  # positions, too
     for part in parts:
-        speeds = [one for one, why in part.left_out.items() if why in _SPEEDS and names.column_role(one) == "command"]
+        speeds = [
+            column for column, why in part.left_out.items() if why in _SPEEDS and names.column_role(column) == "command"
+        ]
         speeds = [] if told else speeds
         if _ARE_VELOCITIES in part.notes or speeds:
             what = f"{part.label} are" if not speeds else f"{', '.join(speeds[:3])} of {part.label} are"
-            found.append(
+            advice.append(
                 f"{what} velocities, and commands must be positions: integrate them along the measured heading, as"
                 " docs/own-log.md does under 'Commands that are velocities'"
             )
-        found += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
+        advice += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
         if part.clock and len(rows := falls_back(part.clock.stamp)):
-            found.append(
+            advice.append(
                 f"the clock of {part.label} begins anew in row {rows[0] + 1}: if its rows are signals one below"
                 " another, add a column of words that say which signal a row is of, such as command_x and measured_x"
             )
-    return "".join(f"{printable(one, 300)}; " for one in found) + ("or " if found else "")
+    return "".join(f"{printable(kind, 300)}; " for kind in advice) + ("or " if advice else "")
 
 
 def period_of(command: Source) -> float:

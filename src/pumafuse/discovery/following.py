@@ -52,16 +52,16 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     s, z = s[inside], z[inside]
     if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
         return None
-    found, noise, steps = list[tuple[float, float, Following]](), scatter(z), _resolution(z)
+    fits, noise, steps = list[tuple[float, float, Following]](), scatter(z), _resolution(z)
     outliers = float(isolated(z).mean())
     moves = _in_motion(z)
     for lag, correlation, slope in filter(None, (_at_span(t, u, s, z, span) for span in _SPANS)):
         led = np.interp(s - lag, t, u)
-        offset, rest = float(np.median(z - math.copysign(1.0, slope) * led)), z - slope * led
-        left = max(min(noise, scatter(rest)), steps)
-        one = Following(lag, correlation, slope, offset, left, steps, robust_sd(rest[moves]), outliers)
-        found.append((one.misfit, float(np.std(rest)), one))  # in whole counts medians are alike: what jumps decides
-    return min(found, key=lambda one: one[:2])[2] if found else None
+        offset, residual = float(np.median(z - math.copysign(1.0, slope) * led)), z - slope * led
+        left = max(min(noise, scatter(residual)), steps)
+        fit = Following(lag, correlation, slope, offset, left, steps, robust_sd(residual[moves]), outliers)
+        fits.append((fit.misfit, float(np.std(residual)), fit))  # in whole counts medians are alike: what jumps decides
+    return min(fits, key=lambda fit: fit[:2])[2] if fits else None
 
 
 def _stands(value: FloatArray) -> bool:
@@ -72,15 +72,15 @@ def _stands(value: FloatArray) -> bool:
 def _in_motion(value: FloatArray) -> BoolArray:
     """Rows that tell a lag: those in motion, where most are at rest and any lag and any gain would do, (n,)."""
     way = np.abs(np.gradient(value))
-    found = way >= _SLOW * np.quantile(way, _FASTEST)
-    return found if _FEWEST <= found.sum() < _MOSTLY * len(value) else np.ones(len(value), dtype=np.bool_)
+    moves = way >= _SLOW * np.quantile(way, _FASTEST)
+    return moves if _FEWEST <= moves.sum() < _MOSTLY * len(value) else np.ones(len(value), dtype=np.bool_)
 
 
 def known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
     """Seconds after an origin [ns] and values of the rows that have both, in order, without what no robot reaches."""
-    there = (stamp != NO_STAMP) & (np.abs(value) < _BEYOND)
-    time, order = np.unique((stamp[there] - origin) / 1e9, return_index=True)
-    return time, value[there][order]
+    valid = (stamp != NO_STAMP) & (np.abs(value) < _BEYOND)
+    time, order = np.unique((stamp[valid] - origin) / 1e9, return_index=True)
+    return time, value[valid][order]
 
 
 def _at_span(
@@ -105,26 +105,26 @@ def _at_span(
         return changes(np.interp(begin[::every] - later, t, u), np.interp(end[::every] - later, t, u))
 
     def correlations(lags: FloatArray, every: int = 1) -> FloatArray:
-        others, mine = moves(lags, every), change[::every]
-        norm = np.sqrt(np.einsum("ij,ij->i", others, others) * float(mine @ mine))
-        return (others @ mine) / np.where(norm > 0.0, norm, np.inf)
+        others, own_moves = moves(lags, every), change[::every]
+        norm = np.sqrt(np.einsum("ij,ij->i", others, others) * float(own_moves @ own_moves))
+        return (others @ own_moves) / np.where(norm > 0.0, norm, np.inf)
 
     coarse, every = np.arange(_EARLIEST, LATEST, _COARSE), max(1, len(change) // _FEW)
-    found = correlations(coarse, every)
-    if not np.abs(found).any():
+    by_lag = correlations(coarse, every)
+    if not np.abs(by_lag).any():
         return None
-    sign = -1.0 if found.max() <= 0.0 or -found.min() > found.max() + _MIRRORED else 1.0
-    found = np.pad(sign * found, 1, constant_values=-1.0)
-    peaks = (found[1:-1] >= np.maximum(found[:-2], found[2:])) & (found[1:-1] >= _NEARLY * found.max())
+    sign = -1.0 if by_lag.max() <= 0.0 or -by_lag.min() > by_lag.max() + _MIRRORED else 1.0
+    by_lag = np.pad(sign * by_lag, 1, constant_values=-1.0)
+    peaks = (by_lag[1:-1] >= np.maximum(by_lag[:-2], by_lag[2:])) & (by_lag[1:-1] >= _NEARLY * by_lag.max())
     best = min(coarse[peaks], key=abs)
     fine = np.arange(best - 1.5 * _COARSE, best + 1.5 * _COARSE, _FINE)
     lag = float(fine[np.argmax(sign * correlations(fine))])
     other = moves(np.array([lag]))[0]
     slope = float(other @ change) / float(other @ other)
-    rest = change - slope * other
-    kept = np.abs(rest - np.median(rest)) <= _OUTLYING * robust_sd(rest)
+    left = change - slope * other
+    kept = np.abs(left - np.median(left)) <= _OUTLYING * robust_sd(left)
     is_motion = float(other[kept] @ other[kept]) < (1.0 - 2.0 * _MOST_OUTLYING) * float(other @ other)
-    if np.count_nonzero(~kept) <= _MOST_OUTLYING * len(rest) and not is_motion:
+    if np.count_nonzero(~kept) <= _MOST_OUTLYING * len(left) and not is_motion:
         other, change = other[kept], change[kept]
     power = math.sqrt(float(other @ other) * float(change @ change))
     return (lag, float(other @ change) / power, slope) if power > 0.0 else None
@@ -167,17 +167,20 @@ def resolution(value: FloatArray) -> float:
 
 def isolated(value: FloatArray) -> BoolArray:
     """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,)."""
-    found = np.zeros(len(value), dtype=np.bool_)
+    is_isolated = np.zeros(len(value), dtype=np.bool_)
     if len(value) < _FEWEST:
-        return found
-    neighbours, place = np.stack([value[:-4], value[1:-3], value[3:-1], value[4:]]), np.array([-2.0, -1.0, 1.0, 2.0])
+        return is_isolated
+    neighbours, positions = (
+        np.stack([value[:-4], value[1:-3], value[3:-1], value[4:]]),
+        np.array([-2.0, -1.0, 1.0, 2.0]),
+    )
     middle = neighbours.mean(axis=0)
-    off = np.abs(neighbours - middle - place[:, None] * (place @ neighbours / 10.0)).max(axis=0)
+    off = np.abs(neighbours - middle - positions[:, None] * (positions @ neighbours / 10.0)).max(axis=0)
     least = np.maximum(_OUTLYING * max(scatter(value), _resolution(value)), _APART * off)
-    found[2:-2] = np.abs(value[2:-2] - middle) > least
-    return found
+    is_isolated[2:-2] = np.abs(value[2:-2] - middle) > least
+    return is_isolated
 
 
-def robust_sd(rest: FloatArray) -> float:
+def robust_sd(residual: FloatArray) -> float:
     """Standard deviation by the median distance from the median."""
-    return SD_OF_MEDIAN * float(np.median(np.abs(rest - np.median(rest))))
+    return SD_OF_MEDIAN * float(np.median(np.abs(residual - np.median(residual))))

@@ -83,29 +83,30 @@ class SensorGuess:
     pair: Pair | None = None
 
 
-def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
+def guess(survey: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     """The arm, and each sensor."""
-    run = found.run
+    run = survey.run
     period = period_of(run.command)
     if math.isnan(period):
-        raise RunError(f"{found.log}: fewer than two commands with stamps of their own")
-    relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= FOLLOWS}
-    first, latencies, pairs = _against_each_other(found.run, relations)
+        raise RunError(f"{survey.log}: fewer than two commands with stamps of their own")
+    relations = {key: relation for key, relation in survey.relations.items() if abs(relation.correlation) >= FOLLOWS}
+    first, latencies, pairs = _against_each_other(survey.run, relations)
     leads = {
         axis: {name: relations[name, axis] for name in run.sensors if (name, axis) in relations} for axis in run.axes
     }
     # Behind the path through the commanded points a held command is late by half a period itself.
     lags = {
-        axis: float(np.median([one.lag - latencies.get(name, 0.0) for name, one in mine.items()])) - 0.5 * period
-        for axis, mine in leads.items()
-        if mine
+        axis: float(np.median([relation.lag - latencies.get(name, 0.0) for name, relation in followers.items()]))
+        - 0.5 * period
+        for axis, followers in leads.items()
+        if followers
     }
-    speeds = [one.speeds.lag - 0.5 * period for one in found.own_frames.values()]
+    speeds = [own_frame.speeds.lag - 0.5 * period for own_frame in survey.own_frames.values()]
     unknown = max(float(np.median(speeds)), 0.0) if speeds else _UNKNOWN_LAG
     shortest = max(min(lags.values(), default=unknown), 0.0)
     delay = _DELAY_SHARE * shortest
-    axes = {axis: _axis(found, axis, leads[axis], lags.get(axis, unknown), delay) for axis in run.axes}
-    sensors = {name: _sensor(found, name, latencies, first, leads, pairs.get(name)) for name in run.sensors}
+    axes = {axis: _axis(survey, axis, leads[axis], lags.get(axis, unknown), delay) for axis in run.axes}
+    sensors = {name: _sensor(survey, name, latencies, first, leads, pairs.get(name)) for name in run.sensors}
     return ArmGuess(period, delay, axes), sensors
 
 
@@ -114,17 +115,21 @@ def _against_each_other(
 ) -> tuple[str, dict[str, float], dict[str, Pair]]:
     """The earliest source, or the reference; how much later each is [s]; each beside the densest."""
     lags: dict[str, list[float]] = {}
-    for (name, _), one in relations.items():
-        lags.setdefault(name, []).append(one.lag)
+    for (name, _), relation in relations.items():
+        lags.setdefault(name, []).append(relation.lag)
     if not lags:
         return "", {}, {}
     base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
     others = [name for name in lags if name != base]
-    pairs = {name: Pair(base, one) for name in others if (one := aligned([run], base, name)) is not None}
-    every = {name: one.alignment for name, one in pairs.items()}
+    pairs = {name: Pair(base, alignment) for name in others if (alignment := aligned([run], base, name)) is not None}
+    every = {name: pair.alignment for name, pair in pairs.items()}
     # One that seems earlier than the densest one, but not surely, would make the time of all wrong by that.
-    known = {name: one.latency for name, one in every.items() if not -_SURELY * one.half < one.latency < 0.0}
-    later = {base: 0.0, **known}
+    early = {
+        name: alignment.latency
+        for name, alignment in every.items()
+        if not -_SURELY * alignment.half < alignment.latency < 0.0
+    }
+    later = {base: 0.0, **early}
     first = base if base == REFERENCE else min(later, key=later.__getitem__)
     ahead = float(np.median(lags[first]))
     ahead = ahead if ahead < -AHEAD else 0.0
@@ -132,29 +137,29 @@ def _against_each_other(
     return first, latencies, pairs
 
 
-def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
+def _axis(survey: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
     best = max(followers, key=lambda name: abs(followers[name].correlation), default="")
-    travel = float(np.nanmax(found.run.command.values[axis]) - np.nanmin(found.run.command.values[axis]))
-    one = followers.get(best)
-    misfit = max(one.misfit if one else 0.02 * travel, _SMALLEST_SD)
-    offset = min((abs(one.offset) for one in followers.values()), default=0.0)
-    rest = max(lag - delay, 0.2 * lag, 1e-3)
+    travel = float(np.nanmax(survey.run.command.values[axis]) - np.nanmin(survey.run.command.values[axis]))
+    relation = followers.get(best)
+    misfit = max(relation.misfit if relation else 0.02 * travel, _SMALLEST_SD)
+    offset = min((abs(follower.offset) for follower in followers.values()), default=0.0)
+    lag_of_plant = max(lag - delay, 0.2 * lag, 1e-3)
     return AxisGuess(
-        kind=found.run.kinds.get(axis, "length"),
+        kind=survey.run.kinds.get(axis, "length"),
         follows=best,
-        lag=max(lag, delay + rest),
-        time_constant=rest,
-        gain=abs(one.slope) if one else 1.0,
+        lag=max(lag, delay + lag_of_plant),
+        time_constant=lag_of_plant,
+        gain=abs(relation.slope) if relation else 1.0,
         misfit=misfit,
-        start=_start(found, axis, best, one, misfit, travel) if one else None,
+        start=_start(survey, axis, best, relation, misfit, travel) if relation else None,
         offset_sd=max(3.0 * misfit, 2.0 * offset if offset < 0.5 * travel else 0.0),
-        input_noise=misfit * math.sqrt(rest),
+        input_noise=misfit * math.sqrt(lag_of_plant),
         drift=0.5 * misfit,
     )
 
 
 def _sensor(
-    found: Survey,
+    survey: Survey,
     name: str,
     latencies: Mapping[str, float],
     first: str,
@@ -162,39 +167,44 @@ def _sensor(
     pair: Pair | None,
 ) -> SensorGuess:
     noises = {} if pair is None else pair.alignment.sd
-    relations = {axis: found.relations.get((name, axis)) for axis in found.run.sensors[name].values}
-    known = {axis: one for axis, one in relations.items() if one is not None}
-    mirrored = [one.slope < 0.0 for one in known.values() if abs(one.correlation) >= FOLLOWS]
+    relations = {axis: survey.relations.get((name, axis)) for axis in survey.run.sensors[name].values}
+    by_axis = {axis: relation for axis, relation in relations.items() if relation is not None}
+    mirrored = [relation.slope < 0.0 for relation in by_axis.values() if abs(relation.correlation) >= FOLLOWS]
     scale = -1.0 if sum(mirrored) > len(mirrored) / 2 else 1.0
-    bias = {axis: size for axis, one in known.items() if (size := _bias(found, axis, one, scale, leads[axis]))}
+    bias = {
+        axis: size for axis, relation in by_axis.items() if (size := _bias(survey, axis, relation, scale, leads[axis]))
+    }
     sd = dict.fromkeys(relations, _UNKNOWN_SD)
-    for axis, one in known.items():  # the least of three: how far a slow sensor moves from row to row is none of it
-        alone = noise(found.run.command, found.run.sensors[name], axis, one.lag)
-        sd[axis] = max(min(one.scatter, alone, noises.get(axis, math.inf)), one.resolution, _SMALLEST_SD)
+    for (
+        axis,
+        relation,
+    ) in by_axis.items():  # the least of three: how far a slow sensor moves from row to row is none of it
+        alone = noise(survey.run.command, survey.run.sensors[name], axis, relation.lag)
+        sd[axis] = max(min(relation.scatter, alone, noises.get(axis, math.inf)), relation.resolution, _SMALLEST_SD)
     words = "DECIDE: how old a measurement is when it is stamped"
     if first == REFERENCE and name in latencies:
         words = "so much later than the reference, whose stamps are taken to be right"
     elif first and name != first and name in latencies:
         words = f"so much later than {first}; add how old a measurement of that one is"
-    turns = found.roles is not None and any(one.turns for one in found.roles.sensors if one.name == name)
-    gates = [_gate(value) for value in found.run.sensors[name].values.values()]
-    gate = min((one for one in gates if one), default=0.0)
-    known = SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns)
+    turns = survey.roles is not None and any(sensor.turns for sensor in survey.roles.sensors if sensor.name == name)
+    gates = [_gate(value) for value in survey.run.sensors[name].values.values()]
+    gate = min((gate for gate in gates if gate), default=0.0)
+    by_axis = SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns)
     if pair is None:
-        return known
+        return by_axis
     beside = pair.alignment
     doubts = list(beside.doubts(name, pair.other))
-    return replace(known, latency_sd=beside.unsteadiness, doubts=doubts, pair=pair)
+    return replace(by_axis, latency_sd=beside.unsteadiness, doubts=doubts, pair=pair)
 
 
-def _start(found: Survey, axis: str, name: str, one: Following, misfit: float, travel: float) -> float | None:
+def _start(survey: Survey, axis: str, name: str, following: Following, misfit: float, travel: float) -> float | None:
     """Where an axis starts by its best sensor [m or rad]; None: at its first command, or nothing tells."""
-    (given, told), (stamp, seen) = found.run.command.series(axis), found.run.measured[name].series(axis)
-    near = int(np.argmin(np.abs(stamp - given[0])))
-    if stamp[near] - given[0] > _SOON * max(one.lag, 0.0) * 1e9:
+    (told_at, told), (stamp, seen) = survey.run.command.series(axis), survey.run.measured[name].series(axis)
+    near = int(np.argmin(np.abs(stamp - told_at[0])))
+    if stamp[near] - told_at[0] > _SOON * max(following.lag, 0.0) * 1e9:
         return None
-    level = math.copysign(1.0, one.slope) * (float(seen[near]) - one.offset)
-    unsure = _AWAY * (misfit + one.scatter + one.resolution) + abs(abs(one.slope) - 1.0) * travel
+    level = math.copysign(1.0, following.slope) * (float(seen[near]) - following.offset)
+    unsure = _AWAY * (misfit + following.scatter + following.resolution) + abs(abs(following.slope) - 1.0) * travel
     return level if abs(level - float(told[0])) > unsure else None
 
 
@@ -203,25 +213,27 @@ def _gate(value: FloatArray) -> float:
     value = value[np.isfinite(value)]
     if not len(value):
         return 0.0
-    found = isolated(value)
-    if found.sum() >= _FEWEST_OUTLIERS and found.mean() > _OUTLIERS:
+    is_isolated = isolated(value)
+    if is_isolated.sum() >= _FEWEST_OUTLIERS and is_isolated.mean() > _OUTLIERS:
         return _GATE
     for every in range(1, _LONGEST_GLITCH + 1):  # by which a glitch of so many rows is one
         some = value[::every]
-        place = np.flatnonzero(isolated(some))
-        beside = 0.5 * (some[place - 1] + some[place + 1])
-        if (np.abs(some[place] - beside) > _FAR * np.ptp(np.delete(some, place))).any():
+        rows = np.flatnonzero(isolated(some))
+        beside = 0.5 * (some[rows - 1] + some[rows + 1])
+        if (np.abs(some[rows] - beside) > _FAR * np.ptp(np.delete(some, rows))).any():
             return _WIDE_GATE
     return 0.0
 
 
-def _bias(found: Survey, axis: str, one: Following, scale: float, others: Mapping[str, Following]) -> float:
+def _bias(survey: Survey, axis: str, following: Following, scale: float, others: Mapping[str, Following]) -> float:
     """The prior sd of a sensor's bias: where its zero is far from the commands', or from a better sensor's; 0: none."""
-    value = found.run.command.values[axis]
+    value = survey.run.command.values[axis]
     travel = float(np.nanmax(value) - np.nanmin(value))
-    noise = _DIFFERENT * (one.scatter + one.misfit)
-    if scale < 0.0 or abs(one.offset) > max(0.5 * travel, noise):
-        return 2.0 * max(abs(one.offset), noise)
-    best = min((other for other in others.values() if other.slope > 0.0), key=lambda other: other.scatter, default=one)
-    apart = abs(one.offset - best.offset)
+    noise = _DIFFERENT * (following.scatter + following.misfit)
+    if scale < 0.0 or abs(following.offset) > max(0.5 * travel, noise):
+        return 2.0 * max(abs(following.offset), noise)
+    best = min(
+        (other for other in others.values() if other.slope > 0.0), key=lambda other: other.scatter, default=following
+    )
+    apart = abs(following.offset - best.offset)
     return 2.0 * apart if apart > noise else 0.0

@@ -67,10 +67,10 @@ class Grid(NamedTuple):
     def mean(self, stamp: TimeArray, value: FloatArray) -> FloatArray:
         """The mean of the values in each bin without the margins, NaN without any, (n,)."""
         size = len(self.time) - 2 * self.margin
-        place = np.floor((stamp - self.time[self.margin]) / (self.step * 1e9) + 0.5).astype(np.int64)
-        inside = (place >= 0) & (place < size)
-        number = np.bincount(place[inside], minlength=size)
-        total = np.bincount(place[inside], weights=value[inside], minlength=size)
+        rows = np.floor((stamp - self.time[self.margin]) / (self.step * 1e9) + 0.5).astype(np.int64)
+        inside = (rows >= 0) & (rows < size)
+        number = np.bincount(rows[inside], minlength=size)
+        total = np.bincount(rows[inside], weights=value[inside], minlength=size)
         return np.divide(total, number, out=np.full(size, np.nan), where=number > 0)
 
 
@@ -103,28 +103,28 @@ def matches(measured: Mapping[str, FloatArray], led: Mapping[str, FloatArray], g
     every = np.arange(-grid.margin, grid.margin + 1)
     near = np.flatnonzero(np.abs(every * grid.step) <= max(SMALL_SHIFT, grid.step))
     fits = {axis: _fits(value, commanded, grid.margin) for axis, value in measured.items()}
-    place, cost, together = dict[str, tuple[int, int]](), 0.0, np.zeros(len(every))
+    places_taken, cost, together = dict[str, tuple[int, int]](), 0.0, np.zeros(len(every))
     for axis, fit in fits.items():
-        own, same = names.index(axis), np.where(fit.slope > 0.0, fit.unexplained, np.inf)
+        column, same = names.index(axis), np.where(fit.slope > 0.0, fit.unexplained, np.inf)
         # Of shifts about as good one counts at which both move the same way.
         alike = same[:, near].min(axis=1) <= fit.unexplained[:, near].min(axis=1) + _AS_GOOD
-        places = [_nearest(one, near) for one in np.where(alike[:, None], same, fit.unexplained)]
-        costs = fit.unexplained[range(len(names)), places] + _MUCH_BETTER * (np.arange(len(names)) != own)
+        places = [_nearest(unexplained, near) for unexplained in np.where(alike[:, None], same, fit.unexplained)]
+        costs = fit.unexplained[range(len(names)), places] + _MUCH_BETTER * (np.arange(len(names)) != column)
         best = int(np.argmin(costs))
-        place[axis], cost = (best, places[best]), cost + float(costs[best])
-        together += np.where(fit.slope[own] > 0.0, fit.unexplained[own], 0.0)
+        places_taken[axis], cost = (best, places[best]), cost + float(costs[best])
+        together += np.where(fit.slope[column] > 0.0, fit.unexplained[column], 0.0)
     late = _nearest(together, np.arange(len(every)))
     shift = 0.0
     if together[late] + _MUCH_BETTER < cost:
-        place = {axis: (names.index(axis), late) for axis in fits}
+        places_taken = {axis: (names.index(axis), late) for axis in fits}
         shift = (float(every[late]) + _between(together, late)) * grid.step
-    found = dict[str, Match]()
-    for axis, (other, at) in place.items():
+    by_axis = dict[str, Match]()
+    for axis, (other, at) in places_taken.items():
         slope, first = float(fits[axis].slope[other, at]), 2 * grid.margin - at
         steady, _ = slope_of_pieces(measured[axis], commanded[other][first : first + len(measured[axis])])
         is_steady = abs(steady - slope) < 0.5 * abs(slope)
-        found[axis] = Match(names[other], shift, float(fits[axis].correlation[other, at]), slope, is_steady)
-    return found
+        by_axis[axis] = Match(names[other], shift, float(fits[axis].correlation[other, at]), slope, is_steady)
+    return by_axis
 
 
 def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple[float, float]) -> float | None:
@@ -134,8 +134,8 @@ def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple
     clocks would be one; of shifts that are about as good the one counts that is nearest to none. Stamps [ns] ascend;
     ``near`` are the lags [s] on one clock.
     """
-    first, begin = (min(int(stamp[0]) for stamp, _ in one.values()) for one in (led, measured))
-    until, last = (max(int(stamp[-1]) for stamp, _ in one.values()) for one in (led, measured))
+    first, begin = (min(int(stamp[0]) for stamp, _ in series.values()) for series in (led, measured))
+    until, last = (max(int(stamp[-1]) for stamp, _ in series.values()) for series in (led, measured))
     apart, span, overlap = (begin - first) / 1e9, (last - begin) / 1e9, last > first and begin < until
     farthest = max(0.5 * span, abs(apart) + near[1] if overlap else 0.0)
     period = max(float(np.median(np.diff(stamp))) for stamp, _ in led.values()) / 1e9
@@ -160,13 +160,13 @@ def lateness(measured: Mapping[str, FloatArray], led: Mapping[str, FloatArray], 
     As of :func:`matches`; motion against the commands is not explained.
     """
     fits = [_fits(value, (led[axis] - led[axis].mean())[None], grid.margin) for axis, value in measured.items()]
-    return np.sum([np.where(one.slope[0] > 0.0, one.unexplained[0], 0.0) for one in fits], axis=0)
+    return np.sum([np.where(fit.slope[0] > 0.0, fit.unexplained[0], 0.0) for fit in fits], axis=0)
 
 
 def best_shift(unexplained: FloatArray, grid: Grid) -> float:
     """The shift at which least is left [s]; of those that are about as good the one nearest to none."""
-    place = _nearest(unexplained, np.arange(len(unexplained)))
-    return (place - grid.margin + _between(unexplained, place)) * grid.step
+    row = _nearest(unexplained, np.arange(len(unexplained)))
+    return (row - grid.margin + _between(unexplained, row)) * grid.step
 
 
 def slope_of_pieces(measured: FloatArray, led: FloatArray) -> tuple[float, float]:
@@ -226,14 +226,14 @@ def _nearest(unexplained: FloatArray, places: IntArray) -> int:
     beside = np.pad(unexplained, 1, constant_values=np.inf)[np.add.outer(places, [0, 2])]
     low = unexplained[places]
     valley = (low <= beside.min(axis=1)) & (low <= low.min() + _AS_GOOD) | (low == low.min())
-    return int(min(places[valley], key=lambda place: abs(place - len(unexplained) // 2)))
+    return int(min(places[valley], key=lambda row: abs(row - len(unexplained) // 2)))
 
 
-def _between(unexplained: FloatArray, place: int) -> float:
+def _between(unexplained: FloatArray, row: int) -> float:
     """How far from a place a parabola through what is left there and beside it is lowest; 0 at an edge."""
-    before, there, after = np.exp(np.pad(unexplained, 1, mode="edge")[place : place + 3]).tolist()
-    bend = before - 2.0 * there + after
-    return 0.5 * (before - after) / bend if bend > 0.0 and 0 < place < len(unexplained) - 1 else 0.0
+    before, here, after = np.exp(np.pad(unexplained, 1, mode="edge")[row : row + 3]).tolist()
+    bend = before - 2.0 * here + after
+    return 0.5 * (before - after) / bend if bend > 0.0 and 0 < row < len(unexplained) - 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -328,18 +328,18 @@ class Tracking:
         _, measured, led, before = self._near
         _, moved, moved_before = self._moved
         motions = (led, moved), (led - before, moved - moved_before)
-        columns = [one for one, about_zero in motions if _spread(about_zero) > self.noise]
-        known, off = np.array([np.ones(len(led)), *columns]), measured - led
-        gram = known @ known.T
-        found = np.linalg.lstsq(gram, known @ off)[0]
-        if not self.excludes(float(found[0])):
+        columns = [column for column, about_zero in motions if _spread(about_zero) > self.noise]
+        columns_and_one, off = np.array([np.ones(len(led)), *columns]), measured - led
+        gram = columns_and_one @ columns_and_one.T
+        line = np.linalg.lstsq(gram, columns_and_one @ off)[0]
+        if not self.excludes(float(line[0])):
             return 0.0
-        left = off - found @ known
+        left = off - line @ columns_and_one
         wanders = float(np.std([piece.mean() for piece in np.array_split(left, _PIECES)]))
         # at a distance from the start that hardly changes, the constant is as uncertain as the slope
         chance = wanders * math.sqrt(len(left) * float(np.linalg.pinv(gram, hermitian=True)[0, 0]))
         error = max(chance, _MODEL * float(np.ptp(led)))
-        return float(found[0]) if abs(found[0]) > _FAR * error else 0.0
+        return float(line[0]) if abs(line[0]) > _FAR * error else 0.0
 
     def excludes(self, zero: float) -> bool:
         """Whether the priors do not expect such a difference of the zeros [m or rad]."""

@@ -76,7 +76,7 @@ _TIME_UNITS = {
     **dict.fromkeys(words_in("milliseconds millis msecs msec ms"), "ms"),
     **dict.fromkeys(words_in("microseconds micros usecs usec us"), "us"),
 }
-_TIMES = frozenset(one for one in _TIME_UNITS if len(one) > 2) | words_in(
+_TIMES = frozenset(word for word in _TIME_UNITS if len(word) > 2) | words_in(
     "t time times stamp stamps timestamp timestamps date datetime clock ts arrival arrived zeit"
 )
 COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
@@ -108,7 +108,7 @@ _TURNING = re.compile(
 
 _KNOWN = _OF_ROLES | _SILENT | _NO_POSITIONS | _TELLING
 # Words of roles without a separator before or behind an axis or what is no position; com is a centre of mass, too.
-_ROLE = "|".join(sorted({one for one in _OF_ROLES if len(one) > 2} - {"com"} | {"act"}))
+_ROLE = "|".join(sorted({word for word in _OF_ROLES if len(word) > 2} - {"com"} | {"act"}))
 _WHAT = rf"(?:[xyzqj]|{'|'.join(sorted((_POSITIONS | _NO_POSITIONS | {'joint'}) - _TIMES))})\d*"
 _GLUED = re.compile(rf"({_ROLE})({_WHAT})|({_WHAT})({_ROLE})")
 
@@ -121,15 +121,15 @@ def words(name: str) -> list[str]:
     apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
     whole = [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
     glued = [None if word in _KNOWN else _GLUED.fullmatch(word) for word in whole]
-    found = [
+    parts = [
         part
         for word, match in zip(whole, glued, strict=True)
         for part in (filter(None, match.groups()) if match else [word])
     ]
-    numbered = [re.fullmatch(r"([a-z]+)(\d+)", word) for word in found]
+    numbered = [re.fullmatch(r"([a-z]+)(\d+)", word) for word in parts]
     return [
         part
-        for word, match in zip(found, numbered, strict=True)
+        for word, match in zip(parts, numbered, strict=True)
         for part in (match.groups() if match and match[1] in _OF_ROLES - _DEVICES else (word,))
     ]
 
@@ -141,8 +141,8 @@ def role_of(name: str) -> Role | None:
 
 def may_be_seen(name: str) -> bool:
     """Whether a name calls its numbers commands by nothing but a word for what a camera looks at, too."""
-    found = {word.rstrip(_DIGITS) for word in words(name)} & _ROLES["command"]
-    return bool(found) and found <= _SEEN
+    stems = {word.rstrip(_DIGITS) for word in words(name)} & _ROLES["command"]
+    return bool(stems) and stems <= _SEEN
 
 
 def role_words(column: str) -> list[str]:
@@ -155,14 +155,14 @@ def column_role(column: str) -> Role | None:
     return _role(words(leaf(column)), frozenset())
 
 
-def quantity(place: str, column: str) -> set[str]:
+def quantity(label: str, column: str) -> set[str]:
     """The words of a place, and the devices of a column there, that are the same of raw and filtered numbers."""
-    return {*words(place), *_DEVICES.intersection(words(column))} - FILTERED - {"raw"}
+    return {*words(label), *_DEVICES.intersection(words(column))} - FILTERED - {"raw"}
 
 
-def has_word(name: str, known: frozenset[str]) -> bool:
+def has_word(name: str, vocabulary: frozenset[str]) -> bool:
     """Whether one of these words is in a name."""
-    return not known.isdisjoint(words(name))
+    return not vocabulary.isdisjoint(words(name))
 
 
 def is_time(column: str) -> bool:
@@ -181,8 +181,8 @@ def likeliest_first(columns: Iterable[str]) -> list[str]:
     count = Counter[str]()
 
     def place(column: str) -> tuple[bool, int]:
-        found = words(leaf(column))
-        about = "when" if not _TELLING.isdisjoint(found) else _role(found, frozenset()) or ""
+        parts = words(leaf(column))
+        about = "when" if not _TELLING.isdisjoint(parts) else _role(parts, frozenset()) or ""
         count[about] += 1
         return not about, count[about]
 
@@ -191,29 +191,29 @@ def likeliest_first(columns: Iterable[str]) -> list[str]:
 
 def no_position(column: str) -> str | None:
     """What a column is by its name, if that is no position; a unit of positions wins over words."""
-    kind, unit, found = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
-    if not _CHANGES.isdisjoint(found):
+    kind, unit, parts = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
+    if not _CHANGES.isdisjoint(parts):
         return "relative: a change, no position"
-    known = kind is not None or _BRACKETED.search(column) is not None
-    if not known and role_words(column) and any(one.rstrip(_DIGITS) == "qd" for one in found):
+    is_told = kind is not None or _BRACKETED.search(column) is not None
+    if not is_told and role_words(column) and any(word.rstrip(_DIGITS) == "qd" for word in parts):
         return "velocity"  # as UR calls it: target_qd_0 beside target_q_0
-    if whole := None if known else next((_WHOLE[one] for one in found if one in _WHOLE), None):
+    if whole := None if is_told else next((_WHOLE[word] for word in parts if word in _WHOLE), None):
         return whole
-    found = [one.rstrip(_DIGITS) for one in found]
-    whats = [one for one in found if one in (_SPREADS if known else _NO_POSITIONS)]
-    if len(whats) == 1 and whats[0] in _NOW and not _POSITIONS.isdisjoint(found):
+    parts = [word.rstrip(_DIGITS) for word in parts]
+    whats = [word for word in parts if word in (_SPREADS if is_told else _NO_POSITIONS)]
+    if len(whats) == 1 and whats[0] in _NOW and not _POSITIONS.isdisjoint(parts):
         return None
-    if len(whats) == 1 and found[-1] in _FINGERS and role_words(column):
+    if len(whats) == 1 and parts[-1] in _FINGERS and role_words(column):
         return None
     of_unit = f"in {unit.strip('_').replace('_', '/')}" if unit is not None and kind is None else None
-    return next(iter(whats), "in °C or °/s" if "°" in column and not known else of_unit)
+    return next(iter(whats), "in °C or °/s" if "°" in column and not is_told else of_unit)
 
 
-def no_position_by_place(place: str, columns: Iterable[str]) -> str | None:
+def no_position_by_place(label: str, columns: Iterable[str]) -> str | None:
     """What the columns of a file or topic are by its name, if they have no words of their own and are no positions."""
     silent = all(axis_of(column, []) == "position" and not role_words(column) for column in columns)
-    why = no_position(place) if silent else None
-    return None if why is None or why in _TELLING or has_word(place, _POSITIONS) else why
+    why = no_position(label) if silent else None
+    return None if why is None or why in _TELLING or has_word(label, _POSITIONS) else why
 
 
 def family(column: str, columns: Container[str]) -> tuple[str, str, str]:
@@ -254,8 +254,8 @@ def is_turning(axis: str) -> bool:
 
 def turns(column: str, axis: str) -> bool:
     """Whether a column is of a joint that turns, by its axis or, as ``joint_pos_FL``, by a word before that."""
-    found = {word.rstrip(_DIGITS) for word in words(leaf(column))}
-    return is_turning(axis) or (not _JOINTS.isdisjoint(found) and SLIDING.isdisjoint(found))
+    stems = {word.rstrip(_DIGITS) for word in words(leaf(column))}
+    return is_turning(axis) or (not _JOINTS.isdisjoint(stems) and SLIDING.isdisjoint(stems))
 
 
 def axis_of(column: str, labels: list[str]) -> str:
@@ -265,9 +265,9 @@ def axis_of(column: str, labels: list[str]) -> str:
     if label and label[1].isdigit():
         if (told := label_of(column, labels)) is not None:
             return plain(re.sub(r"\.pos$", "", told))
-        place = int(label[1])
-        spatial = place < 3 and not {"translation", "translations"}.isdisjoint(words(column))
-        return "xyz"[place] if spatial else f"joint{place}"
+        number = int(label[1])
+        spatial = number < 3 and not {"translation", "translations"}.isdisjoint(words(column))
+        return "xyz"[number] if spatial else f"joint{number}"
     if label:
         return plain(label[1]) or "position"
     unit = unit_of(column)
@@ -283,8 +283,8 @@ def axis_of(column: str, labels: list[str]) -> str:
 
 def label_of(column: str, labels: list[str]) -> str | None:
     """What the element of a list is called, where the log says so."""
-    place = re.search(r"\[(\d+)\]$", column)
-    return labels[int(place[1])] if place and int(place[1]) < len(labels) else None
+    index = re.search(r"\[(\d+)\]$", column)
+    return labels[int(index[1])] if index and int(index[1]) < len(labels) else None
 
 
 def plain(name: str) -> str:
@@ -295,11 +295,11 @@ def plain(name: str) -> str:
     return f"{made}_axis" if made in _KEYS else made
 
 
-def _role(found: list[str], more: frozenset[str]) -> Role | None:
-    plainly = {word.rstrip(_DIGITS) for word in found}
+def _role(parts: list[str], more: frozenset[str]) -> Role | None:
+    plainly = {word.rstrip(_DIGITS) for word in parts}
     if not plainly.isdisjoint(_MARKERS | _DEVICES):  # camera_target is what a camera looks at
         plainly -= _SEEN
-    for role, known in _ROLES.items():
-        if not known.isdisjoint(plainly):
+    for role, vocabulary in _ROLES.items():
+        if not vocabulary.isdisjoint(plainly):
             return role
-    return None if more.isdisjoint(found) else "sensor"
+    return None if more.isdisjoint(parts) else "sensor"

@@ -69,8 +69,8 @@ class Attitude:
     @property
     def turns(self) -> bool:
         """Whether it ever changes: one that does not tells nothing."""
-        known = self.quaternion[np.isfinite(self.quaternion[:, 0])]
-        return len(known) >= _FEWEST and float(rotations.angle_between(known, known[:1]).max()) > _STILL
+        valid = self.quaternion[np.isfinite(self.quaternion[:, 0])]
+        return len(valid) >= _FEWEST and float(rotations.angle_between(valid, valid[:1]).max()) > _STILL
 
     @property
     def farthest(self) -> float:
@@ -101,19 +101,19 @@ def attitudes_in(table: Table, paths: Iterable[str]) -> list[Attitude]:
 def _plain(table: Table, columns: Sequence[str]) -> FloatArray | None:
     """Columns of numbers, (rows, k); None where one is something else."""
     try:
-        return np.column_stack([table.plain(one)[0] for one in columns])
+        return np.column_stack([table.plain(column)[0] for column in columns])
     except RunError:
         return None
 
 
 def _groups(form: re.Pattern[str], paths: Iterable[str], keys: Sequence[str]) -> Iterator[dict[str, str]]:
     """Columns whose names differ by one part and their unit, by that part in lower case."""
-    found: dict[tuple[str, ...], dict[str, str]] = {}
+    groups: dict[tuple[str, ...], dict[str, str]] = {}
     for path in paths:
         if (match := form.match(path)) is not None:
             tail = match["tail"].removesuffix(ending(match["tail"]) or "")
-            found.setdefault((*(match[key] for key in keys), tail), {}).setdefault(match["part"].lower(), path)
-    yield from found.values()
+            groups.setdefault((*(match[key] for key in keys), tail), {}).setdefault(match["part"].lower(), path)
+    yield from groups.values()
 
 
 def _quaternions(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
@@ -136,13 +136,13 @@ def _without_header(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
     """Seven columns without names, x, y, z and four of norm 1, as TUM's and ETH's files of poses have them: w last."""
     order = [path for path in paths if _NAMELESS.fullmatch(path)]
     for first in range(len(order) - 6):
-        place, (x, y, z, w) = order[first : first + 3], order[first + 3 : first + 7]
-        position, value = _plain(table, place), _plain(table, [x, y, z, w])
+        xyz, (x, y, z, w) = order[first : first + 3], order[first + 3 : first + 7]
+        position, value = _plain(table, xyz), _plain(table, [x, y, z, w])
         if position is None or value is None or not _moves(position) or not are_units(value):
             continue
         made = Orientation(quaternion=(x, y, z, w), order="xyzw")
         doubt = f"is w the last of {x}, {y}, {z}, {w}? Their norm is 1, and no name says it (run.toml, order)"
-        axes = dict(zip(place, CARTESIAN, strict=True))
+        axes = dict(zip(xyz, CARTESIAN, strict=True))
         yield Attitude(made, rotations.of_quaternions(value, made.order), "a norm of 1: w last", axes, doubt=doubt)
 
 
@@ -150,20 +150,20 @@ def are_units(value: FloatArray) -> bool:
     """Whether the norm is 1 in all rows, (rows, 4); without those of a sensor that is lost."""
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(value, axis=1)
-    known = norm[np.isfinite(norm) & (norm != 0.0)]
-    return len(known) >= _FEWEST and bool((np.abs(known - 1.0) < _NORM).all())
+    norms = norm[np.isfinite(norm) & (norm != 0.0)]
+    return len(norms) >= _FEWEST and bool((np.abs(norms - 1.0) < _NORM).all())
 
 
 def _angles(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
     """Rotation vectors and Euler angles beside x, y and z that move."""
     for group in _groups(_ANGLE, paths, ("head", "end")):
         listed = group.keys() >= set("012345") and _UR.search(group["0"].rpartition("0")[0]) is not None
-        place = {
+        angles = {
             group[part]: axis for part, axis in zip("012" if listed else "xyz", CARTESIAN, strict=True) if part in group
         }
-        known: list[tuple[str, str, str]] = [("3", "4", "5")] if listed else [rotations.TURNING, *_EULER]
-        forms = [one for one in known if set(one) <= group.keys()]
-        position = _plain(table, list(place)) if len(place) == len(CARTESIAN) else None
+        triples: list[tuple[str, str, str]] = [("3", "4", "5")] if listed else [rotations.TURNING, *_EULER]
+        forms = [form for form in triples if set(form) <= group.keys()]
+        position = _plain(table, list(angles)) if len(angles) == len(CARTESIAN) else None
         if len(forms) != 1 or position is None or not _moves(position):
             continue
         first, second, third = columns = (*(group[part] for part in forms[0]),)
@@ -174,12 +174,12 @@ def _angles(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
             euler = _NAMED_EULER.get(made.convention, "angles about x, y and z that stay")
             what = f"{euler if made.euler else 'a rotation vector'}{'' if unit else f', in {made.unit}'}"
             doubt = "" if listed else f"are {', '.join(columns)} {what}? No name says it (run.toml)"
-            yield Attitude(made, made.read(table)[0], "by name", place, "m" if listed else "", doubt)
+            yield Attitude(made, made.read(table)[0], "by name", angles, "m" if listed else "", doubt)
 
 
 def _moves(position: FloatArray) -> bool:
-    known = position[np.isfinite(position).all(axis=1)]
-    return len(known) > 0 and bool(np.ptp(known, axis=0).any())
+    valid = position[np.isfinite(position).all(axis=1)]
+    return len(valid) > 0 and bool(np.ptp(valid, axis=0).any())
 
 
 def _of_angles(table: Table, columns: tuple[str, str, str], convention: str) -> Orientation | None:
@@ -197,8 +197,8 @@ def _of_angles(table: Table, columns: tuple[str, str, str], convention: str) -> 
 
 def in_order(attitude: Attitude, stamp: TimeArray, other: Attitude, other_stamp: TimeArray, *, leads: bool) -> Attitude:
     """An orientation whose order is open in the order in which it turns with another one, where that tells."""
-    both, known = [attitude, attitude.exchanged()], (other_stamp, other.quaternion)
-    pairs = [((stamp, one.quaternion), known) for one in both]
+    both, other_turns = [attitude, attitude.exchanged()], (other_stamp, other.quaternion)
+    pairs = [((stamp, option.quaternion), other_turns) for option in both]
     shares = [_turning_alike(*(pair if leads else pair[::-1])) for pair in pairs]
     if abs(shares[0] - shares[1]) < _BETTER:
         return attitude
@@ -211,7 +211,7 @@ def _turning_alike(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArr
 
     A frame turns all changes of orientation alike, by a proper rotation; a wrong order mirrors them.
     """
-    (t, led), (s, seen) = (known_rows(*one) for one in (leader, follower))
+    (t, led), (s, seen) = (known_rows(*rows) for rows in (leader, follower))
     begin, end = (max(t[0], s[0]), min(t[-1], s[-1]) - _CHANGE_NS) if len(t) and len(s) else (0, 0)
     if end <= begin:
         return 0.0

@@ -47,7 +47,11 @@ class OwnFrame:
 
 def own_frames(run: Run) -> dict[str, OwnFrame]:
     """The sensors of a run that seem to stand in frames of their own, by name."""
-    return {name: one for name, source in run.sensors.items() if (one := _own_frame(run.command, source)) is not None}
+    return {
+        name: own_frame
+        for name, source in run.sensors.items()
+        if (own_frame := _own_frame(run.command, source)) is not None
+    }
 
 
 def speeds_follow(command: Source, source: Source) -> Following | None:
@@ -63,7 +67,7 @@ def speeds_follow(command: Source, source: Source) -> Following | None:
         for (t, told), (s, seen) in pairs
         if min(len(t), len(s)) >= _FEWEST
     ]
-    return max(filter(None, fast), key=lambda one: one.correlation, default=None)
+    return max(filter(None, fast), key=lambda relation: relation.correlation, default=None)
 
 
 def _axes(command: Source, source: Source) -> list[str]:
@@ -89,8 +93,8 @@ def _own_frame(command: Source, source: Source) -> OwnFrame | None:
     led, seen = led[near] - led[near].mean(axis=0), seen[near] - seen[near].mean(axis=0)
     power = np.sqrt(np.sum(seen**2, axis=0)[:, None] * np.sum(led**2, axis=0))
     crossed = (seen.T @ led) / np.where(power > 0.0, power, np.inf)  # correlations, (k, k)
-    moves = [place for place in range(len(axes)) if np.ptp(led[:, place]) > 0.0]
-    least = min((float(crossed[place, place]) for place in moves), default=1.0)
+    moves = [axis for axis in range(len(axes)) if np.ptp(led[:, axis]) > 0.0]
+    least = min((float(crossed[axis, axis]) for axis in moves), default=1.0)
     if least >= FOLLOWS:
         return None
     as_it_is = float(np.sum(seen * led)) / max(math.sqrt(float(np.sum(seen**2) * np.sum(led**2))), 1e-30)
@@ -98,8 +102,8 @@ def _own_frame(command: Source, source: Source) -> OwnFrame | None:
     _, mirrored = rotations.aligning(seen * np.where(np.arange(len(axes)) == 0, -1.0, 1.0), led)
     is_mirrored = 1.0 - mirrored**2 < _EXPLAINS * (1.0 - turned**2)
     size = np.abs(crossed) if is_mirrored else crossed
-    others = {int(np.argmax(size[:, place])) for place in moves}
-    exchanged = len(others) == len(moves) and all(size[:, place].max() >= _EXCHANGED for place in moves)
+    others = {int(np.argmax(size[:, axis])) for axis in moves}
+    exchanged = len(others) == len(moves) and all(size[:, axis].max() >= _EXCHANGED for axis in moves)
     if exchanged or 1.0 - max(turned, mirrored) ** 2 > _EXPLAINS * (1.0 - as_it_is * abs(as_it_is)):
         return None
     return OwnFrame(speeds, least, math.nan if is_mirrored else angle_of(rotation))
@@ -135,4 +139,4 @@ def _speed(stamp: TimeArray, position: FloatArray) -> FloatArray:
 
 def _path(stamp: TimeArray, position: FloatArray, time: TimeArray) -> FloatArray:
     """Where a point is at some times [m], (m, k)."""
-    return np.column_stack([np.interp(time, stamp, position[:, place]) for place in range(position.shape[1])])
+    return np.column_stack([np.interp(time, stamp, position[:, axis]) for axis in range(position.shape[1])])

@@ -83,8 +83,8 @@ def shrunk(products: Products, penalty: float | None = None) -> Shrunk:
     ridges = _RIDGES * math.sqrt(max(float(power[-1]), 1e-300)) if penalty is None else np.array([penalty])
     share = 1.0 / (power + ridges[:, None] ** 2)
     freedom = (power * share).sum(axis=1)
-    rest = products.power - (b**2 * (2.0 * share - power * share**2)).sum(axis=1)
-    best = int(np.argmin(rest / np.maximum(products.rows - 2.0 - freedom, 1.0) ** 2))
+    left = products.power - (b**2 * (2.0 * share - power * share**2)).sum(axis=1)
+    best = int(np.argmin(left / np.maximum(products.rows - 2.0 - freedom, 1.0) ** 2))
     return Shrunk(V @ (share[best] * b), float(ridges[best]), float(freedom[best]))
 
 
@@ -106,27 +106,27 @@ class Residue:
         return (self(at + ASIDE) - self(at - ASIDE)) / (2.0 * ASIDE)
 
 
-def residue(s: FloatArray, rest: FloatArray, freedom: float) -> Residue:
+def residue(s: FloatArray, residual: FloatArray, freedom: float) -> Residue:
     """The residue of what the commands leave at ascending instants [s], after a fit with some degrees of freedom."""
     from scipy.interpolate import make_lsq_spline
 
     def error(left: FloatArray, used: float) -> float:
         return float(left @ left) / max(len(s) - used, 0.0) ** 2 if len(s) > used + 1.0 else math.inf
 
-    best, least = Residue(), error(rest, freedom)
+    best, least = Residue(), error(residual, freedom)
     for rows in _ROWS_A_KNOT:
         if len(s) < _FEWEST_KNOTS * rows:
             break
         knots = np.concatenate([np.repeat(s[0], 4), s[rows:-rows:rows], np.repeat(s[-1], 4)])
-        spline, more = make_lsq_spline(s, rest, knots, method="norm-eq"), len(knots) - 4.0
-        if (found := error(rest - spline(s), freedom + more)) < least:
-            best, least = Residue(spline, float(s[0]), float(s[-1]), more), found
+        spline, more = make_lsq_spline(s, residual, knots, method="norm-eq"), len(knots) - 4.0
+        if (residue_here := error(residual - spline(s), freedom + more)) < least:
+            best, least = Residue(spline, float(s[0]), float(s[-1]), more), residue_here
     return best
 
 
-def interpolated(s: FloatArray, rest: FloatArray) -> Residue:
+def interpolated(s: FloatArray, left: FloatArray) -> Residue:
     """The residue that goes through all rows: what a sensor of little noise sees of a motion that nobody commanded."""
-    return Residue(lambda at: np.interp(at, s, rest), float(s[0]), float(s[-1]))
+    return Residue(lambda at: np.interp(at, s, left), float(s[0]), float(s[-1]))
 
 
 @dataclass(frozen=True)
@@ -147,14 +147,14 @@ class Path:
 def path(command: tuple[FloatArray, FloatArray], lag: float, s: FloatArray, z: FloatArray) -> Path:
     """The path by the rows of a sensor, which follows roughly ``lag`` [s] late; instants [s] ascend."""
     knots = _KNOTS + lag - _BEFORE - min(max(lag, _SHORT), _LONG)
-    basis, found, rest = _explained(command, knots, s, z)
+    basis, weights, residual = _explained(command, knots, s, z)
     for _ in range(_PLACED):
-        basis, found, rest = _explained(command, knots := _placed(knots, found.coefficients), s, z)
-    level = float(rest.mean())
-    left = residue(s, rest - level, found.freedom)
-    free = max(len(s) - 1.0 - found.freedom - left.freedom, 1.0)
-    sd = robust_sd(rest - level - left(s)) * math.sqrt(len(s) / free)
-    return Path(basis, found.coefficients, level, left, sd)
+        basis, weights, residual = _explained(command, knots := _placed(knots, weights.coefficients), s, z)
+    level = float(residual.mean())
+    left = residue(s, residual - level, weights.freedom)
+    free = max(len(s) - 1.0 - weights.freedom - left.freedom, 1.0)
+    sd = robust_sd(residual - level - left(s)) * math.sqrt(len(s) / free)
+    return Path(basis, weights.coefficients, level, left, sd)
 
 
 def _explained(
@@ -163,16 +163,16 @@ def _explained(
     """Responses, their coefficients, and what they leave of a sensor, (n,)."""
     basis = _responses(*command, knots)
     X = basis(s)
-    found = shrunk(Products.of(X - X.mean(axis=0), z - z.mean()))
-    return basis, found, z - X @ found.coefficients
+    ridge = shrunk(Products.of(X - X.mean(axis=0), z - z.mean()))
+    return basis, ridge, z - X @ ridge.coefficients
 
 
-def clipped_rms(rest: FloatArray) -> float:
+def clipped_rms(left: FloatArray) -> float:
     """Root of the mean square, of each not more than ten robust deviations: what many rows have is no outlier."""
-    kept = np.clip(rest, *(_CLIP * robust_sd(rest) * np.array([-1.0, 1.0])))
+    kept = np.clip(left, *(_CLIP * robust_sd(left) * np.array([-1.0, 1.0])))
     return math.sqrt(float(kept @ kept) / len(kept))
 
 
-def robust_sd(rest: FloatArray) -> float:
+def robust_sd(left: FloatArray) -> float:
     """Standard deviation by the 90 % quantile: a tenth may be outliers, and most may be at rest."""
-    return float(np.quantile(np.abs(rest), 0.9)) / 1.645
+    return float(np.quantile(np.abs(left), 0.9)) / 1.645

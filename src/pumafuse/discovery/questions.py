@@ -23,94 +23,105 @@ _OTHER_UNIT, _ABOUT_ONE = 3.0, 1.25  # factors by which a sensor may move less o
 _LONG = 0.5  # s, of a lag that hardly an arm has
 
 
-def decisions(found: Survey) -> Iterator[tuple[str, str, str]]:
+def decisions(survey: Survey) -> Iterator[tuple[str, str, str]]:
     """What was checked, what it is, and how surely that is known."""
-    if found.roles is not None:
-        roles = found.roles
+    if survey.roles is not None:
+        roles = survey.roles
         streams = roles.streams
-        clocks = {f"{one.part.clock.time.column or 'rows'}": one.part.clock for one in streams if one.part.clock}
-        guessed = [column for column, one in clocks.items() if one.basis.endswith(("interval", "default", "motion"))]
-        yield "clock", ", ".join(f"{column}: {one.basis}" for column, one in clocks.items()), _sure(guessed)
-        signals = [some[0] for one in streams for some in one.axes.values()]
-        units = " and ".join(sorted({one.unit for one in signals}))
-        yield "units", units, _sure([one.column for one in signals if one.basis == "range"])
-        if oriented := [one.attitude for one in streams if one.attitude]:
-            bases = ", ".join(f"{', '.join(one.columns.columns)}: {one.basis}" for one in oriented)
-            yield "orientations", bases, _sure([one.columns.columns[0] for one in oriented if one.doubt])
-        if turns := [f"{one.name} {axis}" for one in streams for axis in one.turns]:
+        clocks = {
+            f"{stream.part.clock.time.column or 'rows'}": stream.part.clock for stream in streams if stream.part.clock
+        }
+        guessed = [
+            column for column, clock in clocks.items() if clock.basis.endswith(("interval", "default", "motion"))
+        ]
+        yield "clock", ", ".join(f"{column}: {clock.basis}" for column, clock in clocks.items()), _sure(guessed)
+        signals = [some[0] for stream in streams for some in stream.axes.values()]
+        units = " and ".join(sorted({signal.unit for signal in signals}))
+        yield "units", units, _sure([signal.column for signal in signals if signal.basis == "range"])
+        if oriented := [stream.attitude for stream in streams if stream.attitude]:
+            bases = ", ".join(f"{', '.join(attitude.columns.columns)}: {attitude.basis}" for attitude in oriented)
+            yield "orientations", bases, _sure([attitude.columns.columns[0] for attitude in oriented if attitude.doubt])
+        if turns := [f"{stream.name} {axis}" for stream in streams for axis in stream.turns]:
             yield "turns", f"{', '.join(turns)}: jumps by whole turns go on (turn_deg in run.toml)", "sure"
-        who = ", ".join(f"{one.name} is a sensor" for one in roles.sensors)
-        moved = [one.name for one in streams if "follow" in one.why]
+        who = ", ".join(f"{sensor.name} is a sensor" for sensor in roles.sensors)
+        moved = [stream.name for stream in streams if "follow" in stream.why]
         yield "who is who", f"{roles.command.part.label} is commanded, {who}", _sure(moved, "by how they move")
-    for name in found.run.sensors:
-        mine = {axis: one for (source, axis), one in found.relations.items() if source == name}
-        if mine:
-            lag, gain = (float(np.median([getattr(one, key) for one in mine.values()])) for key in ("lag", "slope"))
-            least = min(abs(one.correlation) for one in mine.values())
-            moves_as_far = all(_moves_as_far(found.run, name, axis, one) for axis, one in mine.items())
-            as_it_should = least >= _SAME and moves_as_far and all(0.0 <= one.lag <= _LONG for one in mine.values())
+    for name in survey.run.sensors:
+        by_axis = {axis: relation for (source, axis), relation in survey.relations.items() if source == name}
+        if by_axis:
+            lag, gain = (
+                float(np.median([getattr(relation, key) for relation in by_axis.values()])) for key in ("lag", "slope")
+            )
+            least = min(abs(relation.correlation) for relation in by_axis.values())
+            moves_as_far = all(_moves_as_far(survey.run, name, axis, relation) for axis, relation in by_axis.items())
+            as_it_should = (
+                least >= _SAME and moves_as_far and all(0.0 <= relation.lag <= _LONG for relation in by_axis.values())
+            )
             told = f"{lag * MS:.0f} ms late, gain {gain:.3g}, correlation {least:.3f}"
             yield f"{name} follows", told, "sure" if as_it_should else "a question"
 
 
-def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str]:
+def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str]:
     """Sentences, in the order in which one checks."""
-    run = found.run
-    roles = found.roles
+    run = survey.run
+    roles = survey.roles
     streams = [] if roles is None else roles.streams
-    yield from dict.fromkeys(one.part.clock.doubt for one in streams if one.part.clock and one.part.clock.doubt)
-    yield from dict.fromkeys(one.attitude.doubt for one in streams if one.attitude and one.attitude.doubt)
-    for name, one in found.own_frames.items():
-        yield f"{name} {one.words}: `pumafuse register` finds where it stands, and what it sees of the tool"
-    if found.interpolation:
+    yield from dict.fromkeys(
+        stream.part.clock.doubt for stream in streams if stream.part.clock and stream.part.clock.doubt
+    )
+    yield from dict.fromkeys(stream.attitude.doubt for stream in streams if stream.attitude and stream.attitude.doubt)
+    for name, own_frame in survey.own_frames.items():
+        yield f"{name} {own_frame.words}: `pumafuse register` finds where it stands, and what it sees of the tool"
+    if survey.interpolation:
         yield (
             "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"
             " follows that path sooner than an arm can that holds each command (interpolation_ms in run.toml)"
         )
-    follow = any(abs(one.correlation) >= _SAME for one in found.relations.values())
+    follow = any(abs(relation.correlation) >= _SAME for relation in survey.relations.values())
     later = list[str]()
     for name, source in run.sensors.items():
-        mine = {axis: found.relations[name, axis] for axis in source.values if (name, axis) in found.relations}
-        if not mine:
+        by_axis = {axis: survey.relations[name, axis] for axis in source.values if (name, axis) in survey.relations}
+        if not by_axis:
             why = another_clock(source, run.command)
             yield f"{name}: {why or 'too few measurements, or no motion, while there are commands'}"
-        for axis, one in mine.items():
-            size = abs(one.slope)
-            if abs(one.correlation) < _SAME:
+        for axis, relation in by_axis.items():
+            size = abs(relation.slope)
+            if abs(relation.correlation) < _SAME:
                 ask = (
                     ": are axes exchanged, or its clock another one?" if follow else ", nor anything else its commands"
                 )
-                missing = [one for one in CARTESIAN if one not in source.values]
+                missing = [axis for axis in CARTESIAN if axis not in source.values]
                 if axis in CARTESIAN and missing:
                     ask += f" It gives no {' and no '.join(missing)}, without which no frame of its own is found"
-                how = "does not follow" if abs(one.correlation) < FOLLOWS else "hardly follows"
-                later.append(f"{name} {how} the commands on {axis} (correlation {one.correlation:+.2f}){ask}")
+                how = "does not follow" if abs(relation.correlation) < FOLLOWS else "hardly follows"
+                later.append(f"{name} {how} the commands on {axis} (correlation {relation.correlation:+.2f}){ask}")
                 continue
-            if one.lag < 0.0:
-                yield f"{name} runs {-one.lag * MS:.0f} ms ahead of the commands on {axis}: is its clock another one?"
-            elif one.lag > _LONG:
-                most = " or more" if one.lag >= LATEST else ""
-                late = f"{one.lag * MS:.0f} ms{most} late"
+            if relation.lag < 0.0:
+                ahead = f"{-relation.lag * MS:.0f} ms ahead"
+                yield f"{name} runs {ahead} of the commands on {axis}: is its clock another one?"
+            elif relation.lag > _LONG:
+                most = " or more" if relation.lag >= LATEST else ""
+                late = f"{relation.lag * MS:.0f} ms{most} late"
                 yield f"{name} is {late} on {axis}, as hardly an arm is: is its clock another one?"
-            if not _moves_as_far(run, name, axis, one):
+            if not _moves_as_far(run, name, axis, relation):
                 unit = (
                     "is its unit right" if not 1.0 / _OTHER_UNIT < size < _OTHER_UNIT else "is that its gear, or a unit"
                 )
                 later.append(f"{name} moves {size:.3g} times as far as commanded on {axis}: {unit}?")
-    for one in sensors.values():
-        yield from one.doubts
+    for guess in sensors.values():
+        yield from guess.doubts
     if roles is not None:
-        guessed = {printable(one.part.label): one for one in streams if one.guessed}
-        units = sorted({signal.unit for one in guessed.values() for some in one.axes.values() for signal in some})
+        guessed = {printable(stream.part.label): stream for stream in streams if stream.guessed}
+        units = sorted({signal.unit for stream in guessed.values() for some in stream.axes.values() for signal in some})
         if guessed:
             yield f"are the numbers of {', '.join(guessed)} in {' and '.join(units)}? No name says it (run.toml)"
         for stream, why in roles.left_out:
             if stream.name in {*run.sensors, roles.command.name} or "follow" in why or "its commands" in why:
                 yield f"{printable(stream.name)} is not used on {', '.join(stream.axes)}: {why}"
     yield from later
-    for (name, axis), why in found.unused.items():
+    for (name, axis), why in survey.unused.items():
         yield f"{name} is not used on {axis}: {why}. Is it in another frame, or stamped by another clock?"
-    if found.relations and run.reference is None:
+    if survey.relations and run.reference is None:
         yield (
             "how old is a measurement when it is stamped? Commands and measurements tell only the sum of the arm's lag"
             " and that age (fusion.toml, latency_ms)"
@@ -122,9 +133,9 @@ def _is_one(gain: float) -> bool:
     return 1.0 / _ABOUT_ONE < abs(gain) < _ABOUT_ONE
 
 
-def _moves_as_far(run: Run, name: str, axis: str, one: Following) -> bool:
+def _moves_as_far(run: Run, name: str, axis: str, following: Following) -> bool:
     """Whether a sensor moves about as far as it is told to, whatever its sign."""
-    return _is_one(one.slope) or _is_one(_reach(run.measured[name], axis) / _reach(run.command, axis))
+    return _is_one(following.slope) or _is_one(_reach(run.measured[name], axis) / _reach(run.command, axis))
 
 
 def _reach(source: Source, axis: str) -> float:

@@ -94,7 +94,7 @@ class Alignment:
         """How far the latency of a row is from the one that is told, RMS [s]: its scatter, and its steps."""
         parts = [step.after - self.latency for step in self.steps]
         parts += [self.steps[0].before - self.latency] if self.steps else [0.0]
-        return math.hypot(self.latency_sd, math.sqrt(sum(one**2 for one in parts) / len(parts)))
+        return math.hypot(self.latency_sd, math.sqrt(sum(part**2 for part in parts) / len(parts)))
 
     def doubts(self, name: str, other: str) -> Iterator[str]:
         """What one latency of this sensor does not say, beside that other one: steps, a drift, jitter, a scale."""
@@ -124,18 +124,18 @@ class Alignment:
 
 def aligned(runs: Sequence[Run], first: str, second: str) -> Alignment | None:
     """How much later the second sensor is than the first; None where they see no common motion."""
-    found = [one for run in runs if (one := _of_run(run, first, second)) is not None]
-    if len(found) < 2:
-        return found[0] if found else None
-    weight = np.array([one.half**-2 for one in found])
-    latency = np.array([one.latency for one in found])
+    alignments = [alignment for run in runs if (alignment := _of_run(run, first, second)) is not None]
+    if len(alignments) < 2:
+        return alignments[0] if alignments else None
+    weight = np.array([alignment.half**-2 for alignment in alignments])
+    latency = np.array([alignment.latency for alignment in alignments])
     mean = float(weight @ latency / weight.sum())
     # Runs that differ by more than their intervals widen that of their mean (Birge, 1932).
-    birge = math.sqrt(max(1.0, float(weight @ (latency - mean) ** 2) * 1.96**2 / (len(found) - 1)))
+    birge = math.sqrt(max(1.0, float(weight @ (latency - mean) ** 2) * 1.96**2 / (len(alignments) - 1)))
     half = birge / math.sqrt(float(weight.sum()))
-    best = found[int(np.argmax(weight))]
-    sd = {axis: value for one in reversed(found) for axis, value in one.sd.items()}
-    steps = [step for one in found for step in one.steps]
+    best = alignments[int(np.argmax(weight))]
+    sd = {axis: value for alignment in reversed(alignments) for axis, value in alignment.sd.items()}
+    steps = [step for alignment in alignments for step in alignment.steps]
     return replace(best, latency=mean, latency_ci95=(mean - half, mean + half), sd=sd, steps=steps)
 
 
@@ -186,29 +186,29 @@ class _Axis:
     def between(self, begin: float, end: float) -> _Axis:
         """Its rows between two stamps of the second sensor [s]."""
         late = self.lag
-        one, two = (begin - late <= self.s) & (self.s < end - late), (begin <= self.x) & (self.x < end)
-        return replace(self, s=self.s[one], z1=self.z1[one], x=self.x[two], z2=self.z2[two])
+        in_first, two = (begin - late <= self.s) & (self.s < end - late), (begin <= self.x) & (self.x < end)
+        return replace(self, s=self.s[in_first], z1=self.z1[in_first], x=self.x[two], z2=self.z2[two])
 
 
 def _source(run: Run, name: str) -> Source | None:
     """The rows of a sensor, or of the reference, in the part of the run that is used."""
     source = run.measured.get(name)
-    there = run.command.stamp[run.command.stamp != NO_STAMP]
-    return None if source is None or not len(there) else source.rows(run.within(source.stamp, int(there.min())))
+    stamps = run.command.stamp[run.command.stamp != NO_STAMP]
+    return None if source is None or not len(stamps) else source.rows(run.within(source.stamp, int(stamps.min())))
 
 
 def _of_run(run: Run, first: str, second: str) -> Alignment | None:
-    one, two = _source(run, first), _source(run, second)
-    if one is None or two is None:
+    source, two = _source(run, first), _source(run, second)
+    if source is None or two is None:
         return None
-    swapped = _count(two) > _count(one)
-    dense, other = (two, one) if swapped else (one, two)
+    swapped = _count(two) > _count(source)
+    dense, other = (two, source) if swapped else (source, two)
     axes = [axis for name in dense.values if (axis := _axis(run, name, dense, other)) is not None]
     if not axes:
         return None
     latency = float(np.median([axis.lag for axis in axes]))
-    found = _parts([replace(axis, lag=latency) for axis in axes], latency)
-    return None if found is None else _alignment(*found, swapped, two)
+    parts = _parts([replace(axis, lag=latency) for axis in axes], latency)
+    return None if parts is None else _alignment(*parts, swapped, two)
 
 
 def _count(source: Source) -> int:
@@ -218,17 +218,17 @@ def _count(source: Source) -> int:
     return values * (apart + 1) // max(len(source.stamp), 1)
 
 
-def _axis(run: Run, name: str, one: Source, two: Source) -> _Axis | None:
+def _axis(run: Run, name: str, first: Source, second: Source) -> _Axis | None:
     """An axis that the commands move and both sensors see to move alike; outliers are left out."""
-    if name not in two.values or name not in run.command.values:
+    if name not in second.values or name not in run.command.values:
         return None
     told = run.command.stamp, run.command.values[name]
-    rows = [_clean(source.stamp, source.values[name]) for source in (one, two)]
+    rows = [_clean(source.stamp, source.values[name]) for source in (first, second)]
     between, behind = following(*rows), following(told, rows[0])
     if between is None or behind is None or abs(between.correlation) < _FOLLOWS:
         return None
     origin = int(run.command.stamp[run.command.stamp != NO_STAMP].min())
-    (s, z1), (x, z2) = (_thinned(*known(*one, origin)) for one in rows)
+    (s, z1), (x, z2) = (_thinned(*known(*row, origin)) for row in rows)
     if len(s) < _FEWEST:
         return None
     after = np.searchsorted(s, x - between.lag)
@@ -243,10 +243,10 @@ def _axis(run: Run, name: str, one: Source, two: Source) -> _Axis | None:
 
 def _clean(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
     """Rows without outliers and without what stays the same for long: at rest it tells nothing, in motion it froze."""
-    there = np.isfinite(value) & (stamp != NO_STAMP)
-    stamp, value = stamp[there], value[there]
+    valid = np.isfinite(value) & (stamp != NO_STAMP)
+    stamp, value = stamp[valid], value[valid]
     run = np.cumsum(np.diff(value, prepend=value[:1]) != 0.0)
-    moves = np.bincount(run, minlength=1)[run] <= _STILL if len(run) else there[:0]
+    moves = np.bincount(run, minlength=1)[run] <= _STILL if len(run) else valid[:0]
     stamp, value = stamp[moves], value[moves]
     for _ in range(_CLEANED):
         kept = ~isolated(value)
@@ -298,41 +298,41 @@ class _Linear:
 def _linear(axis: _Axis, noise: _Noise, latency: float, fitted: bool) -> _Linear:
     """An axis about a latency; ``fitted``: the noise is fitted anew."""
     n1, n2, at = len(axis.s), len(axis.x), axis.x - latency
-    one, two = axis.first, _design(axis.path.basis, at)
+    basis, two = axis.first, _design(axis.path.basis, at)
     left1, left2 = noise.left(axis.s), noise.left(at)
     y1, y2 = axis.z1 - left1, axis.z2 - noise.scale * left2
     y1, y2 = y1 - y1.mean(), y2 - y2.mean()
     weight1, weight2 = 1.0 / noise.sd1**2, noise.scale / noise.sd2**2
     products = Products(
-        weight1 * one.square + weight2 * noise.scale * two.square,
-        weight1 * (y1 @ one.responses) + weight2 * (y2 @ two.responses),
+        weight1 * basis.square + weight2 * noise.scale * two.square,
+        weight1 * (y1 @ basis.responses) + weight2 * (y2 @ two.responses),
         weight1 * float(y1 @ y1) + float(y2 @ y2) / noise.sd2**2,
         n1 + n2,
     )
-    found = shrunk(products, None if fitted else noise.penalty)
-    coefficients, k = found.coefficients, len(found.coefficients)
-    moved1, moved2 = one.responses @ coefficients, two.responses @ coefficients
+    ridge = shrunk(products, None if fitted else noise.penalty)
+    coefficients, k = ridge.coefficients, len(ridge.coefficients)
+    moved1, moved2 = basis.responses @ coefficients, two.responses @ coefficients
     rest1, rest2 = y1 - moved1, y2 - noise.scale * moved2
     rest1, rest2 = rest1 - np.median(rest1), rest2 - np.median(rest2)
-    rest = np.concatenate([rest1 / noise.sd1, rest2 / noise.sd2])
-    speed1 = one.slopes @ coefficients + noise.left.slope(axis.s)
+    left = np.concatenate([rest1 / noise.sd1, rest2 / noise.sd2])
+    speed1 = basis.slopes @ coefficients + noise.left.slope(axis.s)
     speed2 = noise.scale * (two.slopes @ coefficients + noise.left.slope(at))
     speed = np.concatenate([speed1 / noise.sd1, speed2 / noise.sd2])
     columns = np.zeros((n1 + n2, k + 5))
-    columns[:n1, :k], columns[n1:, :k] = one.responses / noise.sd1, noise.scale / noise.sd2 * two.responses
+    columns[:n1, :k], columns[n1:, :k] = basis.responses / noise.sd1, noise.scale / noise.sd2 * two.responses
     columns[:n1, k], columns[n1:, k + 1] = 1.0 / noise.sd1, 1.0 / noise.sd2
-    columns[n1:, k + 2], columns[n1:, k + 3], columns[:, k + 4] = (moved2 + left2) / noise.sd2, -speed[n1:], rest
-    columns *= np.sqrt(np.minimum(1.0, _BEYOND / np.maximum(np.abs(rest), 1e-300)))[:, None]  # Huber's weights
-    used = found.freedom * n1 / (n1 + n2)
-    sd2 = clipped_rms(rest2) * math.sqrt(n2 / max(n2 - 2.0 - found.freedom + used, 1.0))
-    noise = replace(noise, sd2=max(sd2, floor := 1e-9 * float(np.ptp(axis.z2))), penalty=found.penalty)
+    columns[n1:, k + 2], columns[n1:, k + 3], columns[:, k + 4] = (moved2 + left2) / noise.sd2, -speed[n1:], left
+    columns *= np.sqrt(np.minimum(1.0, _BEYOND / np.maximum(np.abs(left), 1e-300)))[:, None]  # Huber's weights
+    used = ridge.freedom * n1 / (n1 + n2)
+    sd2 = clipped_rms(rest2) * math.sqrt(n2 / max(n2 - 2.0 - ridge.freedom + used, 1.0))
+    noise = replace(noise, sd2=max(sd2, floor := 1e-9 * float(np.ptp(axis.z2))), penalty=ridge.penalty)
     if fitted:
         whole1, whole2 = rest1 + left1, rest2 + noise.scale * left2
         smooth, through = residue(axis.s, whole1, used), interpolated(axis.s, whole1)
         sd1 = clipped_rms(whole1 - smooth(axis.s)) * math.sqrt(n1 / max(n1 - 1.0 - used - smooth.freedom, 1.0))
-        off = [clipped_rms(whole2 - noise.scale * one(at)) for one in (smooth, through)]
+        off = [clipped_rms(whole2 - noise.scale * curve(at)) for curve in (smooth, through)]
         noise = replace(noise, sd1=max(sd1, floor), left=through if off[1] < _BETTER * off[0] else smooth)
-    return _Linear(axis, at, columns, rest, speed, found, noise)
+    return _Linear(axis, at, columns, left, speed, ridge, noise)
 
 
 class _Fit(NamedTuple):
@@ -347,15 +347,15 @@ class _Fit(NamedTuple):
 
 def _fit(axes: Sequence[_Axis], latency: float) -> _Fit | None:
     """The latency by Gauss-Newton; None where it does not settle."""
-    axes = [one for one in axes if min(len(one.s), len(one.x)) >= _FEWEST]
+    axes = [axis for axis in axes if min(len(axis.s), len(axis.x)) >= _FEWEST]
     noises = list[_Noise]()
-    for one in axes:
-        rest, floor = one.z2 - one.slope * one.path(one.x - latency), 1e-9 * float(np.ptp(one.z2))
-        sds = max(one.path.sd, floor), max(clipped_rms(rest - np.median(rest)), floor)
-        noises.append(_Noise(one.slope, *sds, Residue()))
+    for axis in axes:
+        left, floor = axis.z2 - axis.slope * axis.path(axis.x - latency), 1e-9 * float(np.ptp(axis.z2))
+        sds = max(axis.path.sd, floor), max(clipped_rms(left - np.median(left)), floor)
+        noises.append(_Noise(axis.slope, *sds, Residue()))
     last = 0.0
     for count in range(_ROUNDS if axes else 0):
-        lines = [_linear(one, noise, latency, count < _FITTED) for one, noise in zip(axes, noises, strict=True)]
+        lines = [_linear(axis, noise, latency, count < _FITTED) for axis, noise in zip(axes, noises, strict=True)]
         grams = _grams(lines)
         step, scales = _solved(grams, lines)
         if not math.isfinite(step):
@@ -364,7 +364,7 @@ def _fit(axes: Sequence[_Axis], latency: float) -> _Fit | None:
             break
         far = _FARTHEST if step * last >= 0.0 else 0.5 * abs(last)  # where it goes to and fro, less and less
         latency += (last := min(max(step, -far), far))
-        noises = [replace(one.noise, scale=one.noise.scale + more) for one, more in zip(lines, scales, strict=True)]
+        noises = [replace(line.noise, scale=line.noise.scale + more) for line, more in zip(lines, scales, strict=True)]
     else:
         return None
     return _jackknife(grams, lines, latency)
@@ -372,9 +372,9 @@ def _fit(axes: Sequence[_Axis], latency: float) -> _Fit | None:
 
 def _grams(lines: Sequence[_Linear]) -> list[FloatArray]:
     """For each axis the products of its columns over pieces that tell as much about the latency, (pieces, k+5, k+5)."""
-    time = np.concatenate([one.at for one in lines])
+    time = np.concatenate([line.at for line in lines])
     order = np.argsort(time)
-    told = np.cumsum(np.concatenate([one.late(False)[1] ** 2 for one in lines])[order])
+    told = np.cumsum(np.concatenate([line.late(False)[1] ** 2 for line in lines])[order])
     edges = np.interp(np.arange(1, _PIECES) / _PIECES, told / told[-1], time[order])
 
     def of(line: _Linear) -> FloatArray:
@@ -406,7 +406,7 @@ def _solved(
         information += float(G[-2, -2] - right[:, 0] @ solution[:, 0])
         scales.append(solution[k + 2])
     step = score / information if information > 0.0 else math.nan
-    return step, np.array([one[1] - one[0] * step for one in scales])
+    return step, np.array([parts[1] - parts[0] * step for parts in scales])
 
 
 def _jackknife(grams: Sequence[FloatArray], lines: Sequence[_Linear], latency: float) -> _Fit:
@@ -417,7 +417,7 @@ def _jackknife(grams: Sequence[FloatArray], lines: Sequence[_Linear], latency: f
     each = np.array([[step, *scales] for step, scales in pairs])
     sd = np.sqrt((_PIECES - 1) / _PIECES * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
     half = float(stdtrit(_PIECES - 1, 0.975)) * sd
-    scale = np.array([one.noise.scale for one in lines])
+    scale = np.array([line.noise.scale for line in lines])
     return _Fit(latency, max(float(half[0]), _FINEST), scale, half[1:], lines)
 
 
@@ -429,16 +429,16 @@ def _parts(axes: Sequence[_Axis], latency: float) -> tuple[list[_Fit], list[Step
     times = _candidates(axes, latency)
     while times:
         edges = [-math.inf, *times, math.inf]
-        fits = [_fit([one.between(*span) for one in axes], latency) for span in pairwise(edges)]
+        fits = [_fit([axis.between(*span) for axis in axes], latency) for span in pairwise(edges)]
         steps = [
-            Step(time, one.latency, two.latency)
-            for time, one, two in zip(times, fits, fits[1:], strict=False)
-            if one is not None
+            Step(time, fit.latency, two.latency)
+            for time, fit, two in zip(times, fits, fits[1:], strict=False)
+            if fit is not None
             and two is not None
-            and abs(one.latency - two.latency) > max(_FURTHER * math.hypot(one.half, two.half), _SMALLEST_STEP)
+            and abs(fit.latency - two.latency) > max(_FURTHER * math.hypot(fit.half, two.half), _SMALLEST_STEP)
         ]
         if len(steps) == len(times):
-            return [one for one in fits if one is not None], steps
+            return [fit for fit in fits if fit is not None], steps
         times = [step.time for step in steps]
     whole = _fit(axes, latency)
     return None if whole is None else ([whole], [])
@@ -447,8 +447,8 @@ def _parts(axes: Sequence[_Axis], latency: float) -> tuple[list[_Fit], list[Step
 def _candidates(axes: Sequence[_Axis], latency: float) -> list[float]:
     """Stamps at which a step of the latency explains the rows better [s]: of all times and latencies on a grid."""
     shifts = np.arange(-_REACH, _REACH + 0.5 * _STEP, _STEP)
-    time = np.concatenate([one.x for one in axes])
-    cost = np.concatenate([_costs(one, latency + shifts) for one in axes])
+    time = np.concatenate([axis.x for axis in axes])
+    cost = np.concatenate([_costs(axis, latency + shifts) for axis in axes])
     order = np.argsort(time, kind="stable")
     summed = np.concatenate([np.zeros((1, len(shifts))), np.cumsum(cost[order], axis=0)])
     fewest = _FEWEST * len(axes)
@@ -471,10 +471,10 @@ def _costs(axis: _Axis, latencies: FloatArray) -> FloatArray:
     """What the path by the first sensor leaves of each row of the second at latencies [sd²], (m, l)."""
     begin, end = float(axis.x[0] - latencies[-1]), float(axis.x[-1] - latencies[0])
     table = np.linspace(begin, end, min(_TABLE, int((end - begin) / _DENSE) + 2))
-    rest = axis.z2[:, None] - axis.slope * np.interp(axis.x[:, None] - latencies, table, axis.path(table))
-    rest -= np.median(rest, axis=0)
-    sd = min(map(robust_sd, rest.T))
-    return np.minimum((rest / max(sd, 1e-9 * float(np.ptp(axis.z2)))) ** 2, _FAR)
+    left = axis.z2[:, None] - axis.slope * np.interp(axis.x[:, None] - latencies, table, axis.path(table))
+    left -= np.median(left, axis=0)
+    sd = min(map(robust_sd, left.T))
+    return np.minimum((left / max(sd, 1e-9 * float(np.ptp(axis.z2)))) ** 2, _FAR)
 
 
 # ---- what is told ---------------------------------------------------------------------------------------------------
@@ -482,11 +482,11 @@ def _costs(axis: _Axis, latencies: FloatArray) -> FloatArray:
 
 def _alignment(fits: Sequence[_Fit], steps: Sequence[Step], swapped: bool, late: Source) -> Alignment:
     """What is told of the second sensor; ``swapped``: it was the first one that was the slower."""
-    sign, best = -1.0 if swapped else 1.0, max(fits, key=lambda fit: max(np.ptp(one.axis.x) for one in fit.axes))
-    low, high = min(one.latency - one.half for one in fits), max(one.latency + one.half for one in fits)
+    sign, best = -1.0 if swapped else 1.0, max(fits, key=lambda fit: max(np.ptp(axis.axis.x) for axis in fit.axes))
+    low, high = min(fit.latency - fit.half for fit in fits), max(fit.latency + fit.half for fit in fits)
     if swapped:
         low, high = -high, -low
-        steps = [replace(one, before=-one.before, after=-one.after) for one in steps]
+        steps = [replace(step, before=-step.before, after=-step.after) for step in steps]
     scale, scale_ci95 = _scale(best, swapped)
     jitter, sd = _jitter(best, swapped)
     apart, interval = _intervals(late)
@@ -519,22 +519,22 @@ def _jitter(fit: _Fit, swapped: bool) -> tuple[float, dict[str, float]]:
 
     By least squares of squared residuals on the squared speed, weighted by what their variance is then.
     """
-    rows = [one.late(swapped) for one in fit.axes]
-    each = [one.noise.sd1 if swapped else one.noise.sd2 for one in fit.axes]
-    sds = {one.axis.name: sd * robust_sd(rest) for one, sd, (rest, _) in zip(fit.axes, each, rows, strict=True)}
-    rest, speed = (np.concatenate(some) ** 2 for some in zip(*rows, strict=True))
-    number = np.repeat(np.arange(len(rows)), [len(one) for one, _ in rows])
+    rows = [axis.late(swapped) for axis in fit.axes]
+    each = [axis.noise.sd1 if swapped else axis.noise.sd2 for axis in fit.axes]
+    sds = {axis.axis.name: sd * robust_sd(left) for axis, sd, (left, _) in zip(fit.axes, each, rows, strict=True)}
+    squares, speed = (np.concatenate(some) ** 2 for some in zip(*rows, strict=True))
+    number = np.repeat(np.arange(len(rows)), [len(late) for late, _ in rows])
     X = np.column_stack([number[:, None] == np.arange(len(rows)), speed]).astype(np.float64)
     weighted, cov, b = X, np.eye(X.shape[1]), np.append(np.ones(len(rows)), 0.0)
     for _ in range(_FITTED):
         weighted = X / np.maximum(X @ b, 0.1)[:, None] ** 2
         cov = np.linalg.pinv(X.T @ weighted)
-        b = np.maximum(cov @ (weighted.T @ rest), 0.0)
-    error, jitter = weighted * (rest - X @ b)[:, None], math.sqrt(float(b[-1]))
+        b = np.maximum(cov @ (weighted.T @ squares), 0.0)
+    error, jitter = weighted * (squares - X @ b)[:, None], math.sqrt(float(b[-1]))
     variance = cov @ (error.T @ error) @ cov
     if b[-1] < _SURELY * math.sqrt(float(variance[-1, -1])) or jitter < _SMALLEST_JITTER:
         return 0.0, sds
-    return jitter, {name: sds[name] * math.sqrt(max(float(one), 1e-2)) for name, one in zip(sds, b, strict=False)}
+    return jitter, {name: sds[name] * math.sqrt(max(float(factor), 1e-2)) for name, factor in zip(sds, b, strict=False)}
 
 
 def _intervals(source: Source) -> tuple[int, FloatArray]:

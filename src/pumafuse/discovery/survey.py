@@ -76,42 +76,47 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         refuse_twice(described)
         run = without_strays(Run.read(described))
         manifest = tomllib.loads(described.read_text(encoding="utf-8"))
-        aside = own_frames(run)
-        run = _along_axes(run, aside)
+        framed = own_frames(run)
+        run = _along_axes(run, framed)
         run, related = _followed(run, relations(run))
-        found = _without_early(Survey(log, run, related, manifest=manifest, own_frames=aside))
-        return replace(found, interpolation=interpolation(found))
+        without_early = _without_early(Survey(log, run, related, manifest=manifest, own_frames=framed))
+        return replace(without_early, interpolation=interpolation(without_early))
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
     _refuse_alone(log, parts, roles, "nothing that measures where they lead")
     run = without_strays(roles.run)
-    aside = own_frames(run)
-    run = _along_axes(run, aside)
+    framed = own_frames(run)
+    run = _along_axes(run, framed)
     related = relations(run)
-    lags, least = [one.lag for one in related.values() if abs(one.correlation) >= _SURELY], least_lag(run)
+    lags, least = (
+        [relation.lag for relation in related.values() if abs(relation.correlation) >= _SURELY],
+        least_lag(run),
+    )
     surely = _SURELY if max(lags, default=0.0) < least else math.inf
     bad = dict[tuple[str, str], str]()
-    for key, one in related.items() if lags else ():
-        if abs(one.correlation) < FOLLOWS:
-            bad[key] = f"it does not follow the commands (correlation {one.correlation:+.2f}): are columns exchanged?"
-        elif one.lag < least and abs(one.correlation) < surely:
-            bad[key] = _ahead(one)
+    for key, relation in related.items() if lags else ():
+        if abs(relation.correlation) < FOLLOWS:
+            bad[key] = (
+                f"it does not follow the commands (correlation {relation.correlation:+.2f}): are columns exchanged?"
+            )
+        elif relation.lag < least and abs(relation.correlation) < surely:
+            bad[key] = _ahead(relation)
     bad |= {(name, axis): why for name, why in _without_lag(related).items() for axis in (*run.axes, *TURNING)}
     roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
     _refuse_alone(log, parts, roles, "nothing that surely follows them")
-    kept = {(name, axis) for name, one in roles.measured.items() for axis in (*one.axes, *TURNING)}
-    related = {key: one for key, one in related.items() if key in kept}
-    run, related = _followed(_along_axes(without_strays(roles.run), aside), related)
-    found = Survey(log, run, related, parts, roles, own_frames=aside)
-    if step := interpolation(found):
-        command = found.run.command.interpolated(step)
-        found = replace(found, run=replace(found.run, command=command), interpolation=step)
-    return found
+    kept = {(name, axis) for name, stream in roles.measured.items() for axis in (*stream.axes, *TURNING)}
+    related = {key: relation for key, relation in related.items() if key in kept}
+    run, related = _followed(_along_axes(without_strays(roles.run), framed), related)
+    without_early = Survey(log, run, related, parts, roles, own_frames=framed)
+    if step := interpolation(without_early):
+        command = without_early.run.command.interpolated(step)
+        without_early = replace(without_early, run=replace(without_early.run, command=command), interpolation=step)
+    return without_early
 
 
-def _along_axes(run: Run, aside: Collection[str]) -> Run:
+def _along_axes(run: Run, framed: Collection[str]) -> Run:
     """A run in the arm's axes, without the sensors that stand aside."""
-    kept = {name: source for name, source in run.sensors.items() if name not in aside}
+    kept = {name: source for name, source in run.sensors.items() if name not in framed}
     return in_axes(replace(run, sensors=kept), None)[0]
 
 
@@ -124,11 +129,11 @@ def _followed(run: Run, related: _Relations) -> tuple[Run, _Relations]:
         correlation = np.array([related[name, axis].correlation for axis in turning])
         if turning and float(power @ correlation) >= TURNS * float(power.sum()):
             turned.add(name)
-    every = {name: one if name in turned else _without_turning(one) for name, one in run.measured.items()}
+    every = {name: source if name in turned else _without_turning(source) for name, source in run.measured.items()}
     run = replace(run, sensors={name: every[name] for name in run.sensors}, reference=every.get(REFERENCE))
     if run.sensors and turned.isdisjoint(run.sensors):
         run = replace(run.each(lambda _, source: _without_turning(source)), tool=None)
-    return run, {(name, axis): one for (name, axis), one in related.items() if axis in every[name].values}
+    return run, {(name, axis): relation for (name, axis), relation in related.items() if axis in every[name].values}
 
 
 def _without_turning(source: Source) -> Source:
@@ -138,8 +143,8 @@ def _without_turning(source: Source) -> Source:
 def _without_lag(related: _Relations) -> dict[str, str]:
     """Sources of which an axis surely moves alike, but as late as lags are looked for: that is no following."""
     late: dict[str, list[str]] = {}
-    for (name, axis), one in related.items():
-        if one.lag >= LATEST and _is_sure(one):
+    for (name, axis), relation in related.items():
+        if relation.lag >= LATEST and _is_sure(relation):
             late.setdefault(name, []).append(axis)
     return {
         name: (
@@ -155,33 +160,33 @@ def least_lag(run: Run) -> float:
     return -max(AHEAD, _OF_PERIOD * period_of(run.command))
 
 
-def early(found: Survey, name: str) -> dict[str, float]:
+def early(survey: Survey, name: str) -> dict[str, float]:
     """By how much a source moves before its commands [s], for each of its axes that surely does."""
-    least = least_lag(found.run)
-    mine = {axis: one for (source, axis), one in found.relations.items() if source == name}
-    return {axis: -one.lag for axis, one in mine.items() if _is_sure(one) and one.lag < least}
+    least = least_lag(survey.run)
+    by_axis = {axis: relation for (source, axis), relation in survey.relations.items() if source == name}
+    return {axis: -relation.lag for axis, relation in by_axis.items() if _is_sure(relation) and relation.lag < least}
 
 
-def _without_early(found: Survey) -> Survey:
+def _without_early(survey: Survey) -> Survey:
     """Without the axes of a sensor that move before their commands, where it surely follows those of others."""
-    run, unused = found.run, dict[tuple[str, str], str]()
+    run, unused = survey.run, dict[tuple[str, str], str]()
     for name, source in run.sensors.items():
-        ahead = early(found, name)
-        sure = [axis for (mine, axis), one in found.relations.items() if mine == name and _is_sure(one)]
+        ahead = early(survey, name)
+        sure = [axis for (source, axis), relation in survey.relations.items() if source == name and _is_sure(relation)]
         if ahead and len(ahead) < len(sure):
             values = {axis: value for axis, value in source.values.items() if axis not in ahead}
             run = replace(run, sensors={**run.sensors, name: replace(source, values=values)})
-            unused |= {(name, axis): _ahead(found.relations[name, axis]) for axis in ahead}
-    related = {key: one for key, one in found.relations.items() if key not in unused}
-    return replace(found, run=run, relations=related, unused=unused)
+            unused |= {(name, axis): _ahead(survey.relations[name, axis]) for axis in ahead}
+    related = {key: relation for key, relation in survey.relations.items() if key not in unused}
+    return replace(survey, run=run, relations=related, unused=unused)
 
 
-def _ahead(one: Following) -> str:
-    return f"it moves {-one.lag * MS:.0f} ms before its commands (correlation {one.correlation:+.2f})"
+def _ahead(following: Following) -> str:
+    return f"it moves {-following.lag * MS:.0f} ms before its commands (correlation {following.correlation:+.2f})"
 
 
-def _is_sure(one: Following) -> bool:
-    return abs(one.correlation) >= _SURELY
+def _is_sure(following: Following) -> bool:
+    return abs(following.correlation) >= _SURELY
 
 
 def too_early(name: str, by: float) -> str:
@@ -193,30 +198,30 @@ def too_early(name: str, by: float) -> str:
     )
 
 
-def interpolation(found: Survey) -> float:
+def interpolation(survey: Survey) -> float:
     """In which steps the arm seems to go on between its commands [s]; 0 where it may as well hold each.
 
     Behind the path through the commanded points, an arm that holds each is late by half an update period and more. One
     that follows this path sooner knows what is between: the log has samples of what a controller interpolates.
     """
-    period = period_of(found.run.command)
+    period = period_of(survey.run.command)
     margin = max(SOONER, _OF_PERIOD * period)
-    goes_on = -margin <= soonest(found) < 0.5 * period - margin
+    goes_on = -margin <= soonest(survey) < 0.5 * period - margin
     return max(float(f"{period / _STEPS:.1g}"), _FINEST) if goes_on else 0.0
 
 
-def soonest(found: Survey) -> float:
+def soonest(survey: Survey) -> float:
     """The least lag of any source behind the path through the commanded points, where it is known well [s]."""
     lags = dict[str, list[float]]()
-    for (name, _), one in found.relations.items():
-        if _is_sure(one):
-            lags.setdefault(name, []).append(one.lag)
-    return min((float(np.median(mine)) for mine in lags.values()), default=math.inf)
+    for (name, _), relation in survey.relations.items():
+        if _is_sure(relation):
+            lags.setdefault(name, []).append(relation.lag)
+    return min((float(np.median(of_sensor)) for of_sensor in lags.values()), default=math.inf)
 
 
 def _refuse_alone(log: Path, parts: Sequence[Part], roles: Roles, what: str) -> None:
     """Refuse commands without a sensor, with why anything else is none."""
     if not roles.sensors:
         reasons = dict.fromkeys([*(f"{stream.name}: {why}" for stream, why in roles.left_out), *unused(parts)])
-        there = "; ".join([*reasons][:_MOST_REASONS]) or "nothing else is in the log"
-        raise UndecidedError(str(log), f"commands, but {what}: {there}", parts, roles)
+        reasons_told = "; ".join([*reasons][:_MOST_REASONS]) or "nothing else is in the log"
+        raise UndecidedError(str(log), f"commands, but {what}: {reasons_told}", parts, roles)

@@ -120,16 +120,16 @@ def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
 
 def _of_numbers(path: Path, loaded: Mapping[str, npt.NDArray[Any]]) -> Arrays:
     """The arrays of a file without those of objects, which are named."""
-    found, objects = Arrays(), list[str]()
+    arrays, objects = Arrays(), list[str]()
     for name in loaded:
         try:
-            found[name] = loaded[name]
+            arrays[name] = loaded[name]
         except ValueError:
             objects.append(name)
     if objects:
         what = f"{path.name}: {', '.join(objects)}: objects of Python, which are not loaded, as they may run code"
         warn([f"{what}; save arrays of numbers"])
-    return found
+    return arrays
 
 
 def _loaded(folder: Path) -> Arrays:

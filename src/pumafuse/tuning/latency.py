@@ -293,7 +293,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
     notes = [*turned, *likelihood.notes, *said]
     notes += [f"{axis}: does not move, or {trusted} does not measure it" for axis in still]
-    notes += [f"{axis}: {doubt.step}" for axis in lags if (doubt := searches[axis].plain) and doubt.step]
+    notes += [f"{axis}: {plain.step}" for axis in lags if (plain := searches[axis].plain) and plain.step]
     notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
     notes += [f"{axis}: {too_early(trusted, by)}" for axis, by in sooner.items()]
     notes += [_SAMPLED.format(survey.run.name, step * MS) for survey in surveys if (step := interpolation(survey))]

@@ -190,18 +190,17 @@ def _identified(
         len(fixed) < _MOST_FIXED and (combination := not_identifiable(likelihood, best, free(best.config))) is not None
     ):
         (fixed_one,) = (parameter for parameter in free(best.config) if parameter.key == combination.fixed)
-        other_order = (
-            fixed_one.fit == "plant" and fixed_one.configured(configured) is None
-        )  # while no recovery can be set back to none
+        # while no recovery can be set back to none
+        other_order = fixed_one.fit == "plant" and fixed_one.configured(configured) is None
         starts = [best.config] if other_order else [as_configured(fixed_one), best.config]
         fixed.append(combination)
         peaks = (maximise_with_gates(likelihood, start, free(start), notify) for start in starts)
         best = next((peak for peak in peaks if peak.log_posterior > best.log_posterior - 0.5 * Z95**2), best)
-    for fixed_one in not_identifiable_noise(likelihood, best, free(best.config)):
-        start = as_configured(fixed_one)
-        without = maximise_with_gates(likelihood, start, [other for other in free(start) if other.key != fixed_one.key])
+    for noise in not_identifiable_noise(likelihood, best, free(best.config)):
+        start = as_configured(noise)
+        without = maximise_with_gates(likelihood, start, [other for other in free(start) if other.key != noise.key])
         if without.log_posterior > best.log_posterior - 0.5 * Z95**2:
-            fixed.append(NotIdentifiable((fixed_one.key,), fixed_one.key))
+            fixed.append(NotIdentifiable((noise.key,), noise.key))
             best = without
     return best
 

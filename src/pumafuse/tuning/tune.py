@@ -416,8 +416,8 @@ def _with_provenance(
             for sign, is_open, end in zip((-1, 1), interval.open, interval.ci95, strict=True)
         )
         config = changed(config, (*parameter.path[:-1], f"{parameter.path[-1]}_ci95"), (low, high))
-    for axis, parameter in lags.items():
-        low, high = (rounded(end / MS) for end in open_interval(parameter.lag_ms_ci95))
+    for axis, lag in lags.items():
+        low, high = (rounded(end / MS) for end in open_interval(lag.lag_ms_ci95))
         config = changed(config, ("arm", "axes", axis, "lag_ci95"), (low, high))
     earlier = _tuned_on(config)  # what is not fitted now is from there
     return changed(config, ("arm", "provenance", "tuned_on"), [*(run for run in earlier if run not in runs), *runs])
