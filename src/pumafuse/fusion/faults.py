@@ -150,7 +150,7 @@ _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
 
 def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
     """A fault for each angle of the commands or of a sensor that begins anew after each turn."""
-    sentences, angles = list[Fault](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
+    faults, angles = list[Fault](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
     positions: _Positions = _positions(segment, config) if angles else {}
     for axis in angles:
         if times := len(wraps(segment.given(axis)[1])):
@@ -158,15 +158,15 @@ def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
                 f"the commands: an angle that begins anew on {axis} after each turn, {times} times: the model goes back"
                 " by a turn then; turn_deg = 360 beside their column in run.toml makes them go on"
             )
-            sentences.append(Fault((), (axis,), "turns", times, words))
+            faults.append(Fault((), (axis,), "turns", times, words))
         for name, axes in positions.items():
             if axis in axes and (times := len(wraps(config.sensors[name].scale * axes[axis][1]))):
                 words = (
                     f"sensor '{name}': an angle that begins anew on {axis} after each turn, {times} times: turn_deg ="
                     " 360 in its table makes it go on"
                 )
-                sentences.append(Fault((name,), (axis,), "turns", times, words))
-    return sentences
+                faults.append(Fault((name,), (axis,), "turns", times, words))
+    return faults
 
 
 def _positions(segment: Segment, config: FusionConfig) -> _Positions:
@@ -240,8 +240,8 @@ def _tracking(
 def _off(segment: Segment, config: FusionConfig, trackings: _Trackings) -> list[Fault]:
     """A fault for each sensor that is off by a constant; of all sensors of an axis one, on the commands."""
     off = {
-        name: {axis: tracking.zero for axis, tracking in tracking.items() if tracking.zero}
-        for name, tracking in trackings.items()
+        name: {axis: tracking.zero for axis, tracking in of_sensor.items() if tracking.zero}
+        for name, of_sensor in trackings.items()
     }
     faults = list[Fault]()
     for name, zeros in off.items():
@@ -322,13 +322,13 @@ def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
             (name,),
             (axis,),
             "motion",
-            track.own_motion,
-            f"sensor '{name}' moves over {_length(config, axis, track.own_motion, '.3g')} on {axis}, whose commands"
+            tracking.own_motion,
+            f"sensor '{name}' moves over {_length(config, axis, tracking.own_motion, '.3g')} on {axis}, whose commands"
             " rest: is it the right column of the commands?",
         )
-        for name, tracking in trackings.items()
-        for axis, track in tracking.items()
-        if track.own_motion
+        for name, of_sensor in trackings.items()
+        for axis, tracking in of_sensor.items()
+        if tracking.own_motion
     ]
 
 
@@ -365,18 +365,16 @@ def _set(name: str, step: ClockStep, at: float) -> str:
 
 
 def _not_following(segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings) -> list[Fault]:
-    turned_frames = _turned_frames(segment, config, positions, trackings)
-    turned = {name for fault in turned_frames for name in fault.sensors}
+    faults = _turned_frames(segment, config, positions, trackings)
+    turned = {name for fault in faults for name in fault.sensors}
     for name, of_sensor in trackings.items():
         if name in turned:
             continue
         if odd := [axis for axis, tracking in of_sensor.items() if not tracking.follows]:
             grid = _busiest(segment, config.arm.update_period)
             causes = _matches(segment, config, {axis: positions[name][axis] for axis in of_sensor}, grid)
-            turned_frames += _faults(
-                config, name, of_sensor, {axis: causes[axis] for axis in odd}, grid.margin * grid.step
-            )
-    return _of_commands(turned_frames, trackings)
+            faults += _faults(config, name, of_sensor, {axis: causes[axis] for axis in odd}, grid.margin * grid.step)
+    return _of_commands(faults, trackings)
 
 
 def _matches(segment: Segment, config: FusionConfig, positions: Mapping[str, Rows], grid: Grid) -> dict[str, Match]:
@@ -428,11 +426,11 @@ def _faults(
     on_axis = {axis: cause for axis, cause in clear.items() if cause.axis == axis}
     if turned := [axis for axis, cause in on_axis.items() if cause.slope < 0.0]:
         fault(turned, "sign", -1.0, _turned(config, name, turned, on_axis, len(trackings)))
-    for axis, suspect_match in on_axis.items():
-        size = abs(suspect_match.slope)
+    for axis, match in on_axis.items():
+        size = abs(match.slope)
         if not 1.0 / GAIN < size < GAIN:
             refused, words = _unit(config.arm.axes[axis].kind, size)
-            times, correlation = _digits(size, 3), f"{suspect_match.correlation:+.3f}"
+            times, correlation = _digits(size, 3), f"{match.correlation:+.3f}"
             moves = f"moves {times} times as far as the commands of {axis} (correlation {correlation}): {words}"
             fault([axis], "unit", size, moves, refused)
     faulty = {axis for fault in faults for axis in fault.axes}
@@ -509,7 +507,7 @@ def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
     of_commands: list[Fault] = []
     for fault in faults:
         alike = [other for other in faults if fault.is_like(other)]
-        measuring = [name for name, tracking in trackings.items() if not tracking.keys().isdisjoint(fault.axes)]
+        measuring = [name for name, of_sensor in trackings.items() if not of_sensor.keys().isdisjoint(fault.axes)]
         if len(alike) < max(len(measuring), 2) or fault.cause == "nothing":
             of_commands.append(fault)
         elif fault is alike[0]:
@@ -526,8 +524,8 @@ def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
 def _turned_frames(segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings) -> list[Fault]:
     """The faults of sensors that see the commanded motion turned, by 3° or more."""
     faults = list[Fault]()
-    for name, tracking in trackings.items():
-        axes = [axis for axis in (CARTESIAN if "x" in tracking else CANONICAL_AXES) if axis in tracking]
+    for name, of_sensor in trackings.items():
+        axes = [axis for axis in (CARTESIAN if "x" in of_sensor else CANONICAL_AXES) if axis in of_sensor]
         if len(axes) < 2 or (turned := _turned_frame(segment, config, positions[name], axes)) is None:
             continue
         angle, along, back = turned
@@ -644,10 +642,10 @@ def _evidence(
         if count < _FEWEST:
             continue
         sensor, valid = config.sensors[name], valid[:count]
-        residual = start + response(model, period, delay, told_at, command, start, valid)
-        added = moving[0] + response(model, period, delay, earlier, moving, float(moving[0]), valid) - residual
+        at_rest = start + response(model, period, delay, told_at, command, start, valid)
+        added = moving[0] + response(model, period, delay, earlier, moving, float(moving[0]), valid) - at_rest
         added -= added.mean()
-        left = position[:count] - residual
+        left = position[:count] - at_rest
         left -= left.mean()
         along, size = float(added @ left), max(float(added @ added), 1e-30)
         noise = max((sensor.sd_of(axis) or 0.0) / abs(sensor.scale), float(np.std(left - added * (along / size))))

@@ -212,7 +212,7 @@ def validity(performance: Sequence[Performance], fastest: float, kind: Kind) -> 
 
     The speed of the ``fastest`` trial [m/s or rad/s] is the limit where no factor gives one.
     """
-    limits = {performance.factor: performance.limit for performance in performance}
+    limits = {tested.factor: tested.limit for tested in performance}
     radius, limit = limits.get("radius_mm"), limits.get(of_kind("speed_m_s", kind))
     speed = limit / SCREEN[kind].fast_scale if limit else fastest
     return Validity(

@@ -197,7 +197,7 @@ def identify(
         "delay": one_delay,
         "delay_spread_ms": {axis: round(result.delay_spread * units.MS, 2) for axis, result in axes.items()},
         "gain": {axis: result.gain_words for axis, result in axes.items()},
-        "validity": {performance.factor: performance.verdict for performance in performance},
+        "validity": {tested.factor: tested.verdict for tested in performance},
         "samples": "all" if samples is None else samples,
         "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
     }

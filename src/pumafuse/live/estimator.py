@@ -495,7 +495,7 @@ class LiveEstimator:
                 self._counts.outcomes[source, outcome] -= 1
             if sensor is not None:
                 self._counts.rows[source] -= as_row
-        events = [*(counted.event for counted in counted), *new]
+        events = [*(entry.event for entry in counted), *new]
         self.segment += 1
         self._start = {}
         if self._joints is not None:

@@ -47,20 +47,20 @@ def latencies_of(
         return {}
     best = min(lags, key=lambda name: (registrations[name].rms_rotation is None, lags[name].half))
     beside, placed = {best: Quantity.around(0.0)}, placed_by(config, registrations, {})
-    for name in (lag for lag in lags if lag != best):
+    for name in (other for other in lags if other != best):
         both = [run for run in runs if {name, best} <= run.sensors.keys()]
         points = [_of_point(run, best, registrations[best], placed, name) for run in both]
         told = later(points, [_in_base(run, name, placed) for run in both], lags[name].value - lags[best].value)
         beside[name] = told or _sum(lags[name], -lags[best].value)
     if lag is None:
-        first, latencies = min(beside, key=lambda name: beside[name].value), Quantity.around(0.0)
+        first, of_first = min(beside, key=lambda name: beside[name].value), Quantity.around(0.0)
     else:
         first = min(lags, key=lambda name: lags[name].half)
-        latencies = _sum(lags[first], -lag)
+        of_first = _sum(lags[first], -lag)
     return {
-        name: latencies
+        name: of_first
         if name == first
-        else _sum(latency, latencies.value - beside[first].value, beside[first], latencies)
+        else _sum(latency, of_first.value - beside[first].value, beside[first], of_first)
         for name, latency in beside.items()
     }
 

@@ -73,7 +73,7 @@ def _speeds(motion: Motion, steps: int, *, held: bool) -> list[FloatArray]:
     if motion.quaternion is not None:
         turned = Rotation.from_quat(motion.quaternion[last])
         speeds.append((turned[steps:] * turned[:-steps].inv()).magnitude())
-    return [np.minimum(speeds, np.quantile(speeds, _QUIET)) for speeds in speeds if len(speeds)]
+    return [np.minimum(part, np.quantile(part, _QUIET)) for part in speeds if len(part)]
 
 
 def despiked(position: FloatArray) -> FloatArray:
