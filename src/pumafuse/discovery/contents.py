@@ -797,7 +797,7 @@ def unused(parts: Iterable[Part]) -> list[str]:
     sentences = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
     sentences += [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
     sentences += [f"{part.label} ({part.notes[0]})" for part in parts if part.notes and not part.rows]
-    return [printable(fromkey, 200) for fromkey in dict.fromkeys(sentences)]
+    return [printable(sentence, 200) for sentence in dict.fromkeys(sentences)]
 
 
 def _no_clock(table: Table, name: str) -> str:
@@ -1010,7 +1010,7 @@ def no_commands(parts: Iterable[Part]) -> str:
                 f"the clock of {part.label} begins anew in row {rows[0] + 1}: if its rows are signals one below"
                 " another, add a column of words that say which signal a row is of, such as command_x and measured_x"
             )
-    return "".join(f"{printable(kind, 300)}; " for kind in advice) + ("or " if advice else "")
+    return "".join(f"{printable(sentence, 300)}; " for sentence in advice) + ("or " if advice else "")
 
 
 def period_of(command: Source) -> float:

@@ -329,12 +329,12 @@ class Tracking:
         _, moved, moved_before = self._moved
         motions = (led, moved), (led - before, moved - moved_before)
         columns = [column for column, about_zero in motions if _spread(about_zero) > self.noise]
-        columns_and_one, off = np.array([np.ones(len(led)), *columns]), measured - led
-        gram = columns_and_one @ columns_and_one.T
-        line = np.linalg.lstsq(gram, columns_and_one @ off)[0]
+        regressors, off = np.array([np.ones(len(led)), *columns]), measured - led
+        gram = regressors @ regressors.T
+        line = np.linalg.lstsq(gram, regressors @ off)[0]
         if not self.excludes(float(line[0])):
             return 0.0
-        left = off - line @ columns_and_one
+        left = off - line @ regressors
         wanders = float(np.std([piece.mean() for piece in np.array_split(left, _PIECES)]))
         # at a distance from the start that hardly changes, the constant is as uncertain as the slope
         chance = wanders * math.sqrt(len(left) * float(np.linalg.pinv(gram, hermitian=True)[0, 0]))

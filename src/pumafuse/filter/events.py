@@ -43,8 +43,8 @@ class Events(NamedTuple):
     def empty(axes: int, events: int = 0) -> Events:
         """Room for some events that give nothing."""
         time, table = np.zeros(events, dtype=np.int64), np.zeros((events, axes))
-        values_there = np.full((events, axes), ABSENT, dtype=np.uint8)
-        return Events(time, np.zeros(events, dtype=np.int16), time.copy(), table, np.zeros((0, axes)), values_there)
+        codes = np.full((events, axes), ABSENT, dtype=np.uint8)
+        return Events(time, np.zeros(events, dtype=np.int16), time.copy(), table, np.zeros((0, axes)), codes)
 
     def rows(self, chosen: IntArray | slice) -> Events:
         """Some of the events, in the order of ``chosen``."""

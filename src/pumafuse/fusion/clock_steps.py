@@ -167,11 +167,11 @@ def _follows(unexplained: FloatArray) -> bool:
     return float(np.pad(unexplained, 1)[lag : lag + 3].max()) < _FOLLOWS
 
 
-def _gain(unexplained: FloatArray, gain_here: float, other: float) -> float:
+def _gain(unexplained: FloatArray, shift_here: float, other: float) -> float:
     """By how much more is left about another lateness than at its own [s], log.
 
     About: within a third of the way, as a motion that repeats itself looks alike at another lateness.
     """
     shift = _BIN * np.arange(-(len(unexplained) // 2), len(unexplained) // 2 + 1)
-    about = np.abs(shift - other) <= max(abs(other - gain_here) * _ABOUT, 0.5 * _BIN)
+    about = np.abs(shift - other) <= max(abs(other - shift_here) * _ABOUT, 0.5 * _BIN)
     return float(unexplained[about].min() - unexplained.min())

@@ -186,12 +186,12 @@ def interpolated(time: FloatArray, segment: IntArray | IndexArray, reference: Re
 
     A gap is an interval longer than twice the reference's median interval and longer than 50 ms.
     """
-    values_there = np.full(len(time), np.nan)
+    track = np.full(len(time), np.nan)
     for number in set(segment.tolist()):
         here = segment == number
         rows = (reference.segment == number) & np.isfinite(reference.position[axis])
-        values_there[here] = _between(time[here], reference.time[rows], reference.position[axis][rows])
-    return values_there
+        track[here] = _between(time[here], reference.time[rows], reference.position[axis][rows])
+    return track
 
 
 def _score(error: FloatArray, variance: FloatArray) -> Score | None:

@@ -134,7 +134,7 @@ def _axis(digests: Sequence[Digest], axis: str) -> AxisSummary:
 
 def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
     having = [digest for digest in digests if name in digest.axes[axis].sensors]
-    parts = [digest_here.axes[axis].sensors[name] for digest_here in having]
+    parts = [part.axes[axis].sensors[name] for part in having]
     skills = [part.skill for part in parts if part.skill]
     outcomes, skill = added(part.outcomes for part in parts), pooled(skills, [skill.predictions for skill in skills])
     fused = [_fused(part) for part in parts]
