@@ -53,13 +53,13 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
             texts |= {"fusion.toml": config.to_toml(), "arm.toml": config.arm.to_toml()}
     for name, text in texts.items():
         write_file(folder / name, text, replace=force)
-    folder_word = shlex.quote(str(folder))
+    quoted = shlex.quote(str(folder))
     say(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
-    tuned, fused = f"{folder_word}/tuned", f"{folder_word}/fused"
+    tuned, fused = f"{quoted}/tuned", f"{quoted}/fused"
     if not surveyed.own_frames:
-        say(f"  pumafuse latency {folder_word}")
-    say(f"  pumafuse tune {folder_word} -c {folder_word}/fusion.toml -o {tuned} --fit noise,delay,plant")
-    say(f"  pumafuse fuse {folder_word} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
+        say(f"  pumafuse latency {quoted}")
+    say(f"  pumafuse tune {quoted} -c {quoted}/fusion.toml -o {tuned} --fit noise,delay,plant")
+    say(f"  pumafuse fuse {quoted} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
 
 
 def registered(survey: Survey, recorded: Run) -> FusionConfig | None:

@@ -85,10 +85,10 @@ def run(
         configured = with_tool(msgspec.structs.replace(configured, frame=recorded.frame or configured.frame), recorded)
     files = {source: manifest.file_of(Path(source.path)) for source in sources if source.kind in OF_A_RUN}
     listed = {address: manifest.load(file) for address, file in files.items()}
-    for address, address_of in listed.items():
-        start |= address_of.command.start
-        robot = configured.robot if address_of.robot is None else address_of.robot.beside(files[address].parent)
-        configured = msgspec.structs.replace(configured, frame=address_of.frame or configured.frame, robot=robot)
+    for address, described_run in listed.items():
+        start |= described_run.command.start
+        robot = configured.robot if described_run.robot is None else described_run.robot.beside(files[address].parent)
+        configured = msgspec.structs.replace(configured, frame=described_run.frame or configured.frame, robot=robot)
     errors = console(sys.stderr)
 
     def notify(text: str) -> None:

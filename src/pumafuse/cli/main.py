@@ -418,10 +418,7 @@ def _unexpected(error: Exception) -> str:
 
     frames, package = list(traceback.walk_tb(error.__traceback__)), Path(__file__).parents[1]
     paths = [
-        f_local
-        for frame, _ in frames
-        for f_local in frame.f_locals.values()
-        if isinstance(f_local, Path) and f_local.exists()
+        value for frame, _ in frames for value in frame.f_locals.values() if isinstance(value, Path) and value.exists()
     ]
     read = f", reading {paths[-1]}" if paths else ""
     files = [(Path(frame.f_code.co_filename), line) for frame, line in frames]

@@ -60,15 +60,14 @@ def run(
         raise typer.Exit(_NOT_ALL)
 
 
-def show(registration_summary: RegistrationSummary) -> None:
+def show(summary: RegistrationSummary) -> None:
     """Print what was found of each sensor on stdout."""
-    for name, sensor in registration_summary.sensors.items():
+    for name, sensor in summary.sensors.items():
         _show(name, sensor)
-    if registration_summary.joints:
+    if summary.joints:
         say("joints do not answer alike; each is later than the one that answers first by")
         rows = [
-            [n, f"{joint.later * MS:.2f}", _limits(joint.later_ci95, MS, ".2f")]
-            for n, joint in registration_summary.joints.items()
+            [n, f"{joint.later * MS:.2f}", _limits(joint.later_ci95, MS, ".2f")] for n, joint in summary.joints.items()
         ]
         print_tables([table(["joint", "later_ms", "95 % interval"], rows)])
 
