@@ -42,6 +42,16 @@ def test_a_dense_stream_has_more_room(command_hz: float, measurement_hz: float) 
     assert differences(pf.LiveEstimator(config), events_of(run), pf.fuse(run, config), 1.5) == []
 
 
+def test_the_first_room_serves_for_ever() -> None:
+    """A usual stream stays in the memory that was there at first, however long it is; what is old leaves it."""
+    run, config = run_of(60.0, 36.0, 200.0), config_of()
+    live = pf.LiveEstimator(config)
+    assert differences(live, events_of(run), pf.fuse(run, config), 0.1) == []
+    assert live._window.port.room == window.FIRST_ROWS
+    port = live._window.port
+    assert port.end - port.begin < 2.2 * 236.0
+
+
 def flood(live: pf.LiveEstimator, values: FloatArray) -> None:
     """A measurement each 50 µs, of two sensors in turn."""
     for row, value in enumerate(values.tolist()):
