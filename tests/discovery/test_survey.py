@@ -635,6 +635,7 @@ def test_a_lag_that_may_be_a_period_longer_is_asked(late: float, tmp_path: Path)
     assert found.relations["state", "chest"].lag == pytest.approx(0.9, abs=0.05)
     asked = [one for one in questions(found, {}) if " s late? " in one]
     assert [one[:20] for one in asked] == (["is state 4.9 s late?"] if late > 4.0 else [])
+    assert all("add shift_s = -4.8 to its time" in one for one in asked)  # 0.1 s of lag is left
 
 
 def test_a_clock_that_nothing_tells_from_the_lag_is_said_to_be_a_guess(log: Path) -> None:
