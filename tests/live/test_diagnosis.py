@@ -118,16 +118,19 @@ def longer_delay(config: pf.FusionConfig) -> pf.FusionConfig:
 
 
 @pytest.mark.parametrize(
-    ("slip", "configured", "words"),
+    ("slip", "configured", "words", "size"),
     [
-        (later(0.05), lambda config: config, "ms too small (latency_ms, delay_ms or plant)"),
-        (later(0.0), longer_delay, "ms too large (latency_ms, delay_ms or plant)"),
-        (noisy, lambda config: config, "sd_mm is too small"),
+        (later(0.05), lambda config: config, "ms too small (latency_ms, delay_ms or plant)", 50.0),
+        (later(0.0), longer_delay, "ms too large (latency_ms, delay_ms or plant)", 70.0),
+        (noisy, lambda config: config, "sd_mm is too small", None),
     ],
     ids=["late by less than a look sees", "a delay of the arm", "noise"],
 )
 def test_innovations_that_are_too_large_are_explained_as_fuse_explains_them(
-    slip: Callable[[Source], Source], configured: Callable[[pf.FusionConfig], pf.FusionConfig], words: str
+    slip: Callable[[Source], Source],
+    configured: Callable[[pf.FusionConfig], pf.FusionConfig],
+    words: str,
+    size: float | None,
 ) -> None:
     """Where no fault shows: once, with the verdict that `fuse` has of the whole, on the axis where it is worst."""
     run, config = tracked()
@@ -140,6 +143,8 @@ def test_innovations_that_are_too_large_are_explained_as_fuse_explains_them(
     est = pf.fuse(run, config)
     verdicts = {each: verdict for each in est.axes if (verdict := consistency(est, "tracker", each))}
     assert axis == max(verdicts, key=lambda each: verdicts[each].nis) and words in sentence(verdicts[axis])
+    if size is not None:  # ms
+        assert float(explained[0].partition("the lag is ")[2].split()[0]) == pytest.approx(size, rel=0.2)
     second_look = 7.5  # s: the first is 5 s after the first command at the earliest, and the next 2.5 s later
     assert float(explained[0].rpartition("(by ")[2].partition(" s)")[0]) > second_look
 

@@ -71,17 +71,17 @@ class Recent:
         self._rows = list[tuple[int, int, int, bytes]]()  # stamp, source, given axes as bits, values
         self._latest, self._start = [ALWAYS] * len(self._sensors), dict[str, float]()
 
-    def keep(self, stamp: int, source: int, told: int, values: Array[c_double]) -> None:
-        """Keep an event: its values [m or rad], (A,), of axes given as bits; of a dense sensor some."""
+    def keep(self, stamp: int, source: int, bits: int, values: Array[c_double]) -> None:
+        """Keep an event: its values [m or rad], (A,), of axes that ``bits`` name; of a dense sensor some."""
         if source == COMMAND:
             if len(self._start) < len(self._axes):
-                begun = {name: values[axis] for axis, name in enumerate(self._axes) if told >> axis & 1}
+                begun = {name: values[axis] for axis, name in enumerate(self._axes) if bits >> axis & 1}
                 self._start = {name: value for name, value in begun.items() if math.isfinite(value)} | self._start
         elif abs(stamp - self._latest[source]) < _FINEST_NS:
             return
         else:
             self._latest[source] = stamp
-        self._rows.append((stamp, source, told, bytes(values)))
+        self._rows.append((stamp, source, bits, bytes(values)))
 
     def forget(self, after: int) -> None:
         """Take back what is stamped after ``after`` [ns]."""
@@ -92,18 +92,18 @@ class Recent:
         """What came in the span before ``now`` [ns]; None where that is too little. What is older is forgotten."""
         self._rows = [row for row in self._rows if now - _SPAN_NS < row[0] <= now]
         ordered = sorted(self._rows, key=operator.itemgetter(0))
-        stamp, source, bits_given = np.array([row[:3] for row in ordered], dtype=np.int64).reshape(-1, 3).T
+        stamp, source, bits = np.array([row[:3] for row in ordered], dtype=np.int64).reshape(-1, 3).T
         value = np.frombuffer(bytearray().join(row[3] for row in ordered)).reshape(-1, len(self._axes))
         commands = source == COMMAND
         if not commands.any() or stamp[-1] - stamp[commands][0] < _SHORTEST_NS:
             return None
-        bits = bits_given[:, None] >> np.arange(len(self._axes)) & 1
-        value[bits == 0] = np.nan
-        commanded = [axis for axis in range(len(self._axes)) if bits[commands, axis].any()]
+        is_told = bits[:, None] >> np.arange(len(self._axes)) & 1
+        value[is_told == 0] = np.nan
+        commanded = [axis for axis in range(len(self._axes)) if is_told[commands, axis].any()]
         usable = commands | (stamp >= stamp[commands][0] + self._settled)  # where the arm was before is not
 
         def rows(chosen: IntArray, label: str) -> Source:
-            values = {self._axes[axis]: value[chosen, axis] for axis in commanded if bits[chosen, axis].any()}
+            values = {self._axes[axis]: value[chosen, axis] for axis in commanded if is_told[chosen, axis].any()}
             return Source(stamp[chosen], values, label, apart=True)
 
         every = {name: np.flatnonzero(usable & (source == number)) for number, name in enumerate(self._sensors)}
