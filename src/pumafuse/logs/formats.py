@@ -24,6 +24,7 @@ Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 SHEETS = ".xlsx"
 ENDINGS = (".mat", ".npy", ".npz", ".json", ".ulg", SHEETS)
 ARRAY = ".npy"
+_OBJECTS = "objects of Python, which are not loaded, as they may run code; save arrays of numbers"
 _FEWEST = 2  # rows: one number is a setting
 
 
@@ -113,7 +114,12 @@ def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     elif path.suffix == ".mat":
         value = _matlab(path, file)
     else:
-        loaded: Any = np.load(file, allow_pickle=False)
+        try:
+            loaded: Any = np.load(file, allow_pickle=False)
+        except ValueError as error:
+            # of what is no array numpy says that it is pickled, and how to load it unsafely
+            what = _OBJECTS if str(error).startswith("Object arrays") else "no array of numpy, or damaged"
+            raise RunError(f"{path}: {what}") from None
         value = _of_numbers(path, loaded) if path.suffix == ".npz" else loaded
     return _of_value(value)
 
@@ -127,8 +133,7 @@ def _of_numbers(path: Path, loaded: Mapping[str, npt.NDArray[Any]]) -> Arrays:
         except ValueError:
             objects.append(name)
     if objects:
-        what = f"{path.name}: {', '.join(objects)}: objects of Python, which are not loaded, as they may run code"
-        warn([f"{what}; save arrays of numbers"])
+        warn([f"{path.name}: {', '.join(objects)}: {_OBJECTS}"])
     return arrays
 
 
