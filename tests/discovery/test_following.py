@@ -43,8 +43,35 @@ def test_lag_gain_and_level_are_found(lag: float, gain: float, level: float, rat
     assert abs(found.correlation) > 0.95
     if rate > 5.0:
         assert 2e-4 < found.scatter < 5e-4
-    expected = np.median(z - np.sign(gain) * path(s - lag))
-    assert found.offset == pytest.approx(float(expected), abs=2e-3)
+    all_along = float(np.median(z - np.sign(gain) * path(s - lag)))  # or where the motion begins, at 0
+    assert found.offset == pytest.approx(min(all_along, level, key=abs), abs=4e-3)
+
+
+@pytest.mark.parametrize("stop", [0.55, 0.7])
+def test_an_axis_that_a_stop_holds_off_is_not_early(stop: float) -> None:
+    """Up and some way back in 6 s, and an arm that stays where it stops: it follows later, not 0.02 to 0.2 s sooner.
+
+    By how much, 0.1 s, such a motion hardly tells.
+    """
+    t, s = np.arange(0.0, 6.0, 0.005), np.arange(0.02, 5.9, 0.027)
+
+    def told(time: FloatArray) -> FloatArray:
+        return np.where(time < 3.0, 0.5 * (1.0 - np.cos(np.pi * time / 3.0)), 1.0 - 0.1 * (time - 3.0))
+
+    z = np.minimum(0.8 * told(np.maximum(s - 0.1, 0.0)), 0.8 * stop)
+    z += np.random.default_rng(4).normal(scale=3e-3, size=len(s))
+    found = following((stamped(t), told(t)), (stamped(s), z))
+    assert found is not None
+    assert 0.0 <= found.lag < 0.2
+    early = following((stamped(t), told(t)), (stamped(s), 0.8 * told(s + 0.1)))  # a clock is another one
+    assert early is not None and early.lag == pytest.approx(-0.1, abs=0.01)
+
+
+def test_an_axis_that_goes_a_quarter_as_far_has_the_zero_of_its_commands() -> None:
+    """It begins where they do; three quarters of the motion are no offset."""
+    t = np.arange(0.0, 40.0, 0.02)
+    found = following((stamped(t), 0.3 + path(t)), (stamped(t), 0.3 + 0.25 * path(t - 0.1)))
+    assert found is not None and abs(found.offset) < 2e-3
 
 
 def test_a_motion_that_is_a_small_part_of_a_run_is_no_outlier() -> None:

@@ -267,6 +267,14 @@ def test_a_lag_that_steps_is_said_of_one_sensor_alone(commands: int) -> None:
         assert plain is not None and plain.step is None
 
 
+def test_a_stop_is_no_lag_that_steps() -> None:
+    """An axis that goes a third as far in the last part of a run, where it stalls, follows as late there as before."""
+    one, held = (motion(0.08, 0.06, gain) for gain in (1.0, 0.3))
+    edge = one.time[int(0.6 * len(one.time))]
+    found = found_in(one._replace(value=np.where(one.time < edge, one.value, held.value)))
+    assert found is not None and found.step is None
+
+
 def test_nothing_is_said_of_what_is_off_by_next_to_nothing() -> None:
     """Twice as far off as the delayed command: of a thousandth of the range it is said, of half as much it is not."""
     config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config

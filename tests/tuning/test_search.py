@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import differential_evolution
 
 import pumafuse as pf
+from pumafuse.filter.response import response
 from pumafuse.tuning.arms import Arm
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise_with_gates, point
@@ -42,6 +43,26 @@ def test_where_it_starts_does_not_matter() -> None:
     starts.append(with_process(sim.config, input_noise=0.0, drift=0.0, maneuver_noise=0.0, maneuver_drift=0.0))
     totals = [fit_stage(sim.run, config, sd_prior=False).best.log_posterior for config in starts]
     assert max(totals) - min(totals) < 0.1
+
+
+@pytest.mark.parametrize("gain", [0.35, 1.8])
+def test_a_gain_far_from_1_is_fitted_with_everything_else(gain: float) -> None:
+    """As of a servo under a load: no step of noise or arm is lost at a bound of the gain."""
+    t, s = np.arange(0.0, 20.0, 0.028), np.arange(0.0, 19.9, 0.01)
+    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))
+    arm = pf.ArmModel(name="lever", update_period=0.028, delay=0.05, axes={"tip": axis})
+    config = pf.FusionConfig(arm=arm, sensors={"camera": pf.Sensor(sd=1e-4)})
+    u = 0.05 * np.sin(2.0 * t) + 0.03 * np.sin(3.1 * t + 0.4 * t**1.1)
+    true = replaced(axis, gain=pf.Gain(intercept=gain))
+    told, valid = (np.rint(time * 1e9).astype(np.int64) for time in (t, s))
+    z = response(true, 0.028, 0.08, told, u, 0.0, valid)
+    z += np.random.default_rng(3).normal(scale=1e-4, size=len(s))
+    run = pf.Run.from_arrays(t, {"tip": u}, {"camera": (s, {"tip": z})})
+    stage = fit_stage(run, config, ("noise", "delay", "plant", "gain"))
+    assert stage.best.config.arm.axes["tip"].gain.intercept == pytest.approx(gain, rel=0.02)
+    noisy = with_sensors(stage.best.config, sd=5e-4)
+    again = maximise_with_gates(stage.likelihood, noisy, stage.free)
+    assert again.log_posterior == pytest.approx(stage.best.log_posterior, abs=0.1)
 
 
 @pytest.mark.long

@@ -27,6 +27,7 @@ _MOST_OUTLYING = 0.05  # of the changes: each outlier is in two, and of few meas
 _SLOW, _FASTEST = 0.1, 0.99  # of the way that so many rows do not exceed: less is rest
 _MOSTLY = 0.5  # share of the rows in motion, from which the median is one of them
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
+_KNEES = np.linspace(0.0, 1.0, 13)[1:-1]  # of the range that is commanded, where a curve bends
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
 
 
@@ -37,7 +38,7 @@ class Following:
     lag: float  # how late it is behind the path through the other's points [s]
     correlation: float  # of their changes at that lag, outliers apart
     slope: float  # by how much it moves when the other moves by 1
-    offset: float  # how far its level is from slope ± 1 times the other's [m or rad]
+    offset: float  # how far its level is from ± 1 times the other's, where that begins or all along [m or rad]
     scatter: float  # its noise, roughly, [m or rad]
     resolution: float  # that of the steps in which its values come
     misfit: float  # standard deviation of what the other, delayed and scaled, leaves of it, outliers apart [m or rad]
@@ -52,16 +53,51 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     s, z = s[inside], z[inside]
     if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
         return None
-    fits, noise, steps = list[tuple[float, float, Following]](), scatter(z), _resolution(z)
-    outliers = float(isolated(z).mean())
-    moves = _in_motion(z)
-    for lag, correlation, slope in filter(None, (_at_span(t, u, s, z, span) for span in _SPANS)):
+    noise, steps, outliers, moves = scatter(z), _resolution(z), float(isolated(z).mean()), _in_motion(z)
+
+    def at(lag: float, correlation: float, slope: float) -> tuple[float, float, Following]:
         led = np.interp(s - lag, t, u)
-        offset, residual = float(np.median(z - math.copysign(1.0, slope) * led)), z - slope * led
+        offset, residual = _offset(z, led, slope, float(u[0])), z - slope * led
         left = max(min(noise, scatter(residual)), steps)
         fit = Following(lag, correlation, slope, offset, left, steps, robust_sd(residual[moves]), outliers)
-        fits.append((fit.misfit, float(np.std(residual)), fit))  # in whole counts medians are alike: what jumps decides
-    return min(fits, key=lambda fit: fit[:2])[2] if fits else None
+        return fit.misfit, float(np.std(residual)), fit  # in whole counts medians are alike: what jumps decides
+
+    fits = [at(*best) for span in _SPANS if (best := _at_span(t, u, s, z, span))]
+    if not fits:
+        return None
+    least = min(fits, key=lambda fit: fit[:2])[2]
+    if least.lag < -_COARSE and (later := _along_curve(t, u, s, z, least.lag)) > least.lag:
+        led = np.interp(s - later, t, u)
+        least = at(later, float(np.corrcoef(led, z)[0, 1]), float(np.polyfit(led, z, 1)[0]))[2]
+    return least
+
+
+def _along_curve(t: FloatArray, u: FloatArray, s: FloatArray, z: FloatArray, before: float) -> float:
+    """The lag [s] at which it follows a curve over the other's levels, as at a stop or under a load; else ``before``.
+
+    Such an axis seems to turn before its commands do. The curve is a line in pieces, by least squares; it must leave
+    half of what a straight line does.
+    """
+    some = np.unique(np.linspace(0, len(s) - 1, min(_FEW, len(s))).astype(np.int64))
+
+    def left(lag: float, knees: FloatArray) -> float:
+        led = np.interp(s[some] - lag, t, u)
+        bends = np.maximum(led[:, None] - (u.min() + knees * np.ptp(u)), 0.0)
+        columns = np.column_stack([np.ones(len(led)), led, bends])
+        return float(np.sum((z[some] - columns @ np.linalg.lstsq(columns, z[some], rcond=None)[0]) ** 2))
+
+    lag = min(np.arange(_EARLIEST, LATEST, _COARSE).tolist(), key=lambda lag: left(lag, _KNEES))
+    return lag if left(lag, _KNEES) < 0.5 * left(before, _KNEES[:0]) else before
+
+
+def _offset(value: FloatArray, led: FloatArray, slope: float, start: float) -> float:
+    """How far a level is from that of what leads it, which begins at ``start``: there, or on all of the way.
+
+    Where one moves half as far as the other, they agree where they begin, or nowhere.
+    """
+    sign = math.copysign(1.0, slope)
+    offsets = [float(np.median(value - times * (led - start))) - sign * start for times in (sign, slope)]
+    return min(offsets, key=abs)
 
 
 def _stands(value: FloatArray) -> bool:

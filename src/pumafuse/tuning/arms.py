@@ -229,6 +229,11 @@ class Measured:
         ]
         return np.concatenate([left - left.mean() for left in parts] or [np.zeros(0)])
 
+    def squares(self, arm: Arm) -> float:
+        """The sum of the squares that an arm leaves [m²]."""
+        left = self.left(arm)
+        return float(left @ left)
+
     @property
     def power(self) -> float:
         """The sum of squares of all that is measured [m²], of each recording about its mean."""

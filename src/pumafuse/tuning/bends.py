@@ -129,12 +129,12 @@ class _Search:
         if not start:
             return False
         self._starts[kind] = start
-        bent, square = self.whole(beside), _square(self.measured, self.whole(chosen))
+        bent, square = self.whole(beside), self.measured.squares(self.whole(chosen))
         slopes = bent.beyond, bent.below
         most = BEYOND[1] if kind == "sag" else 0.0  # a stop holds an axis off
         if is_sag and (max(map(abs, slopes)) < _SLIGHT or max(slopes) >= most):
             return False
-        return _square(self.measured, bent) < _SEEMS * square
+        return self.measured.squares(bent) < _SEEMS * square
 
     def _size(self, kind: str, arm: Arm) -> dict[str, float]:
         """The likeliest play or fastest speed on a rough grid; none where all that may be is too small."""
@@ -194,7 +194,8 @@ class _Search:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
         first, second = self.halves
         pairs = (first, second), (second, first)
-        return np.array([_square(that, self._fitted(here, self.whole(kinds), kinds).arm) for here, that in pairs])
+        fitted = [(self._fitted(here, self.whole(kinds), kinds).arm, that) for here, that in pairs]
+        return np.array([that.squares(arm) / that.count for arm, that in fitted])
 
     def _fitted(self, measured: Measured, near: Arm, kinds: Sequence[str]) -> Fit:
         """The arm of least squares with these bends near one of the same order."""
@@ -250,11 +251,6 @@ def _levels(measured: Measured, arm: Arm) -> FloatArray:
     """Where an arm without a sag is, as logged, at the measurements that count [m]."""
     parts = zip(measured.recordings, measured.responses(arm), strict=True)
     return np.concatenate([(recording.start + moved)[recording.weight > 0.0] for recording, moved in parts])
-
-
-def _square(measured: Measured, arm: Arm) -> float:
-    """The mean square that an arm leaves [m²]."""
-    return float(np.mean(measured.left(arm) ** 2))
 
 
 def _halves(measured: Measured) -> tuple[Measured, Measured]:

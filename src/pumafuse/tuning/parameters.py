@@ -172,7 +172,7 @@ class Parameter:
         middle, (low, high) = line.get(config), self.bounds
         if self.fit == "delay":
             return replace(line, bounds=(0.0, max(longest_delay(config.arm.update_period), middle)))
-        if self.fit == "scale":  # shares of it: a scale of 0 is none
+        if self.fit == "scale" or path[-1] == "intercept":  # shares of it: a scale of 0 is none
             low, high, line = low * abs(middle), high * abs(middle), replace(line, scale=self.scale * abs(middle))
         return replace(
             line, bounds=(middle + low, middle + high), prior=self.prior and (middle + self.prior[0], self.prior[1])
@@ -204,7 +204,7 @@ _TABLE = (
     _line("plant", "axes.{axis}.sag.slope_beyond", "arm.axes.{axis}.sag.slope_beyond", *BEYOND, log=False, scale=0.1),
     _line("plant", "axes.{axis}.sag.knee_below_mm", "arm.axes.{axis}.sag.knee_below", *_LEVELS, log=False, scale=0.1),
     _line("plant", "axes.{axis}.sag.slope_below", "arm.axes.{axis}.sag.slope_below", *BEYOND, log=False, scale=0.1),
-    _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.5, 0.5, **_INTERCEPT),
+    _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.8, 3.0, **_INTERCEPT),
     _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *RECOVERY, prior=RECOVERY_PRIOR),
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
     _line("scale", "sensors.{sensor}.scale", "sensors.{sensor}.scale", -0.5, 0.5, log=False, scale=0.1),

@@ -132,17 +132,17 @@ def plain_arm(measured: Measured) -> PlainArm | None:
 def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
     """Where another lag in the second part of a run, or of parts of one, leaves much less than an arm for all of it.
 
-    None where none does. The ``arm`` is near that; the first command was given at ``begin`` [ns].
+    None where none does, or where another gain alone does: a stop or a load. The ``arm`` is near that of all; the first
+    command was given at ``begin`` [ns].
     """
     noise = measured.white(arm)
     arm = measured.fitted(arm, ["delay", "gain"], noise, _ANY).arm
-    whole = measured.left(arm)
-    least, step = _HALVED * float(whole @ whole), None
+    least, step = _HALVED * measured.squares(arm), None
     time = np.sort(np.concatenate([recording.time for recording in measured.recordings]))
     splits = _SPLITS if len(measured.recordings) == 1 else _OF_QUARTERS
     for row in np.rint(splits * (len(time) - 1)).astype(int).tolist():
         edge = 0.5 * float(time[row - 1] + time[row])  # between parts of a recording it may be anywhere
-        squares, lags = 0.0, list[float]()
+        squares, with_one_lag, lags = 0.0, 0.0, list[float]()
         for later in (False, True):
             parts = [
                 recording._replace(weight=recording.weight * ((recording.time >= edge) == later))
@@ -150,9 +150,9 @@ def _lag_step(measured: Measured, arm: Arm, begin: int) -> LagStep | None:
             ]
             part = measured.of(parts)
             fitted = part.fitted(arm, ["delay", "gain"], noise, _ANY).arm
-            left = part.left(fitted)
-            squares, lags = squares + float(left @ left), [*lags, fitted.total]
-        if squares < least and abs(lags[1] - lags[0]) > _NOTABLE * arm.total:
+            squares, lags = squares + part.squares(fitted), [*lags, fitted.total]
+            with_one_lag += part.squares(part.fitted(arm, ["gain"], noise, _ANY).arm)
+        if squares < min(least, _HALVED * with_one_lag) and abs(lags[1] - lags[0]) > _NOTABLE * arm.total:
             least, step = squares, LagStep((edge - begin) / 1e9, *lags)
     return step
 
