@@ -60,10 +60,10 @@ def test_an_axis_that_a_stop_holds_off_is_not_early(stop: float) -> None:
 
     z = np.minimum(0.8 * told(np.maximum(s - 0.1, 0.0)), 0.8 * stop)
     z += np.random.default_rng(4).normal(scale=3e-3, size=len(s))
-    found = following((stamped(t), told(t)), (stamped(s), z))
+    found = following((stamped(t), told(t)), (stamped(s), z), is_moved=True)
     assert found is not None
     assert 0.0 <= found.lag < 0.2
-    early = following((stamped(t), told(t)), (stamped(s), 0.8 * told(s + 0.1)))  # a clock is another one
+    early = following((stamped(t), told(t)), (stamped(s), 0.8 * told(s + 0.1)), is_moved=True)  # by another clock
     assert early is not None and early.lag == pytest.approx(-0.1, abs=0.01)
 
 

@@ -45,8 +45,13 @@ class Following:
     outliers: float  # the share of its values that jump away from their neighbours
 
 
-def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, FloatArray]) -> Following | None:
-    """How the second signal, stamps [ns] and values, follows the first; None without overlap or if one rests."""
+def following(
+    leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, FloatArray], *, is_moved: bool = False
+) -> Following | None:
+    """How the second signal, stamps [ns] and values, follows the first; None without overlap or if one rests.
+
+    Where one ``is_moved`` by the other, as an arm by its commands, a stop or a load may hold it off.
+    """
     origin = int(leader[0][leader[0] != NO_STAMP].min(initial=2**62))
     (t, u), (s, z) = known(*leader, origin), known(*follower, origin)
     inside = (s > t[0] if len(t) else s > np.inf) & (s < t[-1] if len(t) else False)
@@ -66,7 +71,7 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     if not fits:
         return None
     least = min(fits, key=lambda fit: fit[:2])[2]
-    if least.lag < -_COARSE and (later := _along_curve(t, u, s, z, least.lag)) > least.lag:
+    if is_moved and least.lag < -_COARSE and (later := _along_curve(t, u, s, z, least.lag)) > least.lag:
         led = np.interp(s - later, t, u)
         least = at(later, float(np.corrcoef(led, z)[0, 1]), float(np.polyfit(led, z, 1)[0]))[2]
     return least

@@ -267,12 +267,12 @@ def _ordered(stream: Stream, reference: Stream, *, leads: bool) -> Attitude:
 
 def relations(run: Run) -> dict[tuple[str, str], Following]:
     """How each sensor, and ``reference``, follows the commands, by its name and the axis."""
+    told = {axis: (run.command.stamp, value) for axis, value in run.command.values.items()}
     return {
         (name, axis): relation
         for name, source in run.measured.items()
         for axis, value in source.values.items()
-        if axis in run.command.values
-        and (relation := following((run.command.stamp, run.command.values[axis]), (source.stamp, value))) is not None
+        if axis in told and (relation := following(told[axis], (source.stamp, value), is_moved=True)) is not None
     }
 
 
