@@ -268,6 +268,8 @@ def test_times_as_programs_write_them(cell: str, ns: int) -> None:
         (["3/4/2026 10:00:00", "3/4/2026 10:00:01"], "2026-03-04T10:00:00", "2026-03-04T10:00:01", "month"),
         (["3/4/2026 11:59:59 PM", "3/5/2026 12:00:01 am"], "2026-03-04T23:59:59", "2026-03-05T00:00:01", "month"),
         (["3/4/2026 23:59:59", "4/4/2026 0:00:01"], "2026-04-03T23:59:59", "2026-04-04T00:00:01", "day"),
+        (["25/12/26 9:05:03", "26/12/26 0:00:01"], "2026-12-25T09:05:03", "2026-12-26T00:00:01", None),
+        (["7.9.31 8:00:00.5"], "2031-09-07T08:00:00.500", "2031-09-07T08:00:00.500", None),
         (["2026-03-04 9:00:00 PM"], "2026-03-04T21:00:00", "2026-03-04T21:00:00", None),
     ],
 )
@@ -281,7 +283,7 @@ def test_all_of_a_column_tells_which_number_of_a_date_is_the_day(
     assert note == (said if leading else None)
 
 
-@pytest.mark.parametrize("cell", ["13/13/2026 1:00:00", "2/30/2026 1:00:00", "3/4/26 10:00:00", "3/4/2026"])
+@pytest.mark.parametrize("cell", ["13/13/2026 1:00:00", "2/30/2026 1:00:00", "3/4/126 10:00:00", "3/4/2026"])
 def test_what_is_no_date_with_slashes_is_refused(cell: str) -> None:
     """It is said how to write one."""
     text = one_line(RunError, lambda: one_column(["", cell]).stamps("t"))

@@ -23,6 +23,7 @@ ELAPSED = (
 # Other ways to write a time, and what stands for them here. With points the day comes first everywhere. MATLAB writes
 # 1.5 sec.
 _REWRITTEN = (
+    (r"^(\d\d?[./]\d\d?[./])(\d\d)(,?[ T])", r"\120\2\3"),  # a year of this century
     (r"^(\d\d?)\.(\d)\.", r"\1.0\2."),
     (r"^(\d)\.(\d\d)\.", r"0\1.\2."),
     (r"^(\d\d)\.(\d\d)\.(\d{4}),?[ T]", r"\3-\2-\1 "),
