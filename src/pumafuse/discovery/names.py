@@ -29,11 +29,11 @@ _ROLES: dict[Role, frozenset[str]] = {
     "sensor": _DEVICES
     | words_in(
         "state states measured measurement measurements meas msr actual present real ist istwert pv process current"
-        " cur encoder encoders feedback fbk fb observed observation estimate estimated recorded reported odom"
+        " cur curr encoder encoders feedback fbk fb observed observation estimate estimated recorded reported odom"
     ),
 }
 # In the name of a topic or file these are something else.
-_OF_COLUMNS = words_in("set sp pv process fb current cur present real control ctrl input inputs")
+_OF_COLUMNS = words_in("set sp pv process fb current cur curr present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
@@ -69,7 +69,8 @@ _WHOLE = {
     **dict.fromkeys(words_in("qx qy qz qw"), "turning"),
 }
 _TRANSLATIONS = {"tx": "x", "ty": "y", "tz": "z"}
-_NOW = words_in("current cur")  # of motors, but of the present beside
+_NOW = words_in("current cur curr")  # of motors, but of the present beside
+_MEASURED = _ROLES["sensor"] - _NOW  # what is measured is a motor's current: CurrentFeedback
 _POSITIONS = words_in("position positions pos pose angle theta x y z roll pitch yaw")
 _TIME_UNITS = {
     **dict.fromkeys(words_in("seconds secs sec s"), "s"),
@@ -201,7 +202,7 @@ def no_position(column: str) -> str | None:
         return whole
     parts = [word.rstrip(_DIGITS) for word in parts]
     whats = [word for word in parts if word in (_SPREADS if is_told else _NO_POSITIONS)]
-    if len(whats) == 1 and whats[0] in _NOW and not _POSITIONS.isdisjoint(parts):
+    if len(whats) == 1 and whats[0] in _NOW and not _POSITIONS.isdisjoint(parts) and _MEASURED.isdisjoint(parts):
         return None
     if len(whats) == 1 and parts[-1] in _FINGERS and role_words(column):
         return None
