@@ -247,3 +247,14 @@ def test_a_type_without_a_definition_is_named(tmp_path: Path) -> None:
     refusal = one_line(RunError, lambda: survey(tmp_path / "a.mcap"))
     assert "/acme/setpoint: its messages cannot be decoded" in refusal
     assert "acme_msgs/msg/SetPoint" in refusal
+
+
+def test_topics_that_measure_no_position_are_named_where_nothing_else_does(tmp_path: Path) -> None:
+    """With the reason: a user sees that they were looked at."""
+    time, kind = np.arange(0.0, 11.0, 0.02), "sensor_msgs/msg/Imu"
+    sent = [
+        ("/goal_joints", "sensor_msgs/msg/JointState", *rest) for _, _, *rest in states(["lift"], moves(time), time)
+    ]
+    turning = [("/gyro", kind, START + t, {"angular_velocity": {"x": 0.1, "y": 0.0, "z": 0.2}}) for t in time]
+    said = one_line(RunError, lambda: survey(bag(tmp_path / "log.mcap", [*sent, *turning])))
+    assert "/gyro (no positions in messages of this type)" in said

@@ -1120,6 +1120,21 @@ def test_commands_that_never_move_are_named(tmp_path: Path) -> None:
     text = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
     assert "What is called so never moves: GoalTicks, always 42, and none runs ahead" in text
     assert "None is called" not in text
+    write(tmp_path / "log.csv", {"t_s": t, "swing": z[:, 0]})
+    write(tmp_path / "desired.csv", {"t_s": t, "swing": np.zeros(len(t))})
+    assert "What is called so never moves: swing, always 0" in one_line(RunError, lambda: survey(tmp_path))
+
+
+def test_texts_without_a_clock_are_named_and_read_at_a_rate(log: Path) -> None:
+    """Alone in a folder; beside a table they may be anything."""
+    t, u, z = recorded_at_once()
+    for name, at in (("planned", u), ("measured", z)):
+        np.savetxt(log / f"{name}.txt", at, "%.6f")
+    said = one_line(RunError, lambda: survey(log))
+    assert "measured.txt (no clock for its 1000 rows), planned.txt (no clock for its 1000 rows)" in said
+    assert survey(log, 50.0).relations["measured", "column_1"].lag == pytest.approx(LAG, abs=3e-3)
+    write(log / "camera.csv", {"t_s": t, "x_mm": 1e3 * z[:, 0]})
+    assert [part.label for part in parts_of(log)] == ["camera.csv"]
 
 
 def test_what_has_no_clock_is_named_where_nothing_tells_the_commands(tmp_path: Path) -> None:
@@ -1401,6 +1416,16 @@ def test_a_reference_that_runs_ahead_of_the_commands_is_no_truth(tmp_path: Path)
     found = survey(tmp_path / "log.csv")
     assert found.run.reference is None
     assert any(one.startswith("reference is not used on x: it does not follow the commands") for one in asked(found))
+
+
+def test_of_two_clocks_that_were_counted_the_first_is_taken(tmp_path: Path) -> None:
+    """Cycles of 4 ms beside the time that they make: another count tells it no better."""
+    t, n = 0.004 * np.arange(3000), np.arange(3000)
+    columns = {"time_run": t, "time_cycle": n, "bend_target": np.sin(2.0 * t), "bend_actual": np.sin(2.0 * (t - 0.06))}
+    write(tmp_path / "log.csv", columns)
+    found = survey(tmp_path / "log.csv")
+    assert found.relations["actual", "bend"].lag == pytest.approx(0.06, abs=3e-3)
+    assert any("By time_run it lasts 12 s, by time_cycle" in one for one in asked(found))
 
 
 def test_what_repeats_the_commands_later_is_no_copy(tmp_path: Path) -> None:

@@ -177,14 +177,12 @@ class Part:
 
 def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
     """What a log has: a table, a recording, or a folder of them; ``rate`` is that of rows without stamps [Hz], or 0."""
-    parts: list[Part] = []
+    parts, texts = list[Part](), list[Part]()
     for path in _files(log):
         is_known = path.name.endswith(_TABLES) or formats.has_tables(path) or tables.is_recording(path)
         if path != log and not is_known:
-            with suppress(RunError):  # it may be anything, if it is no table of positions with a clock of its own
-                parts += [
-                    part for part in _tabled(path, rate) if part.clock and not part.clock.time.rate and part.signals
-                ]
+            with suppress(RunError):  # beside others it may be anything, if it is no table with a clock of its own
+                texts += [part for part in _tabled(path, rate) if part.signals]
         elif tables.is_recording(path):
             parts += _recorded(path)
         else:
@@ -196,9 +194,10 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
                 parts.append(Part(path, notes=(str(error).removeprefix(f"{path}: "),)))
                 continue
             parts += [part for name in several for part in _tabled(path, rate, name)]
-        if len(parts) > _MOST_PARTS:
+        if len(parts) + len(texts) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
-    parts = _of_one_run(parts)
+    timed = [part for part in texts if part.clock and not part.clock.time.rate]
+    parts = _of_one_run(parts + timed if parts else texts)
     return [part if part.clock is None else replace(part, clock=_beside(part, part.clock, parts)) for part in parts]
 
 
@@ -548,8 +547,8 @@ def _or_another(table: Table, clock: Clock, others: Iterable[Clock]) -> Clock:
     for other in others:
         spans = [float(np.ptp(timed.stamp[timed.stamp != NO_STAMP])) / 1e9 for timed in (clock, other)]
         if max(spans) > _ALIKE_SPANS * min(spans) > 0.0:
-            steps = np.diff(clock.stamp)
-            counted = np.abs(steps - np.median(steps)).max() <= _OF_STEP * np.median(steps)
+            steps = np.diff([clock.stamp, other.stamp])
+            counted = (np.ptp(steps, axis=1) <= _OF_STEP * np.median(steps, axis=1)).tolist() == [True, False]
             names_of = clock.time.column, other.time.column
             doubt = (
                 f"which is the clock of {table.path.name}? By {names_of[0]} it lasts {spans[0]:.4g} s, by"
@@ -796,7 +795,8 @@ def unused(parts: Iterable[Part]) -> list[str]:
     parts = list(parts)
     sentences = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
     sentences += [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
-    sentences += [f"{part.label} ({part.notes[0]})" for part in parts if part.notes and not part.rows]
+    none = (part for part in parts if part.notes and not (part.signals or part.left_out))
+    sentences += [f"{part.label} ({part.notes[0]})" for part in none]
     return [printable(sentence, 200) for sentence in dict.fromkeys(sentences)]
 
 

@@ -158,8 +158,12 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         what = "; ".join(
             f"{printable(stream.part.label)}: {', '.join(list(stream.axes)[:_MOST_LISTED])}" for stream in streams
         )
-        still = [f"{column}, {why}" for part in parts for column, why in part.left_out.items() if why.startswith(RESTS)]
-        still = [column for column in still if names.column_role(column.rpartition(",")[0]) == "command"]
+        still = [
+            f"{column}, {why}"
+            for part in parts
+            for column, why in part.left_out.items()
+            if why.startswith(RESTS) and "command" in (names.column_role(column), names.role_of(part.stem))
+        ]
         called = "None is called command, goal, target, desired, setpoint or action"
         called = f"What is called so never moves: {printable('; '.join(still[:3]), _LONGEST)}" if still else called
         advice = f"{no_commands(parts)}say it in run.toml"
