@@ -1455,6 +1455,17 @@ def test_stamps_of_a_headerless_table_may_repeat(tick: float, every: float, tmp_
     assert any("is no clock: 40 distinct stamps, one every 1 s" in note for note in coarse.notes)
 
 
+@pytest.mark.parametrize("later", [0.3, 0.8])
+def test_what_moves_alike_much_later_measures_nothing_in_a_table_without_a_header(later: float, tmp_path: Path) -> None:
+    """Legs of a gait follow each other by a share of a stride, and no arm is so late."""
+    t = np.arange(0.0, 30.0, 0.02)
+    np.savetxt(tmp_path / "walk.csv", np.column_stack([t, path(t)[:, 1], path(t - later)[:, 1]]), "%.5f", ",")
+    if later < 0.5:
+        assert set(survey(tmp_path / "walk.csv").run.sensors) == {"measured"}
+    else:
+        assert "which numbers are the commands?" in one_line(RunError, lambda: survey(tmp_path / "walk.csv"))
+
+
 def test_rows_that_a_clock_of_ticks_gets_may_vary(tmp_path: Path) -> None:
     """Three to five rows of a logger in each tick of 5 ms; a table of commands and measurements without a header."""
     rows = np.random.default_rng(1).choice([3, 4, 5], 2000, p=[0.17, 0.58, 0.25])
@@ -1483,6 +1494,25 @@ def test_what_is_called_an_error_is_no_position(tmp_path: Path) -> None:
     write(tmp_path / "log.csv", columns | {"errs_y_m": 0.9 * z[:, 1]})
     (part,) = parts_of(tmp_path / "log.csv")
     assert {one.column for one in part.signals} == {"target_y_m", "robot_y_m"}
+
+
+def test_how_a_tool_leans_is_not_where_it_is(tmp_path: Path) -> None:
+    """A vehicle that leans before it goes, each about as the way that it is told."""
+    t, rng = np.arange(0.0, 40.0, 0.02), np.random.default_rng(4)
+    told = path(t)
+    lean = 0.2 * path(t - 0.2)[:, :2] + 0.014 * np.sin(3.1 * t)[:, None] + rng.normal(0.0, 1e-4, (len(t), 2))
+    columns = {"t_s": t, "target_x": told[:, 0], "target_y": told[:, 1]}
+    write(tmp_path / "log.csv", columns | {"measured_roll_rad": lean[:, 1], "measured_pitch_rad": lean[:, 0]})
+    said = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    assert "commands, but nothing that measures where they lead" in said
+
+
+def test_a_set_point_is_not_measured_by_another(tmp_path: Path) -> None:
+    """Paths of a motor and of its joint, both planned: nothing in the log says where the arm was."""
+    t, u, z = recorded_at_once()
+    columns = {"t_s": t, "ref_motor[0]": u[:, 0], "ref_motor[1]": u[:, 1]}
+    write(tmp_path / "log.csv", columns | {"ref_joint[0]": z[:, 0], "ref_joint[1]": z[:, 1], "spring[0]": 2.0 * t % 3})
+    assert "commands" in one_line(RunError, lambda: survey(tmp_path / "log.csv"))
 
 
 def test_one_coordinate_of_a_point_is_a_joint_only_where_it_moves_as_that_does(tmp_path: Path) -> None:

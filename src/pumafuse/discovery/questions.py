@@ -15,12 +15,10 @@ from ..logs.run import Run, Source
 from ..units import MS
 from .following import LATEST, Following
 from .guesses import SensorGuess
-from .roles import another_clock
+from .roles import MOST_LAG, SAME, another_clock
 from .survey import FOLLOWS, Survey
 
-_SAME = 0.8  # correlation of changes from which one follows another for sure
 _OTHER_UNIT, _ABOUT_ONE = 3.0, 1.25  # factors by which a sensor may move less or more than its command
-_LONG = 0.5  # s, of a lag that hardly an arm has
 
 
 def decisions(survey: Survey) -> Iterator[tuple[str, str, str]]:
@@ -55,7 +53,7 @@ def decisions(survey: Survey) -> Iterator[tuple[str, str, str]]:
             least = min(abs(relation.correlation) for relation in by_axis.values())
             moves_as_far = all(_moves_as_far(survey.run, name, axis, relation) for axis, relation in by_axis.items())
             as_it_should = (
-                least >= _SAME and moves_as_far and all(0.0 <= relation.lag <= _LONG for relation in by_axis.values())
+                least >= SAME and moves_as_far and all(0.0 <= relation.lag <= MOST_LAG for relation in by_axis.values())
             )
             told = f"{lag * MS:.0f} ms late, gain {gain:.3g}, correlation {least:.3f}"
             yield f"{name} follows", told, "sure" if as_it_should else "a question"
@@ -77,7 +75,7 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
             "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"
             " follows that path sooner than an arm can that holds each command (interpolation_ms in run.toml)"
         )
-    follow = any(abs(relation.correlation) >= _SAME for relation in survey.relations.values())
+    follow = any(abs(relation.correlation) >= SAME for relation in survey.relations.values())
     later = list[str]()
     for name, source in run.sensors.items():
         by_axis = {axis: survey.relations[name, axis] for axis in source.values if (name, axis) in survey.relations}
@@ -86,7 +84,7 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
             yield f"{name}: {why or 'too few measurements, or no motion, while there are commands'}"
         for axis, relation in by_axis.items():
             size = abs(relation.slope)
-            if abs(relation.correlation) < _SAME:
+            if abs(relation.correlation) < SAME:
                 ask = (
                     ": are axes exchanged, or its clock another one?" if follow else ", nor anything else its commands"
                 )
@@ -99,7 +97,7 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
             if relation.lag < 0.0:
                 ahead = f"{-relation.lag * MS:.0f} ms ahead"
                 yield f"{name} runs {ahead} of the commands on {axis}: is its clock another one?"
-            elif relation.lag > _LONG:
+            elif relation.lag > MOST_LAG:
                 most = " or more" if relation.lag >= LATEST else ""
                 late = f"{relation.lag * MS:.0f} ms{most} late"
                 yield f"{name} is {late} on {axis}, as hardly an arm is: is its clock another one?"

@@ -29,7 +29,7 @@ from .orientations import Attitude, in_order
 from .own_frames import speeds_follow
 
 _OF_POINT = 0.98  # correlation from which a joint moves one coordinate of a point alone, as a rail does
-_SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
+SAME = 0.8  # correlation of changes from which one signal follows another, and may be its axis under another name
 _ALIKE, _LEVEL = 0.98, 0.1  # correlation of columns of one axis, and share of their range by which their ends differ
 _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _EVEN, _MOSTLY = 0.05, 0.9  # of a step, by which those of a clock differ, as it has digits; of the steps
@@ -37,12 +37,13 @@ _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: tw
 _TO_AND_FRO = 10  # turns at rest, from which they are noise: an arm that settles turns a few times
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
 _NEAR = -0.5, 1.5  # s, from and to which lag a sensor is on the commands' clock
-_MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that an arm is late where its clock is shifted
+MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that hardly an arm is late; and that one is where its clock is shifted
 _FEWEST = 20  # rows
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
 _MOST_APART = 40  # axes of a table that is taken apart by their names
 _MOST_LISTED, _LONGEST = 8, 200  # columns in an error, letters of all of them
 _NUMBERED = re.compile(r"joint\d+|position")
+_OF_POSE = {*CARTESIAN, "roll", "pitch", "yaw"}  # axes whose names say so much that only the same motion says more
 _AXIS_WORD = re.compile(r"[xyz]|\d+|")
 _Group: TypeAlias = tuple[str, str, str, bool]  # words of roles, list, copy, whether they are desired values
 
@@ -205,16 +206,15 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
                     left_out.append((replace(stream, axes=some), why_not))
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
+    may_measure = command.role != "reference"  # beside commands; another set point measures nothing
     command, *kept = _in_order([command, *_raw(kept, left_out)], left_out)
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
     sensors = [stream for stream in kept if stream.role == "sensor"]
     references = [stream for stream in kept if stream.role == "reference"]
     left_out += [(stream, "a second reference") for stream in references[1:]]
-    if not sensors:
-        sensors = [
-            replace(stream, role="sensor", why=f"{stream.why}, but nothing else measures") for stream in references[:1]
-        ]
-        references = []
+    alone = references[:1] if may_measure and not sensors else []
+    sensors += [replace(stream, role="sensor", why=f"{stream.why}, but nothing else measures") for stream in alone]
+    references = [] if alone else references
     reports = [sensor for sensor in sensors if "reported" in sensor.name.split("_") and len(sensors) > 1]
     left_out += [
         (report, "what the controller itself reports: no measurement of where the tool is") for report in reports
@@ -323,7 +323,7 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
     known_shifts = {"both begin at once": (begins - begun) / 1e9, "both end at once": (ends - ended) / 1e9}
     known_shifts |= {"time zones are hours apart": hours} if hours else {}
     why, ahead = next(
-        ((words, by) for words, by in known_shifts.items() if 0.0 <= late - by < _MOST_LAG),
+        ((words, by) for words, by in known_shifts.items() if 0.0 <= late - by < MOST_LAG),
         ("the lag is a guess: nothing tells what of it is the clock's", late - GUESSED_LAG),
     )
     side = "ahead of" if ahead > 0.0 else "behind"
@@ -488,7 +488,7 @@ def _led(stream: Stream) -> list[Stream]:
         if np.abs(ends[leader] - ends[other]).max() > _LEVEL * np.ptp(ends[other]):
             continue
         relation = following((source.stamp, source.values[leader]), (source.stamp, source.values[other]))
-        if relation is None or relation.correlation <= _ALIKE or relation.lag <= -_AT_ONCE:
+        if relation is None or relation.correlation <= _ALIKE or not -_AT_ONCE < relation.lag < MOST_LAG:
             continue
         if relation.lag > _AT_ONCE or _stands_beside(source.values[leader], source.values[other]):
             leads.setdefault(leader, {})[other] = relation.lag
@@ -575,10 +575,10 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]
         if other is not leader and other.role != "command":
             axes, _ = _matched(leader, other)
             relations = _relations(leader, replace(other, axes=axes))
-            if not any(abs(relation.correlation) >= _SAME for relation in relations):
+            if not any(abs(relation.correlation) >= SAME for relation in relations):
                 relations = list(filter(None, [speeds_follow(leader.source, other.source)]))
             for relation in relations:
-                if abs(relation.correlation) >= _SAME and relation.lag > _AT_ONCE:
+                if abs(relation.correlation) >= SAME and relation.lag > _AT_ONCE:
                     count, late = count + abs(relation.correlation), late + relation.lag
     return round(count, 1), late
 
@@ -588,7 +588,7 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
     relations = _relations(command, stream)
-    alike = [relation for relation in relations if relation.correlation >= _SAME]
+    alike = [relation for relation in relations if relation.correlation >= SAME]
     behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
     gains, fewest = (
         [relation.slope for relation in behind],
@@ -597,7 +597,7 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     if len(behind) > fewest and max(gains) < _GAINS * min(gains):
         return f"{float(np.median([relation.lag for relation in behind])) * 1e3:.0f} ms late", ""
     speeds = speeds_follow(command.source, stream.source)
-    if speeds is not None and speeds.correlation >= _SAME and -_AT_ONCE < speeds.lag < LATEST:
+    if speeds is not None and speeds.correlation >= SAME and -_AT_ONCE < speeds.lag < LATEST:
         return f"{speeds.lag * 1e3:.0f} ms late, by its speed", ""
     most = max((relation.correlation for relation in relations), default=0.0)
     if not alike:
@@ -666,15 +666,11 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
         for pair in alike
         if (relation := _relation(command, pair[1], stream, pair[0])) is not None
     }
-    points = [name for name in others if name in CARTESIAN]
-    pairs = {
-        pair: correlation
-        for pair, correlation in pairs.items()
-        if correlation >= _OF_POINT or len(points) < 2 or pair[0] not in points
-    }
+    points = [name for name in others if name in _OF_POSE]
+    least = {name: _OF_POINT if name in points and len(points) > 1 else SAME for name in others}
     named = {(name, axis) for name, axis in pairs if axis in (seen[name], name.rpartition("_")[2])}  # as p_RS_R_x is x
     for name, axis in sorted(pairs, key=lambda pair: (pair in named, pairs[pair]), reverse=True):
-        if pairs[name, axis] >= _SAME and axis not in fits and name in others:
+        if pairs[name, axis] >= least[name] and axis not in fits and name in others:
             fits[axis] = stream.axes[name]
             others.remove(name)
     if fits or not pairs:
