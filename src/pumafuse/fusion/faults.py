@@ -23,8 +23,10 @@ from ..logs.frames import CARTESIAN
 from ..model.arm import CANONICAL_AXES
 from ..space.rotations import nearest
 from ..units import DEG, MM, OF_KIND, Kind, mistaken, wraps
+from .causes import Cause
 from .clock_steps import ClockStep, clock_steps
 from .config import FusionConfig
+from .consistency import Finding
 from .segments import Segment
 from .setup import turn_of
 
@@ -50,7 +52,9 @@ _MOVE = 1e9  # ns, of the moves that are compared: less is noise, over more nois
 _PARTS = 8  # of a run, each of which is left out once: as the angle scatters then, so uncertain it is
 
 _OF_CLOCKS = "clock", "nothing"  # how a clock that was set looks over all of a run
-_Cause: TypeAlias = Literal["turns", "unit", "columns", "sign", "clock", "set", "frame", "nothing", "motion", "zero"]
+_Cause: TypeAlias = (
+    Literal["turns", "unit", "columns", "sign", "clock", "set", "frame", "nothing", "motion", "zero"] | Cause | Finding
+)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,9 @@ from .consistency import MANY_REJECTED, Consistency, Finding
 from .estimates import Estimates
 
 _WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps the error bars
+_SURELY = 40.0  # log-likelihood that a cause gains: no chance; a real arm does not move by one noise all the time
+_DETAIL = 1.2, 0.2  # factor on NIS, and correlation, within which it is a detail that a model of an arm lacks
+_FAR = 6.0  # standard deviations by which more are rejected than is many
 _TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
 
 
@@ -87,6 +90,24 @@ def sentence(consistency: Consistency) -> str:
             return f"{nis}: consistent"
         case _:
             return f"{nis}: {causes or 'no one cause stands out'}"
+
+
+def likeliest(consistency: Consistency) -> tuple[Cause | Finding, str, float] | None:
+    """What makes innovations other than expected, surely and by so much that it matters; None where nothing does.
+
+    A cause, whose it is ("" of the arm), and the log-likelihood that it gains; or that so many are rejected.
+    """
+    fused = consistency.count
+    if consistency.finding is Finding.REJECTED:
+        decided = fused / (1.0 - consistency.rejected)
+        usual = MANY_REJECTED * decided
+        surely = decided - fused > usual + _FAR * math.sqrt(usual)
+        return (Finding.REJECTED, consistency.sensor, decided - fused) if surely else None
+    (factor, correlation), nis = _DETAIL, consistency.nis
+    if 1.0 / factor < nis < factor and np.abs(consistency.correlation).max(initial=0.0) < correlation:
+        return None
+    first = next((suspect for suspect in consistency.causes if suspect.gain > _SURELY), None)
+    return first and (first.cause, first.sensor, first.gain)
 
 
 def in_words(suspect: Suspect, consistency: Consistency) -> str:

@@ -9,27 +9,31 @@ from collections.abc import Mapping, Sequence
 from ctypes import Array, c_double
 from dataclasses import dataclass
 from functools import cache, partial
+from itertools import product
 from typing import TypeAlias
 
+import msgspec
 import numpy as np
 
-from ..arrays import ALWAYS, IndexArray, IntArray, TimeArray
+from ..arrays import ALWAYS, NEVER, IndexArray, IntArray, TimeArray
 from ..errors import PumafuseError
 from ..filter.events import COMMAND, Results
 from ..filter.outcome import Outcome
 from ..filter.window import Window
 from ..fusion.causes import Cause, evidence_of
 from ..fusion.chi_square import quantile
-from ..fusion.config import FusionConfig
-from ..fusion.consistency import consistency
+from ..fusion.config import FusionConfig, Start
+from ..fusion.consistency import Finding, consistency
+from ..fusion.estimates import Estimates
 from ..fusion.faults import Fault, faults_of, settled
 from ..fusion.offline import judged
 from ..fusion.segments import Segment, build
-from ..fusion.verdicts import sentence
+from ..fusion.verdicts import likeliest, sentence
 from ..logs.run import Run, Source
 from .rate_limit import RateLimitedLog
 
 _SPAN_NS = 20_000_000_000  # of the past in which faults are looked for: within 5 s causes are mistaken for each other
+_REST_NS = 600_000_000_000  # before the span, for which it rests where that begins: nobody knows what was before
 _SHORTEST_NS = 5_000_000_000  # of the past below which nothing is looked for
 _APART_NS = 2_500_000_000, 5_000_000_000  # between two looks for faults, of 5 to 10 ms each: at first, and later
 _FINEST_NS = 8_000_000  # between two rows of a sensor that are kept: faults are looked for by 500 of a span
@@ -55,7 +59,7 @@ _SHOWS = {
     "zero": "another zero",
 }
 
-_Key: TypeAlias = tuple[tuple[str, ...], str, int]  # sensors, the cause of their fault, and when that was
+_Key: TypeAlias = tuple[tuple[str, ...], str | Cause | Finding, int]  # sensors, the cause of their fault, and when
 
 
 class Recent:
@@ -64,16 +68,21 @@ class Recent:
     def __init__(self, config: FusionConfig) -> None:
         self._config, self._axes, self._sensors = config, tuple(config.arm.axes), tuple(config.sensors)
         self._settled = round(max(settled(config, axis) for axis in self._axes) * 1e9)
+        self._rest = _REST_NS - np.array([2, 1, 0]) * round(config.arm.update_period * 1e9)
         self.restart()
 
     def restart(self) -> None:
         """Begin anew."""
-        self._rows = list[tuple[int, int, int, bytes]]()  # stamp, source, given axes as bits, values
-        self._latest, self._start = [ALWAYS] * len(self._sensors), dict[str, float]()
+        self._rows = list[tuple[int, int, int, bytes]]()  # stamp, source, given axes as bits, values and spreads
+        self._latest, self._start, self._first = [ALWAYS] * len(self._sensors), dict[str, float](), NEVER
 
-    def keep(self, stamp: int, source: int, bits: int, values: Array[c_double]) -> None:
-        """Keep an event: its values [m or rad], (A,), of axes that ``bits`` name; of a dense sensor some."""
+    def keep(self, stamp: int, source: int, bits: int, values: Array[c_double], spread: Array[c_double]) -> None:
+        """Keep an event: its values [m or rad], (A,), of axes that ``bits`` name, and by what their noise is scaled.
+
+        Of a dense sensor some are kept.
+        """
         if source == COMMAND:
+            self._first = min(self._first, stamp)
             if len(self._start) < len(self._axes):
                 begun = {name: values[axis] for axis, name in enumerate(self._axes) if bits >> axis & 1}
                 self._start = {name: value for name, value in begun.items() if math.isfinite(value)} | self._start
@@ -81,38 +90,53 @@ class Recent:
             return
         else:
             self._latest[source] = stamp
-        self._rows.append((stamp, source, bits, bytes(values)))
+        self._rows.append((stamp, source, bits, bytes(values) + bytes(spread)))
 
     def forget(self, after: int) -> None:
         """Take back what is stamped after ``after`` [ns]."""
         self._rows = [row for row in self._rows if row[0] <= after]
         self._latest = [min(stamp, after) for stamp in self._latest]
 
-    def part(self, now: int) -> tuple[Run, Segment] | None:
-        """What came in the span before ``now`` [ns]; None where that is too little. What is older is forgotten."""
+    def part(self, now: int) -> tuple[Run, Segment, FusionConfig] | None:
+        """What came in the span before ``now`` [ns]; None where that is too little. What is older is forgotten.
+
+        By the configuration that is given, the arm may have strayed from its start.
+        """
         self._rows = [row for row in self._rows if now - _SPAN_NS < row[0] <= now]
         ordered = sorted(self._rows, key=operator.itemgetter(0))
         stamp, source, bits = np.array([row[:3] for row in ordered], dtype=np.int64).reshape(-1, 3).T
-        value = np.frombuffer(bytearray().join(row[3] for row in ordered)).reshape(-1, len(self._axes))
+        table = np.frombuffer(bytearray().join(row[3] for row in ordered)).reshape(-1, 2, len(self._axes))
+        value, spread = table[:, 0], table[:, 1]
         commands = source == COMMAND
         if not commands.any() or stamp[-1] - stamp[commands][0] < _SHORTEST_NS:
             return None
         is_told = bits[:, None] >> np.arange(len(self._axes)) & 1
         value[is_told == 0] = np.nan
-        commanded = [axis for axis in range(len(self._axes)) if is_told[commands, axis].any()]
+        commanded = [axis for axis in range(len(self._axes)) if np.isfinite(value[commands, axis]).any()]
         usable = commands | (stamp >= stamp[commands][0] + self._settled)  # where the arm was before is not
 
         def rows(chosen: IntArray, label: str) -> Source:
-            values = {self._axes[axis]: value[chosen, axis] for axis in commanded if is_told[chosen, axis].any()}
-            return Source(stamp[chosen], values, label, apart=True)
+            told = [axis for axis in commanded if is_told[chosen, axis].any()]
+            values, spreads = ({self._axes[axis]: part[chosen, axis] for axis in told} for part in (value, spread))
+            return Source(stamp[chosen], values, label, spreads, apart=True)
 
         every = {name: np.flatnonzero(usable & (source == number)) for number, name in enumerate(self._sensors)}
         sensors = {name: rows(chosen, name) for name, chosen in every.items() if len(chosen)}
         names, kinds = {self._axes[axis] for axis in commanded}, self._config.arm.kind_of
         start = {name: level for name, level in self._start.items() if name in names}
+        told = rows(np.flatnonzero(commands), "commands")
+        rested = [np.insert(part, 0, part[np.isfinite(part)][:1].repeat(3)) for part in told.values.values()]
+        stamp = np.insert(told.stamp, 0, told.stamp[0] - self._rest)
+        command = Source(stamp, dict(zip(told.values, rested, strict=True)), "commands", apart=True)
+        age, process = (now - self._first) / 1e9, self._config.process
+        strayed = {
+            axis: math.hypot(self._config.start.offset_sd_of(axis), process[axis].drift * math.sqrt(age))
+            for axis in self._axes
+        }
+        config = msgspec.structs.replace(self._config, start=Start(offset_sd=strayed))
         try:
-            run = Run("stream", rows(np.flatnonzero(commands), "commands"), sensors, start=start, kinds=kinds)
-            return run, build(run, self._config)
+            run = Run("stream", command, sensors, start=start, kinds=kinds)
+            return run, build(run, config), config
         except PumafuseError:  # of what is there nothing can be made
             return None
 
@@ -149,19 +173,20 @@ class Diagnosis:
         self._ends = deque[int](maxlen=_QUARTERS + 2)  # of the window's rows, at the last looks
         self._troubles = dict[_Key, _Trouble]()
         self._large = dict[str, dict[str, int]]()  # by sensor and axis, when innovations were last too large [ns]
-        self._suspected = dict[str, tuple[Cause, str]]()  # by sensor, what the last look found behind that
-        self._verdicts = dict[str, str]()  # by sensor, what was said of it
         self._reacquired = dict[str, int]()  # when each sensor was taken again [ns]
         self.set_back = dict[str, int]()  # when it was said of a sensor that its stamps step back [ns]
 
     @property
     def shown(self) -> tuple[str, ...]:
         """A sentence on each fault that shows now."""
+        said = [trouble.fault for trouble in self._troubles.values() if trouble.is_said]
+        explained = {name for fault in said for name in fault.sensors}
         large = [
-            self._verdicts.get(name) or f"{_innovations(name, axes)} are far larger than expected"
+            f"{_innovations(name, axes)} are far larger than expected"
             for name, axes in self._large.items()
+            if name not in explained
         ]
-        return (*(trouble.fault.sentence for trouble in self._troubles.values() if trouble.is_said), *large)
+        return (*(fault.sentence for fault in said), *large)
 
     def look(self, window: Window, now: int) -> None:
         """Look at what has come until ``now`` [ns]."""
@@ -173,8 +198,7 @@ class Diagnosis:
         if now >= self._faults_due:
             self._faults_due = now + _APART_NS[now >= self._since + _SPAN_NS]
             if (part := self.recent.part(now)) is not None:
-                self._look_for_faults(part[1], now)
-                self._look_for_causes(*part, now)
+                self._look_for_faults(*part, now)
         stamp, source, results = window.read(max(port.begin, self._ends[0], port.end - _MOST_ROWS), port.end)
         recent = (stamp > now - _SECOND_NS) & (stamp <= now) & (source >= 0)
         stamp, source, results = stamp[recent], source[recent], results.rows(np.flatnonzero(recent))
@@ -190,20 +214,21 @@ class Diagnosis:
 
     # ---- faults of the log ------------------------------------------------------------------------------------------
 
-    def _look_for_faults(self, segment: Segment, now: int) -> None:
+    def _look_for_faults(self, run: Run, segment: Segment, config: FusionConfig, now: int) -> None:
         travel = {axis: float(np.ptp(segment.given(axis)[1])) for axis in segment.axes}
         explained = {name for (names, *_), trouble in self._troubles.items() if trouble.is_said for name in names}
         faults = [
             fault
-            for fault in faults_of(segment, self._config, origin=0)
+            for fault in faults_of(segment, config, origin=0)
             if fault.cause != "nothing" or explained.isdisjoint(fault.sensors)
         ]
+        faults += self._unexpected(judged(run, segment, config), faults)
         for fault in faults:
             key = _key(fault)
             trouble = self._troubles.setdefault(key, _Trouble(fault))
             was_said = trouble.is_said
             trouble.fault, trouble.missed, trouble.found = fault, 0, trouble.found + 1
-            trouble.travel = max(travel[axis] for axis in fault.axes)
+            trouble.travel = max((travel[axis] for axis in fault.axes), default=0.0)
             if trouble.is_said and not was_said and not self._is_set_back(fault):
                 self._log.write(str(key), f"{fault.sentence} (by {now / 1e9:.3f} s)")
         keys, named = set(map(_key, faults)), {name for fault in faults for name in fault.sensors}
@@ -223,30 +248,31 @@ class Diagnosis:
         if trouble.is_said and trouble.missed < _TWICE:
             return
         del self._troubles[key]
-        if trouble.is_said and not is_replaced and cause in _SHOWS:
-            self._log.write(f"{key} over", f"{_named(sensors)}: {_SHOWS[cause]} shows no more at {now / 1e9:.3f} s")
+        if trouble.is_said and not is_replaced and cause != "set":
+            shows = _SHOWS[cause] if isinstance(cause, str) else "what the verdict says"
+            self._log.write(f"{key} over", f"{_named(sensors)}: {shows} shows no more at {now / 1e9:.3f} s")
 
-    # ---- causes -----------------------------------------------------------------------------------------------------
+    def _unexpected(self, estimates: Estimates, faults: Sequence[Fault]) -> list[Fault]:
+        """What `fuse` says of innovations in the span where no fault is: of each sensor the clearest, a cause once.
 
-    def _look_for_causes(self, run: Run, segment: Segment, now: int) -> None:
-        """Say what explains innovations that are too large, where no fault does: what `fuse` says of the span."""
-        faulty = {name for trouble in self._troubles.values() if trouble.is_said for name in trouble.fault.sensors}
-        names = [name for name in self._large if name not in faulty and name not in self._verdicts]
-        if not names:
-            return
-        estimates = judged(run, segment, self._config)
-        evidence = cache(partial(evidence_of, estimates))
-        for name in names:
-            axes = self._large[name]
-            of_axes = {axis: consistency(estimates, name, axis, partial(evidence, axis)) for axis in axes}
-            axis, worst = max(of_axes.items(), key=lambda pair: pair[1].nis if pair[1] else 0.0)
-            if worst is None or not worst.causes:
+        A cause that was said of a sensor stays, as long as there is any.
+        """
+        said = [trouble.fault for trouble in self._troubles.values() if trouble.is_said]
+        causes = {fault.sensors: fault.cause for fault in said if not isinstance(fault.cause, str)}
+        named = [fault for fault in (*faults, *said) if isinstance(fault.cause, str)]
+        faulty = {each for fault in named for each in (*fault.sensors, *fault.axes)}
+        evidence, clearest = cache(partial(evidence_of, estimates)), dict[str, tuple[tuple[float, bool], Fault]]()
+        for axis, name in product(estimates.axes, estimates.measurements.sensors):
+            verdict = consistency(estimates, name, axis, partial(evidence, axis))
+            if not faulty.isdisjoint((axis, name)) or verdict is None or (first := likeliest(verdict)) is None:
                 continue
-            likeliest, before = worst.causes[0][:2], self._suspected.get(name)
-            self._suspected[name] = likeliest
-            if likeliest == before:
-                self._verdicts[name] = f"sensor '{name}' on {axis}: {sentence(worst)}"
-                self._log.write(f"{name} verdict", f"{self._verdicts[name]} (by {now / 1e9:.3f} s)")
+            cause, whose, gain = first
+            weight, sensor = (gain, whose == name), whose or name
+            if sensor not in faulty and (sensor not in clearest or weight > clearest[sensor][0]):
+                harmed = () if verdict.finding is Finding.TOO_SMALL else (axis,)  # error bars that are too wide hold
+                words = f"sensor '{name}' on {axis}: {sentence(verdict)}"
+                clearest[sensor] = weight, Fault((sensor,), harmed, causes.get((sensor,), cause), gain, words)
+        return list({fault.cause: fault for _, fault in sorted(clearest.values(), key=operator.itemgetter(0))}.values())
 
     # ---- innovations ------------------------------------------------------------------------------------------------
 
@@ -287,8 +313,6 @@ class Diagnosis:
         for name, axes in list(self._large.items()):
             if max(axes.values()) < now - _CALM_NS:
                 del self._large[name]
-                self._verdicts.pop(name, None)
-                self._suspected.pop(name, None)
                 self._log.write(f"{name} NIS over", f"{_innovations(name, axes)} are as expected at {now / 1e9:.3f} s")
 
     def _names(self, pair: int) -> tuple[str, str]:

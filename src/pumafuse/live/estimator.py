@@ -575,7 +575,7 @@ class LiveEstimator:
             return self._refuse(sensor, values, outcome, why, counts.outcomes)
         rows, diagnosis = window.port.end, self._diagnosis
         source = COMMAND if sensor is None else self._sensors[sensor]
-        diagnosis.recent.keep(stamp, source, bits, new)
+        diagnosis.recent.keep(stamp, source, bits, new, window.spread)
         taken = window.add(stamp, source, bits, oldest)
         if not taken:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
