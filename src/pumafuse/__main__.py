@@ -10,6 +10,8 @@ def main() -> None:
 
         run()
     except KeyboardInterrupt:
+        if sys.stderr is not None:  # pyright: ignore[reportUnnecessaryComparison]
+            sys.stderr.write("interrupted\n")
         sys.exit(130)
 
 

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import datetime
+import errno
+import os
 import re
+import select
+import stat
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
@@ -17,6 +22,7 @@ from .errors import ConfigError, PumafuseError, suggestion
 from .units import AN, KINDS, Kind, as_length, ending, from_si, in_unit, of_kind, to_si
 
 MOST_TEXT = 16 << 20  # characters; what is longer, a device perhaps, is no configuration
+_PATIENCE = 3.0  # s for somebody to open a pipe and write
 # A key of so many parts takes tomllib seconds and gigabytes.
 _DEEP = re.compile(r"^[ \t\[]*(?:[^\n.=,#\[\]{}]*\.){100}", re.MULTILINE)
 _BOUND = re.compile(r"Expected `(?:float|int)` (>=|<=|>|<) (\S+)")
@@ -48,7 +54,7 @@ def read(path: Path) -> dict[str, Any]:
 def text_of(path: Path) -> str:
     """The text of a file that describes something, one character more than it may have at most."""
     try:
-        with path.open(encoding="utf-8") as file:
+        with open(path, encoding="utf-8", opener=_opened) as file:
             return file.read(MOST_TEXT + 1)
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: not a text file in UTF-8") from None
@@ -56,6 +62,19 @@ def text_of(path: Path) -> str:
         raise ConfigError(f"{path}: no such file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _opened(path: str, flags: int) -> int:
+    """Open a file; of a pipe, such as a shell's ``<(...)``, wait for what is written, but not for somebody to write."""
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if stat.S_ISFIFO(os.fstat(descriptor).st_mode):
+        if not select.select([descriptor], [], [], _PATIENCE)[0]:
+            with suppress(BlockingIOError):  # somebody has opened it and will write
+                if not os.read(descriptor, 1):
+                    os.close(descriptor)
+                    raise OSError(errno.EPIPE, f"a pipe into which nobody writes, for {_PATIENCE:g} s")
+        os.set_blocking(descriptor, True)
+    return descriptor
 
 
 def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The command line on real files: `demo`, `fuse`, `compare`, `discretize`, and refusals of every command."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import pumafuse as pf
-from executable import DATA, FUSION, SCAN, names, pumafuse, refused
+from executable import DATA, EXECUTABLE, FUSION, SCAN, names, pumafuse, refused
 from pumafuse.cli.fuse import folders_of
 
 AXES = ("tangential", "radial", "vertical")
@@ -196,7 +197,7 @@ def test_discretize_prints_the_model_it_names() -> None:
 
 
 def test_an_interrupt_while_the_command_line_is_imported_is_no_traceback() -> None:
-    """Ctrl-C within the first tenth of a second, as one who has mistyped presses it: exit code 130, no word."""
+    """Ctrl-C within the first tenth of a second, as one who has mistyped presses it: as later, one line."""
     code = (
         "import sys\n"
         "class Interrupted:\n"
@@ -207,7 +208,31 @@ def test_an_interrupt_while_the_command_line_is_imported_is_no_traceback() -> No
         "main()\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+def test_an_interrupt_of_a_command_is_a_line() -> None:
+    """Exit code 130, while it works, too."""
+    code = (
+        "import os, signal, sys\n"
+        "import pumafuse.cli.fuse as command\n"
+        "command.run = lambda *_: os.kill(os.getpid(), signal.SIGINT)\n"
+        f"sys.argv = ['pumafuse', 'fuse', '{SCAN}', '-c', '{FUSION}', '-o', 'none']\n"
+        "from pumafuse.cli.main import main\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_is_a_configuration_if_somebody_writes_into_it(tmp_path: Path) -> None:
+    """A line where nobody does, not a wait for ever; what a shell's `<(...)` runs may take its time."""
+    pipe = tmp_path / "fusion.toml"
+    os.mkfifo(pipe)
+    assert "nobody writes" in refused("fuse", SCAN, "-c", pipe, "-o", tmp_path / "none")
+    slowly = f"'{EXECUTABLE}' fuse '{SCAN}' -c <(sleep 4; exec cat '{FUSION}') -o '{tmp_path / 'fused'}'"
+    subprocess.run(["bash", "-c", slowly], capture_output=True, check=True)
 
 
 def test_a_gain_of_the_speed_that_never_recovers_is_warned_of(tmp_path: Path) -> None:

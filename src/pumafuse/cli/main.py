@@ -392,6 +392,10 @@ def main() -> None:
     end = arguments.index(ROS_ARGS) if "live" in arguments[:1] and ROS_ARGS in arguments else len(arguments)
     try:
         app(arguments[:end], obj=arguments[end:])
+    except SystemExit as ended:
+        if isinstance(getattr(ended.__context__, "__cause__", None), KeyboardInterrupt):  # of which typer says nothing
+            say("interrupted", err=True)
+        raise
     except PumafuseError as error:
         say(f"pumafuse: {error}", err=True)
         sys.exit(1)
