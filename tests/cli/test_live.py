@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from io import StringIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,6 +36,17 @@ def test_a_replay_gives_what_as_live_gives() -> None:
         assert [line[axis]["sd_mm"] for line in found] == (track.position_sd * 1e3).tolist()
     assert "commands: 2143 fused; 2143 estimates" in done.stderr
     assert "vision" in done.stderr
+
+
+def test_a_replay_says_what_was_noticed_when_the_run_was_read(tmp_path: Path) -> None:
+    """As `fuse` does: of columns that are not used, of stray stamps, each once."""
+    rows = [f"{0.028 * k + (500.0 if k == 60 else 0.0):.3f},{500.0 + k / 10},{500.0 + k / 10},1" for k in range(200)]
+    table = tmp_path / "run.csv"
+    table.write_text("time_s,command.radial_mm,tracker.radial_mm,battery\n" + "\n".join(rows) + "\n")
+    live = pumafuse("live", f"replay:{table}?speed=max", "-c", FUSION).stderr.splitlines()
+    fused = pumafuse("fuse", table, "-c", FUSION, "-o", tmp_path / "fused").stderr.splitlines()
+    noticed = [text for text in fused if "battery" in text or "a stray stamp" in text]
+    assert len(noticed) == 3 and [text for text in live if text in noticed] == noticed
 
 
 def test_the_status_shows_milliseconds_and_millimetres() -> None:

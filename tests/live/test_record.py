@@ -70,6 +70,27 @@ def recorded(tmp_path: Path) -> Recorded:
     return Recorded(tmp_path / "record")
 
 
+def test_a_record_does_not_tell_when_a_row_came(tmp_path: Path) -> None:
+    """A camera that is 50 ms late: `--as-live` has its rows sooner than live; of the past both know the same."""
+    source = files("pumafuse") / "data" / "scan"
+    run, config = pf.Run.read(str(source)), pf.FusionConfig.load(str(source / "fusion.toml"))
+    until, late, now = run.command.stamp[0] + 20_000_000_000, {"vision": 50_000_000}, dict[int, float]()
+    recorder = Recorder(tmp_path / "record", config, dict(run.start), lambda _: None)
+    live = pf.LiveEstimator(config, start=run.start, event_log=recorder)
+    events = [event for event in events_of(replace(run, reference=None)) if event.stamp <= until]
+    for event in sorted(events, key=lambda event: event.stamp + late.get(event.sensor, 0)):
+        feed(live, event)
+        if not event.sensor:
+            now[event.stamp] = live.estimate(event.stamp)["x"].position
+    recorder.close(live.sure)
+    recorded = pf.Run.read(tmp_path / "record")
+    as_live, hindsight = (pf.fuse(recorded, config, mode=mode) for mode in ("as-live", "filtered"))
+    stamps = as_live.origin + np.rint(as_live.time * 1e9).astype(np.int64)
+    given = np.array([now[stamp] for stamp in stamps.tolist()])
+    assert 1e-7 < np.abs(given - as_live["x"].position).max() < 3.5e-6
+    assert live.estimate(int(stamps[-1]))["x"].position == hindsight["x"].position[-1]
+
+
 def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
     """Twenty seconds of the shipped run as lines."""
     data = files("pumafuse") / "data"

@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from ..errors import ConfigError, RunError
+from ..errors import ConfigError, RunError, warn
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from ..fusion.placing import with_tool
@@ -34,6 +34,7 @@ from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream, Watcher
 from ..live.wire import Event
 from ..logs import manifest
+from ..logs.clock import without_strays
 from ..logs.run import Run
 from ..units import MS
 from .tables import Columns, cells, console, headings, print_tables, table
@@ -79,8 +80,9 @@ def run(
         raise ConfigError(f"{lonely.pop()}: is a source alone; several may be of the network")
     if kinds.count("ros2") > 1:
         raise ConfigError("ros2: one node is enough; one run.toml may name all topics")
-    recorded = Run.read(alone.path) if alone.kind == "replay" else None
+    recorded = without_strays(Run.read(alone.path)) if alone.kind == "replay" else None
     if recorded is not None:
+        warn(f"run '{recorded.name}': {note}" for note in recorded.notes)
         start = dict(recorded.start)
         configured = with_tool(msgspec.structs.replace(configured, frame=recorded.frame or configured.frame), recorded)
     files = {source: manifest.file_of(Path(source.path)) for source in sources if source.kind in OF_A_RUN}
