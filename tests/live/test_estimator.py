@@ -273,13 +273,14 @@ def test_missing_commands_are_counted(lost: int, said: bool) -> None:
         assert f"one is due every {PERIOD * 1e3:g} ms), the longest gap is {2 * PERIOD:.3g} s" in found[0]
 
 
+@pytest.mark.parametrize("copied", [False, True], ids=["of one path", "one repeats the other"])
 @pytest.mark.parametrize("later", [0.006, 0.009, 0.02])
-def test_two_senders_are_named_and_no_command_is_called_missing(later: float) -> None:
-    """Two nodes, each at the arm's period, of one path: said once, with both intervals; recorded as live."""
+def test_two_senders_are_named_and_no_command_is_called_missing(later: float, copied: bool) -> None:
+    """Two nodes, each at the arm's period: said once, with both intervals; recorded as live."""
     notices: list[str] = []
     live = pf.LiveEstimator(CONFIG, on_notice=notices.append)
     t = np.sort(np.concatenate([np.arange(1500) * PERIOD, np.arange(1500) * PERIOD + later]))
-    u = 0.57 + 0.01 * np.sin(t)
+    u = 0.57 + 0.01 * np.sin(np.repeat(np.arange(1500) * PERIOD, 2) if copied else t)
     for time, value in zip(t.tolist(), u.tolist(), strict=True):
         live.command(time, radial=value)
     words = (

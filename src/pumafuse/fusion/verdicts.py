@@ -106,8 +106,10 @@ def likeliest(consistency: Consistency) -> tuple[Cause | Finding, str, float] | 
     (factor, correlation), nis = _DETAIL, consistency.nis
     if 1.0 / factor < nis < factor and np.abs(consistency.correlation).max(initial=0.0) < correlation:
         return None
-    first = next((suspect for suspect in consistency.causes if suspect.gain > _SURELY), None)
-    return first and (first.cause, first.sensor, first.gain)
+    for cause, sensor, size, gain in consistency.causes[:1]:
+        is_guess = cause is Cause.PROCESS and size < 1.0  # process noise that is too large: bars are wide, and hold
+        return None if gain < _SURELY or is_guess else (cause, sensor, gain)
+    return None
 
 
 def in_words(suspect: Suspect, consistency: Consistency) -> str:

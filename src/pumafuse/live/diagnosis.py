@@ -39,6 +39,7 @@ _APART_NS = 2_500_000_000, 5_000_000_000  # between two looks for faults, of 5 t
 _FINEST_NS = 8_000_000  # between two rows of a sensor that are kept: faults are looked for by 500 of a span
 _TWICE = 2  # looks in a row that find a fault, or do not, until that is said; that a clock was set is said at once
 _BEFORE_NS = 2_000_000_000  # before rows go on where stamps step back, that was said of them
+_MOVING = 0.25  # of the commands, which move an axis: at rest what counts in steps, or repeats its value, has no noise
 _MOVED = 0.5  # of the commanded motion that showed a fault, without which nothing shows that it is over
 
 _SECOND_NS, _QUARTER_NS = 1_000_000_000, 250_000_000  # over which innovations are judged, and how often
@@ -262,7 +263,9 @@ class Diagnosis:
         named = [fault for fault in (*faults, *said) if isinstance(fault.cause, str)]
         faulty = {each for fault in named for each in (*fault.sensors, *fault.axes)}
         evidence, clearest = cache(partial(evidence_of, estimates)), dict[str, tuple[tuple[float, bool], Fault]]()
-        for axis, name in product(estimates.axes, estimates.measurements.sensors):
+        steps = {axis: np.diff(estimates.segments[0].given(axis)[1]) for axis in estimates.axes}
+        moving = [axis for axis, step in steps.items() if np.count_nonzero(step) > _MOVING * len(step)]
+        for axis, name in product(moving, estimates.measurements.sensors):
             verdict = consistency(estimates, name, axis, partial(evidence, axis))
             if not faulty.isdisjoint((axis, name)) or verdict is None or (first := likeliest(verdict)) is None:
                 continue

@@ -589,8 +589,8 @@ class LiveEstimator:
         if sensor is None:
             if not judged:
                 counts.outcomes[COMMAND, result.outcome] += 1
-                if result.outcome is _FUSED:
-                    self._doubtful += self._clock.doubtful
+                self._doubtful += result.outcome is _FUSED and self._clock.doubtful
+                if result.outcome in (_FUSED, Outcome.DUPLICATE):
                     self._watch.intervals(stamp, values)
             self._commands.add(stamp, codes, window.value[:], oldest)
             self._watch.limits(self._commands)
