@@ -254,7 +254,7 @@ class Diagnosis:
             self._log.write(f"{key} over", f"{_named(sensors)}: {shows} shows no more at {now / 1e9:.3f} s")
 
     def _unexpected(self, estimates: Estimates, faults: Sequence[Fault]) -> list[Fault]:
-        """What `fuse` says of innovations in the span where no fault is: of each sensor the clearest, a cause once.
+        """What `fuse` says of innovations in the span where no fault is: of each sensor the clearest, of the arm once.
 
         A cause that was said of a sensor stays, as long as there is any.
         """
@@ -262,7 +262,7 @@ class Diagnosis:
         causes = {fault.sensors: fault.cause for fault in said if not isinstance(fault.cause, str)}
         named = [fault for fault in (*faults, *said) if isinstance(fault.cause, str)]
         faulty = {each for fault in named for each in (*fault.sensors, *fault.axes)}
-        evidence, clearest = cache(partial(evidence_of, estimates)), dict[str, tuple[tuple[float, bool], Fault]]()
+        evidence, clearest = cache(partial(evidence_of, estimates)), dict[str, tuple[tuple[float, bool], str, Fault]]()
         steps = {axis: np.diff(estimates.segments[0].given(axis)[1]) for axis in estimates.axes}
         moving = [axis for axis, step in steps.items() if np.count_nonzero(step) > _MOVING * len(step)]
         for axis, name in product(moving, estimates.measurements.sensors):
@@ -274,8 +274,9 @@ class Diagnosis:
             if sensor not in faulty and (sensor not in clearest or weight > clearest[sensor][0]):
                 harmed = () if verdict.finding is Finding.TOO_SMALL else (axis,)  # error bars that are too wide hold
                 words = f"sensor '{name}' on {axis}: {sentence(verdict)}"
-                clearest[sensor] = weight, Fault((sensor,), harmed, causes.get((sensor,), cause), gain, words)
-        return list({fault.cause: fault for _, fault in sorted(clearest.values(), key=operator.itemgetter(0))}.values())
+                clearest[sensor] = weight, whose, Fault((sensor,), harmed, causes.get((sensor,), cause), gain, words)
+        ordered = sorted(clearest.values(), key=operator.itemgetter(0))
+        return list({(fault.cause, whose): fault for _, whose, fault in ordered}.values())
 
     # ---- innovations ------------------------------------------------------------------------------------------------
 
