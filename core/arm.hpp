@@ -69,7 +69,8 @@ struct Arm {
         linear = value_of(max_speed) == 0.0 && value_of(half_play) == 0.0;
         sags = value_of(sag_offset) != 0.0 || value_of(sag_slope) != 0.0 || value_of(sag_slope_beyond) != 0.0 ||
                value_of(sag_slope_below) != 0.0;
-        lag = plant.order == 1 ? axis.time_constant : 2.0 * axis.damping / axis.natural_frequency;
+        const Real lag = plant.order == 1 ? axis.time_constant : 2.0 * axis.damping / axis.natural_frequency;
+        per_lag = 1.0 / lag;
         farthest = value_of(max_speed) > 0.0 ? value_of(lag * max_speed) : std::numeric_limits<double>::infinity();
         fast = value_of(plant.order == 1 ? plant.rate : plant.omega);
         const double turning = square(value_of(plant.omega)) - square(value_of(plant.sigma));
@@ -104,11 +105,15 @@ struct Arm {
         const int side = this->side(d);
         if (side != 0) at_limit(d, side, dt);
         else free(d, plant.over(dt), dt);
-        const Motion m = motion(before, side), n = motion(d, side);
-        const auto slope_then = [&] { return later_slope(side, m, d, plant.over(dt)); };
+        const auto turning = [&] {
+            if (value_of(plant.decay) == 0.0) return changes(value_of(before.rate), value_of(d.rate));
+            const Motion m = motion(before, side), n = motion(d, side);
+            const auto slope_then = [&] { return later_slope(side, m, d, plant.over(dt)); };
+            return (cut_by_play && turns(m, m.rate, n.rate, slope_then)) ||
+                   (cut_by_limit && turns(m, m.closing, n.closing, slope_then));
+        };
         if ((side == 0 && value_of(dt) > half_swing) || this->side(d) != side ||
-            (cut_by_play && turns(m, m.rate, n.rate, slope_then)) ||
-            (cut_by_limit && turns(m, m.closing, n.closing, slope_then)))
+            ((cut_by_play || cut_by_limit) && turning()))
             d = before, in_pieces(d, slack, dt);
         else slack = pushed(slack, before, d);
     }
@@ -117,7 +122,7 @@ struct Arm {
     static constexpr double STILL = 1e-12;      // m; what moves by less is at rest: a thousandth of PF_FINEST
     static constexpr int MOST_PIECES = 10'000;  // of a path: an axis that swings on and on between two events
 
-    Real lag;           // L [s]
+    Real per_lag;       // 1/L [1/s]
     double farthest;    // L V [m]: a gap that asks for more than the limit is larger
     double fast;        // 1/tau or omega [1/s]
     bool cut_by_play, cut_by_limit;  // where the drive turns, or its gap no longer closes
@@ -134,7 +139,7 @@ struct Arm {
     // s.
     Real asked(const Drive<Real>& d, int side) const {
         if (side != 0) return double(side) * max_speed;
-        return plant.order == 1 ? plant.rate * d.gap() : d.gap() / lag;
+        return plant.order == 1 ? plant.rate * d.gap() : per_lag * d.gap();
     }
 
     // Whether the drive goes on without its limit, and neither turns against its tool nor leaves it: no cut is needed.
