@@ -16,6 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
+from scipy.spatial.transform import Rotation
 
 import bag_files
 import pumafuse as pf
@@ -214,6 +215,18 @@ def test_tables_without_a_header(log: Path, tmp_path: Path) -> None:
         (log / f"{name}.csv").write_text("".join(lines))
     found = check_fuses(log, tmp_path / "out", ("column_4", "column_5", "column_6"))
     assert {part.clock.time.nanoseconds for part in found.parts if part.clock} == {"column 2"}
+
+
+def test_columns_of_a_turned_sensor_are_in_their_order(log: Path) -> None:
+    """Turned by 125°, the second follows x against its sign, and the first y: exchanged they would be mirrored."""
+    t, u, s, z = recorded()
+    write(log / "goal.csv", {"time": t, **xyz(u)})
+    turned = np.add(Rotation.from_euler("z", -125.0, degrees=True).apply(z), [4.0, -5.0, 0.5])
+    np.savetxt(log / "tracker.txt", np.column_stack([s, turned]), "%.7f")
+    found = survey(log)
+    assert found.roles is not None
+    (sensor,) = found.roles.sensors
+    assert [sensor.axes[axis][0].column for axis in "xyz"] == ["column 2", "column 3", "column 4"]
 
 
 @pytest.mark.parametrize("stamps", ["none", "frames", "seconds"])

@@ -661,11 +661,14 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
         for name, axis in product(others, [axis for axis in command.axes if axis not in fits])
         if (few or seen[name] == told[axis]) and _same_kind(command, axis, stream, name)
     ]
-    pairs = {
-        pair: abs(relation.correlation)
+    follows = {
+        pair: relation.correlation
         for pair in alike
         if (relation := _relation(command, pair[1], stream, pair[0])) is not None
     }
+    if not fits and (point := _turned_point(command, stream, follows)):
+        return point, ""
+    pairs = {pair: abs(correlation) for pair, correlation in follows.items()}
     points = [name for name in others if name in _OF_POSE]
     least = {name: _OF_POINT if name in points and len(points) > 1 else SAME for name in others}
     named = {(name, axis) for name, axis in pairs if axis in (seen[name], name.rpartition("_")[2])}  # as p_RS_R_x is x
@@ -681,6 +684,26 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     most = max(pairs, key=pairs.__getitem__)
     alike = f"at most {pairs[most]:.2f}, {most[1]}"
     return fits, f"its axes are called otherwise than the commands', and follow none ({alike})"
+
+
+def _turned_point(
+    command: Stream, stream: Stream, follows: Mapping[tuple[str, str], float]
+) -> dict[str, Sequence[Signal]]:
+    """Three columns as x, y and z, in their order, that are as fast as the commanded point and follow it in no order.
+
+    Columns of a frame that is turned, each called after what it follows best, would be mirrored.
+    """
+    moving = [axis for axis in stream.axes if _travel(stream, axis) > 0.0]
+    if len(moving) != len(CARTESIAN) or not {*CARTESIAN} <= command.axes.keys():
+        return {}
+    orders = (zip(order, CARTESIAN, strict=True) for order in permutations(moving))
+    if any(all(follows.get(pair, 0.0) >= SAME for pair in order) for order in orders):
+        return {}
+    values = {axis: stream.source.values[name] for axis, name in zip(CARTESIAN, moving, strict=True)}
+    speeds = speeds_follow(command.source, replace(stream.source, values=values))
+    if speeds is None or speeds.correlation < SAME:
+        return {}
+    return {axis: stream.axes[name] for axis, name in zip(CARTESIAN, moving, strict=True)}
 
 
 def _bare(axes: Iterable[str]) -> dict[str, str]:
