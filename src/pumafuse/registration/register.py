@@ -318,7 +318,8 @@ def _coarse(
     nearer = fitted(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
     again = _plant(nearer.position.lag)
     both = (fitted(rows, start, free) for start in (begin, nearer._replace(position=again, angle=again)))
-    return min(both, key=lambda fit: fit.left() / fit.state.scale)
+    best = min(both, key=lambda fit: fit.left() / fit.state.scale)
+    return best._replace(state=best.state._replace(angle=best.state.position))  # few rows may not tell that of turning
 
 
 def _plant(lag: float) -> Plant:
