@@ -29,12 +29,12 @@ CONFIG = pf.FusionConfig(
 
 def followed(command: FloatArray, step: float = 0.0, noise: float = 1e-3) -> FloatArray:
     """What a sensor gives, 4 ms after each command [m]: held commands through a delay and a lag, by finer steps."""
-    fine = np.repeat(command, 25)  # 1 ms
-    late, position = np.concatenate([np.full(37, fine[0]), fine[:-37]]), np.empty(len(fine))
+    fine = np.repeat(command, 50)  # 0.5 ms
+    late, position = np.concatenate([np.full(75, fine[0]), fine[:-75]]), np.empty(len(fine))
     position[0] = fine[0]
     for k in range(1, len(fine)):
-        position[k] = position[k - 1] + (late[k] - position[k - 1]) / 38.0
-    value = position[4::25] + noise * np.random.default_rng(3).standard_normal(len(command))
+        position[k] = position[k - 1] + (late[k - 1] - position[k - 1]) * (1.0 - np.exp(-1.0 / 75.0))
+    value = position[8::50] + noise * np.random.default_rng(3).standard_normal(len(command))
     return np.rint(value / step) * step if step else value
 
 
