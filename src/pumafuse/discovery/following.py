@@ -28,6 +28,7 @@ _SLOW, _FASTEST = 0.1, 0.99  # of the way that so many rows do not exceed: less 
 _MOSTLY = 0.5  # share of the rows in motion, from which the median is one of them
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
 _KNEES = np.linspace(0.0, 1.0, 13)[1:-1]  # of the range that is commanded, where a curve bends
+ABOUT_ONE = 1.25  # factor by which one moves less or more than the other, where it moves as far
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
 
 
@@ -38,7 +39,7 @@ class Following:
     lag: float  # how late it is behind the path through the other's points [s]
     correlation: float  # of their changes at that lag, outliers apart
     slope: float  # by how much it moves when the other moves by 1
-    offset: float  # how far its level is from ± 1 times the other's, where that begins or all along [m or rad]
+    offset: float  # how far its level is from ± 1 times the other's; where they begin, if it moves otherwise [m or rad]
     scatter: float  # its noise, roughly, [m or rad]
     resolution: float  # that of the steps in which its values come
     misfit: float  # standard deviation of what the other, delayed and scaled, leaves of it, outliers apart [m or rad]
@@ -96,13 +97,13 @@ def _along_curve(t: FloatArray, u: FloatArray, s: FloatArray, z: FloatArray, bef
 
 
 def _offset(value: FloatArray, led: FloatArray, slope: float, start: float) -> float:
-    """How far a level is from that of what leads it, which begins at ``start``: there, or on all of the way.
+    """How far a level is from that of what leads it, which begins at ``start``.
 
     Where one moves half as far as the other, they agree where they begin, or nowhere.
     """
     sign = math.copysign(1.0, slope)
-    offsets = [float(np.median(value - times * (led - start))) - sign * start for times in (sign, slope)]
-    return min(offsets, key=abs)
+    times = sign if 1.0 / ABOUT_ONE < abs(slope) < ABOUT_ONE else slope
+    return float(np.median(value - times * (led - start))) - sign * start
 
 
 def _stands(value: FloatArray) -> bool:

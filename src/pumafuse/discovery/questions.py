@@ -13,12 +13,12 @@ from ..errors import printable
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run, Source
 from ..units import MS
-from .following import LATEST, Following
+from .following import ABOUT_ONE, LATEST, Following
 from .guesses import SensorGuess
 from .roles import MOST_LAG, SAME, another_clock
 from .survey import FOLLOWS, Survey
 
-_OTHER_UNIT, _ABOUT_ONE = 3.0, 1.25  # factors by which a sensor may move less or more than its command
+_OTHER_UNIT = 3.0  # factor by which a sensor may move less or more than its command
 
 
 def decisions(survey: Survey) -> Iterator[tuple[str, str, str]]:
@@ -128,7 +128,7 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
 
 def _is_one(gain: float) -> bool:
     """Whether a gain is about 1, whatever its sign."""
-    return 1.0 / _ABOUT_ONE < abs(gain) < _ABOUT_ONE
+    return 1.0 / ABOUT_ONE < abs(gain) < ABOUT_ONE
 
 
 def _moves_as_far(run: Run, name: str, axis: str, following: Following) -> bool:
