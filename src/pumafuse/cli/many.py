@@ -13,12 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar, cast
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 
 from ..errors import PumafuseError, PumafuseWarning
 from ..folders import sweep
-from .screen import say
+from .screen import INTERRUPTED, say
 
 R = TypeVar("R")
 
@@ -80,7 +81,7 @@ def run_jobs(
                 move(len(results) + len(failed))
     except KeyboardInterrupt:
         say(f"interrupted: {len(results)} of {len(jobs)} runs are done and kept", err=True)
-        raise
+        raise typer.Exit(INTERRUPTED) from None
     except TerminatedWorkerError:
         kept = f"{len(results)} of {len(jobs)} runs are done and kept"
         raise PumafuseError(f"a worker process died (out of memory?): {kept}") from None

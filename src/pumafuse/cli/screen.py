@@ -8,6 +8,8 @@ from typing import Any
 import msgspec
 import typer
 
+INTERRUPTED = 130  # exit code after Ctrl-C, as shells have it: 128 and the number of SIGINT
+
 
 def say(text: str, *, err: bool = False) -> None:
     """Print a text on standard output, or on standard error, without control characters but ends of lines."""

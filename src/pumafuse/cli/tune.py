@@ -20,7 +20,7 @@ from ..tuning.summary import TuningSummary
 from ..tuning.tune import Progress, tune
 from ..units import SCREEN
 from ..views import formatting
-from .screen import say
+from .screen import INTERRUPTED, say
 from .tables import interval, print_tables, table
 
 SUMMARY = "tuning.json"
@@ -28,7 +28,7 @@ PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", ARM_FILE, ROBOT_FILE})
 _HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
 _PAIRS = 3  # of correlated parameters that are shown
-WORSE, _INTERRUPTED = 3, 130
+WORSE = 3
 
 
 def run(
@@ -86,7 +86,7 @@ def run(
 def end(summary: TuningSummary) -> None:
     """Leave with the exit code of a tuning that was interrupted, or is worse on what it was validated on."""
     if summary.interrupted:
-        raise typer.Exit(_INTERRUPTED)
+        raise typer.Exit(INTERRUPTED)
     if summary.worse:
         raise typer.Exit(WORSE)
 
