@@ -325,36 +325,53 @@ void run(const Filter<N>& filter, State<N, double>& state, const Table& rows, Ti
     }
 }
 
-// The same, each estimate by the events that had arrived by then: where one comes late, the pass goes back to the
-// checkpoint before it and runs on from there.
+// Rows of which those that came after an instant are not yet stamped.
+struct Arrived {
+    const Table& rows;
+    const Time* arrival;
+    Time until;
+
+    Event operator[](Time row) const {
+        Event event = rows[row];
+        if (arrival[row] > until) event.stamp = PF_NEVER;
+        return event;
+    }
+};
+
+// The same, each estimate by the events that had arrived when it was asked for: in the order of asking, and where an
+// event comes late, or an earlier instant is asked for, the pass goes back to the checkpoint before it.
 template <int N>
 void run_as_live(const Filter<N>& filter, State<N, double>& state, const Table& rows, Time n, const Time* times,
-                 double* outputs) {
+                 const Time* asked, double* outputs) {
     const pf_events& events = rows.events;
-    const Time count = events.count;
-    std::vector<Time> arrival(count), queue(count), valid(n + 1, count);  // valid: how many rows are by each estimate
-    for (Time row = 0; row < count; ++row)
-        arrival[row] = rows[row].is_command() ? events.stamp[row] : std::max(events.stamp[row], events.time[row]);
-    std::iota(queue.begin(), queue.end(), Time(0));
-    std::stable_sort(queue.begin(), queue.end(), [&](Time a, Time b) { return arrival[a] < arrival[b]; });
+    const Time count = events.count, *arrival = events.arrival ? events.arrival : events.stamp;
+    const auto by = [](Time size, const Time* key) {
+        std::vector<Time> order(size);
+        std::iota(order.begin(), order.end(), Time(0));
+        std::stable_sort(order.begin(), order.end(), [&](Time a, Time b) { return key[a] < key[b]; });
+        return order;
+    };
+    const std::vector<Time> queue = by(count, arrival), turn = by(n, asked);
+    std::vector<Time> valid(n + 1, count), back(n + 1, count);  // rows by each estimate, and from where on they run anew
     Time places = 1;  // more than rows may have to be taken back
-    for (Time k = 0, due = 0; k <= n; ++k) {
-        if (k < n) valid[k] = std::upper_bound(events.time, events.time + count, times[k]) - events.time;
-        for (; due < count && (k == n || arrival[queue[due]] <= times[k]); ++due)
-            places = std::max(places, valid[k] - queue[due] + 1);
+    for (Time k = 0, due = 0, reached = 0; k <= n; ++k) {
+        if (k < n) valid[k] = std::upper_bound(events.time, events.time + count, times[turn[k]]) - events.time;
+        back[k] = valid[k];
+        for (; due < count && (k == n || arrival[queue[due]] <= asked[turn[k]]); ++due)
+            back[k] = std::min(back[k], queue[due]);
+        places = std::max(places, reached - back[k] + 1), reached = std::max(reached, valid[k]);
     }
     std::vector<State<N, double>> checkpoints(places, state);
-    std::vector<char> arrived(count, 0);
-    for (Time k = 0, due = 0, done = 0; k <= n; ++k) {
-        Time row = done;
-        for (; due < count && (k == n || arrival[queue[due]] <= times[k]); ++due)
-            arrived[queue[due]] = 1, row = std::min(row, queue[due]);
-        if (row < done) state = checkpoints[row % places];
-        for (done = std::max(done, valid[k]); row < done; ++row) {
-            checkpoints[row % places] = state;
-            if (arrived[row]) filter.step(state, rows[row], rows.fate(row));
+    for (Time k = 0, done = 0; k <= n; ++k) {
+        const Time until = k < n ? asked[turn[k]] : PF_NEVER;
+        if (back[k] < done) done = back[k], state = checkpoints[done % places];
+        for (; done < valid[k]; ++done) {
+            checkpoints[done % places] = state;
+            if (arrival[done] <= until) filter.step(state, rows[done], rows.fate(done));
         }
-        if (k < n) filter.estimate(state, rows, done, count, times[k], times[k], outputs, n, k);
+        if (k == n) break;
+        const Time time = times[turn[k]];
+        filter.estimate(state, Arrived{rows, arrival, until}, done, count, time, time, outputs, n, turn[k]);
     }
 }
 

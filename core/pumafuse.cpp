@@ -11,7 +11,8 @@ struct pf_filter {
 
     explicit pf_filter(Time axes) : axes(axes) {}
     virtual ~pf_filter() = default;
-    virtual void run(int mode, const Table& rows, Time begin, Time end, Time n, const Time* time, double* outputs) = 0;
+    virtual void run(int mode, const Table& rows, Time begin, Time end, Time n, const Time* time, const Time* asked,
+                     double* outputs) = 0;
     virtual bool bias(Time sensor, Time axis, double found[2]) const = 0;
 };
 
@@ -25,8 +26,9 @@ struct Recorded final : pf_filter {
     Recorded(const pf_model& model, Time origin)
         : pf_filter(model.axes), filter(model_of<double>(model)), state(filter.at_rest(origin)) {}
 
-    void run(int mode, const Table& rows, Time begin, Time end, Time n, const Time* time, double* outputs) override {
-        if (mode == PF_AS_LIVE) run_as_live(filter, state, rows, n, time, outputs);
+    void run(int mode, const Table& rows, Time begin, Time end, Time n, const Time* time, const Time* asked,
+             double* outputs) override {
+        if (mode == PF_AS_LIVE) run_as_live(filter, state, rows, n, time, asked ? asked : time, outputs);
         else if (mode == PF_SMOOTHED) run_smoothed(filter, state, rows, n, time, outputs);
         else pumafuse::run(filter, state, rows, begin, end, mode == PF_REPEATED, n, time, outputs);
     }
@@ -111,9 +113,9 @@ pf_filter* pf_filter_new(const pf_model* model, int64_t origin) {
 void pf_filter_free(pf_filter* filter) { delete filter; }
 
 int pf_filter_run(pf_filter* filter, int mode, const pf_events* events, int64_t begin, int64_t end,
-                  const pf_results* results, int64_t n, const int64_t* time, double* outputs) {
+                  const pf_results* results, int64_t n, const int64_t* time, const int64_t* asked, double* outputs) {
     const Table rows{*events, results, filter->axes};
-    return attempt([&] { filter->run(mode, rows, begin, end, n, time, outputs); });
+    return attempt([&] { filter->run(mode, rows, begin, end, n, time, asked, outputs); });
 }
 
 int pf_filter_bias(const pf_filter* filter, int64_t sensor, int64_t axis, double bias[2]) {

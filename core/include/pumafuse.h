@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 9              /* of this interface: a program and its library must agree */
+#define PF_VERSION 10             /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -98,6 +98,7 @@ typedef struct {
     const double *value;   /* [m] as logged, (n, A) */
     const double *spread;  /* by what the noise of each is scaled, (n, A); NULL: by nothing */
     const uint8_t *known;  /* PF_FUSED where the filter decides, else what the value is, (n, A) */
+    const int64_t *arrival; /* when it came, (n,); NULL: at its stamp */
 } pf_events;
 
 /* What became of n events; the caller's arrays. Values that the filter does not decide on are not written. */
@@ -157,13 +158,14 @@ typedef struct pf_filter pf_filter;
 PF_API pf_filter *pf_filter_new(const pf_model *model, int64_t origin);
 PF_API void pf_filter_free(pf_filter *filter); /* NULL: nothing */
 /* How estimates are asked for: by the events until then; likewise, where outcomes are repeated, whatever a gate would
- * say; by the events that had arrived by then (commands at their stamp, measurements at the later of stamp and
- * validity); by all measurements. */
+ * say; by the events that had arrived by then, or by when each estimate is `asked` for; by all measurements. */
 enum { PF_FILTERED, PF_REPEATED, PF_AS_LIVE, PF_SMOOTHED };
 /* Events begin to end, all of them for the last two, and an estimate at each of n times, ascending; the commands in
- * later rows that are stamped by then are known, too. outputs (PF_OUTPUTS, A, n). Returns 0; -1 without memory. */
+ * later rows that are stamped and have arrived by then are known, too. asked (n,), or NULL: at these times. outputs
+ * (PF_OUTPUTS, A, n). Returns 0; -1 without memory. */
 PF_API int pf_filter_run(pf_filter *filter, int mode, const pf_events *events, int64_t begin, int64_t end,
-                         const pf_results *results, int64_t n, const int64_t *time, double *outputs);
+                         const pf_results *results, int64_t n, const int64_t *time, const int64_t *asked,
+                         double *outputs);
 /* Mean and sd [m] of the constant bias of a sensor on an axis; returns 1, or 0 where none is in the state. */
 PF_API int pf_filter_bias(const pf_filter *filter, int64_t sensor, int64_t axis, double bias[2]);
 

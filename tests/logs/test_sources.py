@@ -311,6 +311,20 @@ def test_commands_between_which_a_controller_interpolates(tmp_path: Path) -> Non
         assert f"interpolation_ms = {step} is not between a thousandth of the interval of the commands, 100 ms" in text
 
 
+def test_when_rows_came_is_a_column_of_any_unit(tmp_path: Path) -> None:
+    """Empty: at its stamp; a command between two has come with the next one; axes with rows of their own have none."""
+    columns = {"t_s": [0.0, 0.1, 0.2], "came": pa.array([5.0, None, 230.0]), "x_m": [0.0, 0.1, 0.2]}
+    arrived = 'time = "t_s"\narrived = { column = "came", unit = "ms" }\n'
+    command = read(tmp_path, f'{arrived}x = "x_m"', columns).command
+    assert command.arrival.tolist() == [5_000_000, 100_000_000, 230_000_000]
+    finer = read(tmp_path, f'{arrived}x = "x_m"\ninterpolation_ms = 50', columns).command
+    assert finer.arrival.tolist() == [5_000_000, 100_000_000, 100_000_000, 230_000_000, 230_000_000]
+    own_rows = 'x = { column = "x_m", where = { came = 5 } }'
+    assert "arrived: axes with rows of their own have none" in refusal(
+        partial(read, tmp_path, arrived + own_rows, columns)
+    )
+
+
 def test_axes_with_stamps_of_their_own_are_interpolated_each(tmp_path: Path) -> None:
     """Each has the values that it has alone, whatever lies between its rows."""
     time, joint = np.arange(200) * 0.05 + 1e-3 * (np.arange(200) % 2), np.tile(["elbow", "wrist"], 100)

@@ -121,7 +121,7 @@ def written(folder: Path, *, single: bool, damage: Any = None) -> Path:
         pq.write_table(table, folder / f"{name}.parquet")
         head = name if name in ("command", "reference") else f"sensors.{name}"
         axes = "\n".join(f"{column[0]} = '{column}'" for column in columns)
-        lines.append(f"[{head}]\nfile = '{name}.parquet'\ntime = 'time_ns'\n{axes}")
+        lines.append(f"[{head}]\nfile = '{name}.parquet'\ntime = 'time_ns'\narrived = 'time_ns'\n{axes}")
         lines += ["noise = { sd = 'error_mm', typical = 0.2 }"] if name == "camera" else []
     (folder / "run.toml").write_text("\n".join(lines))
     return folder

@@ -20,7 +20,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
 from ..errors import PumafuseError
 from .events import Events, Results
 
-VERSION = 9  # of the interface
+VERSION = 10  # of the interface
 FINEST = 1e-9  # PF_FINEST
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
@@ -86,7 +86,7 @@ _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double
     "constant_velocity": "vnppnppp",
     "filter_new": "ppn",
     "filter_free": "vp",
-    "filter_run": "ipipnnpnpp",
+    "filter_run": "ipipnnpnppp",
     "filter_bias": "ipnnp",
     "linearise": "ippnnpppp",
     "live_new": "ppnn",
@@ -148,9 +148,7 @@ def _tables(events: Events, results: Results) -> tuple[Any, Any]:
 
 
 def _events_of(events: Events) -> ctypes.Structure:
-    pointers = [at(part) for part in events]
-    pointers[Events._fields.index("spread")] *= len(events.spread) > 0
-    return _Events(len(events.time), *pointers)
+    return _Events(len(events.time), *(at(part) * (len(part) > 0) for part in events))
 
 
 class Handle:
@@ -186,19 +184,22 @@ class Filter(Handle):
         times: TimeArray,
         mode: Literal["filtered", "repeated", "as-live", "smoothed"] = "filtered",
         span: tuple[int, int] | None = None,
+        asked: TimeArray | None = None,
     ) -> FloatArray:
         """Events in their order, and an estimate at each of ``times``, int64 ns, ascending, (n,).
 
         An estimate knows the events until then (``repeated``: by the outcomes in ``results``, whatever a gate would
-        say), those that had arrived by then, or all of them. Of a ``span`` from the first event to behind the last it
-        knows commands behind it, too. ``results`` gets what became of each measurement.
+        say), those that had arrived by then (or when it is ``asked`` for, int64 ns, (n,)), or all of them. Of a
+        ``span`` from the first event to behind the last it knows commands behind it, too. ``results`` gets what became
+        of each measurement.
 
         Returns:
             Outputs by :class:`Output`, axis and time, (8, A, n).
         """
         outputs, (table, rows) = np.zeros((len(Output), self._axes, len(times))), _tables(events, results)
-        ends, asked = span or (0, len(events.time)), (len(times), at(times), at(outputs))
-        checked(library.pf_filter_run(self._core, _MODES.index(mode), table, *ends, rows, *asked))
+        ends, when = span or (0, len(events.time)), None if asked is None else at(asked)
+        wanted = len(times), at(times), when, at(outputs)
+        checked(library.pf_filter_run(self._core, _MODES.index(mode), table, *ends, rows, *wanted))
         return outputs
 
     def bias(self, sensor: int, axis: int) -> tuple[float, float] | None:

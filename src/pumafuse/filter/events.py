@@ -30,6 +30,7 @@ class Events(NamedTuple):
         spread: By what the noise of a value is scaled, (n, A); (0, A) where by nothing.
         known: What each value is before the filter sees it: ``FUSED`` where the filter decides, ``ABSENT`` where the
             row gives none, else why it is not used, (n, A).
+        arrival: When it came, int64 ns, (n,); (0,) where at its stamp.
     """
 
     time: TimeArray
@@ -38,6 +39,7 @@ class Events(NamedTuple):
     value: FloatArray
     spread: FloatArray
     known: CodeArray
+    arrival: TimeArray = np.zeros(0, dtype=np.int64)
 
     @staticmethod
     def empty(axes: int, events: int = 0) -> Events:
@@ -88,4 +90,6 @@ def joined(parts: Sequence[Events]) -> Events:
     """The events of several tables, one after the other."""
     if any(len(part.spread) for part in parts):
         parts = [part if len(part.spread) else part._replace(spread=np.ones_like(part.value)) for part in parts]
+    if any(len(part.arrival) for part in parts):
+        parts = [part if len(part.arrival) else part._replace(arrival=part.stamp) for part in parts]
     return Events._make(map(np.concatenate, zip(*parts, strict=True)))

@@ -38,8 +38,12 @@ def filter_segment(
     mode: Mode,
     engine: Engine = "compiled",
     progress: Callable[[float], None] | None = None,
+    asked: TimeArray | None = None,
 ) -> Filtered:
-    """Filter or smooth one segment; ``times`` of the estimates ascend, int64 ns, none before the origin."""
+    """Filter or smooth one segment; ``times`` of the estimates ascend, int64 ns, none before the origin.
+
+    As live they know what had come until they are ``asked`` for, see :meth:`.Segment.asked`.
+    """
     events = segment.events_once(config)
     model, results = model_of(segment, config), _undecided(events)
     if engine == "filterpy":
@@ -50,7 +54,7 @@ def filter_segment(
         outputs = slow_core.run(results, times, progress)
         return _filtered(segment, outputs, events, results, slow_core.bias)
     core = Filter(model, segment.origin)
-    return _filtered(segment, core.run(events, results, times, mode), events, results, core.bias)
+    return _filtered(segment, core.run(events, results, times, mode, asked=asked), events, results, core.bias)
 
 
 def filter_piece(

@@ -93,7 +93,8 @@ def fuse(
         moving.extend(starts_in_motion(segment, config))
         times = output_times(segment, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
-        segment_result = filter_segment(segment, config, times, mode, engine, share)
+        asked = segment.asked(times, rate is not None)
+        segment_result = filter_segment(segment, config, times, mode, engine, share, asked)
         return Part(part, segment.without_measurements(), times, segment_result)  # found has them
 
     parts += [filtered(number, part) for number, part in enumerate(logged)]

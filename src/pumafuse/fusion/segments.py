@@ -202,6 +202,20 @@ class Segment:
         valid = _valid(rows.stamp, self._latency(config)[rows.source])[on_any_axis(rows.known, Outcome.FUSED)]
         return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
+    def asked(self, times: TimeArray, on_grid: bool) -> TimeArray | None:
+        """When a stream gives the estimates at ``times``, by the clock of arrivals [int ns], (n,); None without one.
+
+        It does as each command comes, or ``on_grid`` just before the first event that is stamped later.
+        """
+        if not len(self.command_rows.arrival) + len(self.measurement_rows.arrival):
+            return None
+        rows = joined([self.command_rows, self.measurement_rows])
+        if not on_grid:
+            return rows.arrival.take(np.searchsorted(self.command_rows.stamp, times, side="right") - 1)
+        order = np.argsort(rows.stamp)
+        first = np.minimum.accumulate(np.append(rows.arrival[order], NEVER)[::-1])[::-1]
+        return first.take(np.searchsorted(rows.stamp[order], times, side="right")) - 1
+
     def _latency(self, config: FusionConfig) -> IntArray:
         """Of each sensor, int ns."""
         latency = [config.sensors[name].latency if name in config.sensors else 0.0 for name in self.sensors]
@@ -362,6 +376,10 @@ def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
     note_rows(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
     order = in_order(source.stamp, int(np.count_nonzero(missing)))
     rows = _table(source, run.axes, order, COMMAND)
+    if len(rows.arrival):  # what is sent again is there from the first time on
+        again = (np.diff(rows.stamp) == 0) & (np.diff(np.nan_to_num(rows.value), axis=0) == 0.0).all(axis=1)
+        first = np.maximum.accumulate(np.where(np.append(False, again), 0, np.arange(len(rows.stamp))))
+        rows = rows._replace(arrival=rows.arrival.take(first))
     rows = rows._replace(known=classify(policy, rows, 0, np.zeros_like(missing[order])))
     if len(source.stray):
         rows.known[source.stray[order][:, None] & (rows.known == int(Outcome.INVALID))] = int(Outcome.STRAY)
@@ -514,7 +532,9 @@ def _table(source: Source, axes: tuple[str, ...], order: IntArray | slice, numbe
             spread[:, at] = source.spread[axis][order]
     if len(source.noise):
         spread *= source.noise[order, None]
-    return Events(_valid(stamp, latency), np.full(len(stamp), number, dtype=np.int16), stamp, value, spread, codes)
+    time, numbers = _valid(stamp, latency), np.full(len(stamp), number, dtype=np.int16)
+    arrival = source.arrival[order].copy() if len(source.arrival) else source.arrival
+    return Events(time, numbers, stamp, value, spread, codes, arrival)
 
 
 def best_of(codes: CodeArray) -> CodeArray:

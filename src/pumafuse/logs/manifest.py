@@ -186,6 +186,7 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     orientation: Orientation | None = None
     joints: dict[str, list[Column]] = {}  # the columns of the joints of the '[robot]', which are a pose
     noise: RowNoise | None = None  # the column of how noisy each row is; only sensors have one
+    arrived: Time | None = None  # when each row came; None: at its stamp
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -198,7 +199,8 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
         axes = [column for columns in (*self.axes.values(), *self.joints.values()) for column in columns]
         turning = () if self.orientation is None else self.orientation.columns
         noise = () if self.noise is None else (self.noise.column,)
-        names = [*self.time.columns, *(column.column for column in axes), *turning, *noise]
+        times = (*self.time.columns, *(() if self.arrived is None else self.arrived.columns))
+        names = [*times, *(column.column for column in axes), *turning, *noise]
         return [*names, *(name for axis in axes for name in axis.where)]
 
     @property
@@ -345,11 +347,11 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in x = 'x_mm'")
     if "noise" in keys:
         _check_noise(keys["noise"], kind, where, f"{path}.noise")
-    of_whole_rows = next((key for key in ("orientation", "noise") if key in keys), None)
+    of_whole_rows = next((key for key in ("orientation", "noise", "arrived") if key in keys), None)
     if of_whole_rows and any(column.get("where") for columns in axes.values() for column in columns):
         raise ConfigError(f"{where}: {path}.{of_whole_rows}: axes with rows of their own have none")
-    if "time" in keys:
-        keys["time"] = _time(keys["time"], where, f"{path}.time")
+    for key in [key for key in ("time", "arrived") if key in keys]:
+        keys[key] = _time(keys[key], where, f"{path}.{key}")
     if "where" in keys:
         keys["where"] = _where(keys["where"], where, f"{path}.where")
     more = {"kinds": kinds} if kinds else {}

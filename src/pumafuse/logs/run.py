@@ -63,6 +63,7 @@ class Source:
         stray: Rows of commands of which a value is left out, as nobody sent it, (rows,); (0,) where none is.
         joints: Where the joints are of which x, y, z and the orientation are the pose; None where none are told.
         noise: By what a sensor's noise is scaled in each row, on all axes, (rows,); (0,) where by nothing.
+        arrival: When each row came, int64 ns, (rows,); (0,) where at its stamp.
     """
 
     stamp: TimeArray
@@ -75,6 +76,7 @@ class Source:
     stray: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     joints: Joints | None = None
     noise: FloatArray = field(default_factory=lambda: np.zeros(0))
+    arrival: TimeArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def sd_of(self, axis: str) -> float:
         """Standard deviation of the noise of a reference on one axis [m or rad]."""
@@ -230,11 +232,13 @@ class Source:
 
         stamp = self.stamp[row] + np.rint(share * np.append(gap, 0.0)[row]).astype(np.int64)
         values = {axis: between(value) for axis, value in self.values.items()}
+        arrival = self.arrival[row + (share > 0.0)] if len(self.arrival) else self.arrival
+        finer = replace(self, stamp=stamp, values=values, arrival=arrival)
         if self.joints is not None:
             told = np.column_stack([between(value) for value in self.joints.values.T])
-            return replace(self, stamp=stamp, values=values).posed(Joints(self.joints.chain, told))
+            return finer.posed(Joints(self.joints.chain, told))
         turned = None if self.orientation is None else rotations.between(self.orientation, row, share)
-        return replace(self, stamp=stamp, values=values, orientation=turned)
+        return replace(finer, orientation=turned)
 
     def on_timeline(self) -> tuple[Source, str | None]:
         """The source as Rerun shows it, where its clock steps back: by stamps, the first of each; and a note.
@@ -262,7 +266,8 @@ class Source:
         joints = None if self.joints is None else Joints(self.joints.chain, self.joints.values[chosen])
         noise = self.noise[chosen] if len(self.noise) else self.noise
         kept = replace(self, stamp=self.stamp[chosen], values=values, spread=spread, orientation=turned, joints=joints)
-        return replace(kept, stray=stray, noise=noise)
+        arrival = self.arrival[chosen] if len(self.arrival) else self.arrival
+        return replace(kept, stray=stray, noise=noise, arrival=arrival)
 
 
 @dataclass(frozen=True, repr=False)
@@ -614,6 +619,9 @@ def of_tables(
         source = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units, entry.orientation)
         if entry.noise is not None:
             source = replace(source, noise=entry.noise.factor(read[entry.rows].plain(entry.noise.column)[0]))
+        if entry.arrived is not None:
+            arrival, _ = entry.arrived.stamps(read[entry.rows])
+            source = replace(source, arrival=np.where(arrival == NO_STAMP, source.stamp, arrival))
         if chain is not None and entry.joints:
             source = _posed(source, read[entry.rows], entry.joints, chain, units)
         if entry.entity:

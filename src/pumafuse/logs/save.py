@@ -14,7 +14,7 @@ from ..units import SCREEN, Screen, seconds
 from . import tables
 from .run import NOISE, Run, Source
 
-_KEYS = ("file", "topic", "entity", "where", "time", "start", "clock", NOISE)  # of a source in run.toml
+_KEYS = ("file", "topic", "entity", "where", "time", "start", "clock", NOISE, "arrived")  # of a source in run.toml
 _TAKEN = ("commands", "truth", "trials", "samples", "path")
 
 
