@@ -6,20 +6,21 @@ import errno
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 
 import pumafuse as pf
 from pumafuse.live import record
 from pumafuse.live.record import Recorder
+from pumafuse.live.stream import Stream
 from pumafuse.logs.frames import Cylindrical
-from streams import FIELDS, TRACKED, T, any_stream, delayed, events_of, feed, record_is_as_live
+from streams import FIELDS, TRACKED, Event, T, any_stream, delayed, events_of, feed, record_is_as_live
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 
@@ -70,25 +71,86 @@ def recorded(tmp_path: Path) -> Recorded:
     return Recorded(tmp_path / "record")
 
 
-def test_a_record_does_not_tell_when_a_row_came(tmp_path: Path) -> None:
-    """A camera that is 50 ms late: `--as-live` has its rows sooner than live; of the past both know the same."""
+class Kept:
+    """Keeps the estimates that go out, by stamp."""
+
+    def __init__(self) -> None:
+        self.estimates = dict[int, pf.LiveEstimate]()
+
+    def event(self, event: object, result: pf.UpdateResult) -> None: ...
+
+    def estimate(self, estimate: pf.LiveEstimate) -> None:
+        self.estimates[estimate.stamp] = estimate
+
+    def tick(self, health: object) -> None: ...
+
+
+def record_says_what_live_said(
+    folder: Path, config: pf.FusionConfig, start: dict[str, float], arrivals: Sequence[Event], rate: float | None = None
+) -> None:
+    """Assert that what goes out while events come is, to the bit, what their record gives as live."""
+    recorded, kept = Recorded(folder, config, start), Kept()
+    stream = Stream(recorded.live, lambda _: None, lambda _: None, rate, [kept])
+    for event in arrivals:
+        stream.take([event])
+        recorded.tick()
+    stream.end()
+    offline = pf.fuse(recorded.close(), config, mode="as-live", rate=rate)
+    stamps = offline.origin + np.rint(offline.time * 1e9).astype(np.int64)
+    assert sorted(kept.estimates) == stamps.tolist()
+    for axis, track in offline.axes.items():
+        for field in FIELDS:
+            said = [getattr(kept.estimates[stamp][axis], field) for stamp in stamps.tolist()]
+            assert np.array_equal(said, getattr(track, field), equal_nan=True), (axis, field)
+
+
+@pytest.mark.parametrize("rate", [None, 100.0])
+@pytest.mark.parametrize("late", ["vision", "tracker", "commands", "all"])
+def test_a_record_of_late_rows_is_as_live(tmp_path: Path, late: str, rate: float | None) -> None:
+    """A camera or a tracker is 50 ms late, commands are by 0 to 20 ms, all by 0 to 0.9 s; each command, and a grid."""
     source = files("pumafuse") / "data" / "scan"
     run, config = pf.Run.read(str(source)), pf.FusionConfig.load(str(source / "fusion.toml"))
-    until, late, now = run.command.stamp[0] + 20_000_000_000, {"vision": 50_000_000}, dict[int, float]()
-    recorder = Recorder(tmp_path / "record", config, dict(run.start), lambda _: None)
-    live = pf.LiveEstimator(config, start=run.start, event_log=recorder)
-    events = [event for event in events_of(replace(run, reference=None)) if event.stamp <= until]
-    for event in sorted(events, key=lambda event: event.stamp + late.get(event.sensor, 0)):
-        feed(live, event)
-        if not event.sensor:
-            now[event.stamp] = live.estimate(event.stamp)["x"].position
-    recorder.close(live.sure)
-    recorded = pf.Run.read(tmp_path / "record")
-    as_live, hindsight = (pf.fuse(recorded, config, mode=mode) for mode in ("as-live", "filtered"))
-    stamps = as_live.origin + np.rint(as_live.time * 1e9).astype(np.int64)
-    given = np.array([now[stamp] for stamp in stamps.tolist()])
-    assert 1e-7 < np.abs(given - as_live["x"].position).max() < 3.5e-6
-    assert live.estimate(int(stamps[-1]))["x"].position == hindsight["x"].position[-1]
+    first, rng = int(run.command.stamp[0]), np.random.default_rng(1)
+    events = [event for event in events_of(replace(run, reference=None)) if event.stamp <= first + 20_000_000_000]
+
+    def arrival(event: Event) -> float:
+        if late == "all":
+            return event.stamp + (rng.uniform(0.0, 0.9e9) if event.stamp > first else 0.0)
+        if late == "commands":
+            return event.stamp + (rng.uniform(0.0, 20e6) if not event.sensor and event.stamp > first else 0.0)
+        return event.stamp + 50e6 * (event.sensor == late)
+
+    record_says_what_live_said(tmp_path / "record", config, dict(run.start), sorted(events, key=arrival), rate)
+
+
+@settings(max_examples=15)
+@given(drawn=any_stream())
+def test_a_record_of_any_late_rows_is_as_live(tmp_path_factory, drawn) -> None:
+    """Any axes, gaps and gates, sensors late by up to 0.9 s; commands too, and twice, if they are a period apart."""
+    config, run, seed = drawn
+    assume((np.diff(run.command.stamp) > 0).all())  # of one stamp the last command counts
+    start, rng, events = dict.fromkeys(run.axes, 0.5), np.random.default_rng(seed), events_of(run)
+    apart = np.diff(run.command.stamp).min(initial=T) >= T
+    first = next(event for event in events if not event.sensor)
+    late = [event.stamp + (rng.uniform(0.0, 0.9e9) if event.sensor or apart else 0.0) for event in events]
+    arrivals = [events[place] for place in np.argsort(late, kind="stable")]
+    if apart:
+        arrivals = [first, *(event for event in delayed(arrivals, 0.9, seed, twice=0.1) if event.stamp != first.stamp)]
+    record_says_what_live_said(tmp_path_factory.mktemp("live") / "record", config, start, arrivals)
+
+
+def test_a_record_without_arrivals_is_read_as_before(tmp_path: Path) -> None:
+    """Those of earlier versions: each row has come at its stamp, and where rows came in order nothing changes."""
+    recorded = Recorded(tmp_path / "record")
+    recorded.go(60)
+    now = pf.fuse(recorded.close(), TRACKED, mode="as-live")
+    manifest = tmp_path / "record" / "run.toml"
+    manifest.write_text(manifest.read_text().replace('arrived = "arrived_ns"\n', ""))
+    run = pf.Run.read(tmp_path / "record")
+    before = pf.fuse(run, TRACKED, mode="as-live")
+    assert len(run.command.arrival) == 0
+    for field in FIELDS:
+        assert getattr(now["radial"], field).tolist() == getattr(before["radial"], field).tolist()
 
 
 def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import toml
+from ..arrays import ALWAYS
 from ..folders import FolderError, check_writable, write_file
 from ..fusion.config import ROBOT_FILE, FusionConfig
 from ..logs.clock import TOLERATED_STEP_BACK_NS
@@ -39,6 +40,7 @@ _TRIED_AGAIN = 1.0  # s after the disk refused
 _MOST_WAITING = 64 << 20  # bytes that wait for a disk
 _PATIENCE = 5.0  # s for the disk at the end
 _COMMANDS, _MANIFEST, _TIME = "commands.csv", "run.toml", "time_ns"
+_ARRIVED = "arrived_ns"  # the newest stamp by then, and 1 ns after the row before: only the order counts
 _QUATERNION = ["qx", "qy", "qz", "qw"]  # columns
 
 
@@ -80,7 +82,7 @@ class Recorder:
         check_writable(folder, force=False, markers=(), ours=lambda _: False)
         folder.mkdir(parents=True, exist_ok=True)
         self._turning = _QUATERNION if turns else []
-        header = ",".join((_TIME, *self._columns.values(), *self._turning, NOISE)).encode() + b"\n"
+        header = ",".join((_TIME, _ARRIVED, *self._columns.values(), *self._turning, NOISE)).encode() + b"\n"
         beside = {} if self._robot is None else {ROBOT_FILE: text_of(Path(self._robot.urdf))}
         self._writer = Writer(header, beside)
         self._due, self._reported = 0.0, -math.inf
@@ -115,7 +117,8 @@ class Recorder:
         line = ",".join(
             [cells.get(axis, "") for axis in self._columns] + (turned or [""] * len(self._turning)) + [noise]
         )
-        self._pending.append(_Row(stamp, sensor, filled, f"{stamp},{line}\n".encode()))
+        self._arrived = max(stamp, self._arrived + 1)
+        self._pending.append(_Row(stamp, sensor, filled, f"{stamp},{self._arrived},{line}\n".encode()))
 
     def discard(self, after: int) -> None:
         """Remove the events stamped after ``after`` [ns]."""
@@ -174,7 +177,7 @@ class Recorder:
         self._newest: dict[str | None, int] = {}  # stamp of each source
         self._seen: dict[str | None, set[str]] = {}  # axes of each source
         self._listed: set[str | None] = set()  # sources whose rows have been handed over
-        self._commanded = False
+        self._commanded, self._arrived = False, ALWAYS
 
     def _flush_until(self, sure: int | None) -> None:
         """Hand over the rows that nothing will take back."""
@@ -214,6 +217,7 @@ class Recorder:
             sensor: {
                 "file": _file(sensor),
                 "time": _TIME,
+                "arrived": _ARRIVED,
                 **{axis: column for axis, column in self._columns.items() if axis in seen - self._joints.keys()},
                 **(
                     {"joints": {joint: self._columns[joint] for joint in self._joints}}
