@@ -128,7 +128,7 @@ def steps_of(problem: Problem) -> list[Steps]:
     events, model, found = problem.events, model_of(problem.segment, problem.config), list[Steps]()
     for number, axis in enumerate(model.axis):
         outcome, view = problem.filtered.results.outcome[:, number], model.view[:, number]
-        command = (events.source == COMMAND) & (events.known[:, number] == FUSED)
+        command = (events.source == COMMAND) & (events.codes[:, number] == FUSED)
         rows = np.flatnonzero(command | ((events.source != COMMAND) & (outcome == FUSED)))
         time = np.concatenate((events.time[rows], problem.times))
         row = np.concatenate((rows, np.full(len(problem.times), -1)))

@@ -62,21 +62,24 @@ def test_every_room_is_known() -> None:
 
 
 def test_names_say_the_thing() -> None:
-    """No variable or parameter is called by a word that says nothing of what it holds."""
+    """Nothing is called by a word that says nothing of what it holds or does, but keys of files: `rest_s`."""
     silent = {"found", "one", "known", "given", "rest", "own", "place", "like", "aside", "mine", "there"}
     for path in SOURCE.rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        fields = {
+        keys = {
             id(line.target)
-            for node in ast.walk(tree)
-            if isinstance(node, ast.ClassDef)
-            for line in node.body
-            if isinstance(line, ast.AnnAssign)
+            for line in ast.walk(tree)
+            if isinstance(line, ast.AnnAssign) and "name=" in ast.unparse(line.value or line.target)
         }
         for node in ast.walk(tree):
-            is_set = isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and id(node) not in fields
-            name = node.arg if isinstance(node, ast.arg) else node.id if is_set else ""
-            assert name not in silent, f"{path}, line {node.lineno}: {name}"
+            match node:
+                case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                    pass
+                case ast.arg(arg=name) | ast.FunctionDef(name=name):
+                    pass
+                case _:
+                    continue
+            assert name.lstrip("_") not in silent or id(node) in keys, f"{path}, line {node.lineno}: {name}"
 
 
 def test_no_room_hides_a_public_name() -> None:

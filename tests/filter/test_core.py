@@ -73,13 +73,13 @@ def any_events(config: FusionConfig, count: int = 80, seed: int = 1) -> Events:
     events.source[:] = rng.integers(COMMAND, len(config.sensors), count)
     scale = np.array([*(sensor.scale for sensor in config.sensors.values()), 1.0])[events.source]  # -1: the last
     events.value[:] = scale[:, None] * (START + rng.normal(0.0, 5e-3, (count, 1)))  # the same of every axis
-    events.known[:] = Outcome.FUSED
+    events.codes[:] = Outcome.FUSED
     return events._replace(spread=rng.uniform(0.5, 2.0, (count, 1)).repeat(axes, axis=1))
 
 
 def run(config: FusionConfig, events: Events) -> tuple[FloatArray, Results, Filter]:
     """Outputs at each event, by what was known until then."""
-    results, core = Results.room(*events.known.shape), Filter(model_of(config), 0)
+    results, core = Results.room(*events.codes.shape), Filter(model_of(config), 0)
     return core.run(events, results, events.time), results, core
 
 
@@ -87,11 +87,11 @@ def test_what_a_measurement_does_not_see_keeps_its_bits() -> None:
     """A bias that nobody has measured, an offset that is known, an axis that is not in the row."""
     config = config_of(["turning", "lag"])
     events = any_events(config)
-    events.known[:, 0][events.source == 2] = ABSENT
+    events.codes[:, 0][events.source == 2] = ABSENT
     outputs, results, core = run(config, events)
     assert core.bias(2, 0) == (0.0, SENSORS["drifting"].bias_sd)
     assert core.bias(2, 1) != (0.0, SENSORS["drifting"].bias_sd)
-    seen = events.known[:, 0] == Outcome.FUSED
+    seen = events.codes[:, 0] == Outcome.FUSED
     alone, others, _ = run(config_of(["turning"]), events.columns([0]).rows(np.flatnonzero(seen)))
     np.testing.assert_array_equal(outputs[:, 0, seen], alone[:, 0])
     np.testing.assert_array_equal(others.innovation[:, 0], results.innovation[seen, 0])
@@ -109,9 +109,9 @@ def test_an_axis_beside_one_with_more_states_gives_the_same_bits(axis: str, besi
     both = config_of([axis, "turning, rough" if axis != "turning, rough" else "lag"], many)
     wide, model = any_events(both, 60 + 6 * beside), model_of(both)
     model.view["bias_sd"][:, 0] = 0.0
-    wide.known[wide.source > 0, 0] = ABSENT
+    wide.codes[wide.source > 0, 0] = ABSENT
     mine = np.flatnonzero(wide.source <= 0)
-    events, found = wide.rows(mine).columns([0]), Results.room(*wide.known.shape)
+    events, found = wide.rows(mine).columns([0]), Results.room(*wide.codes.shape)
     alone, results, _ = run(plain, events)
     np.testing.assert_array_equal(Filter(model, 0).run(wide, found, wide.time)[:, 0, mine], alone[:, 0])
     np.testing.assert_array_equal(found.innovation[mine, 0], results.innovation[:, 0])

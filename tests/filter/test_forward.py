@@ -67,7 +67,7 @@ class Pass:
         self.results, self.outputs = list[Results](), list[FloatArray]()
 
     def run(self, events: Events, times: TimeArray, span: tuple[int, int] | None = None) -> Pass:
-        results = Results.room(*events.known.shape)
+        results = Results.room(*events.codes.shape)
         self.outputs.append(self.core.run(events, results, times, span=span))
         self.results.append(results.rows(np.arange(*span)) if span else results)
         return self
@@ -122,7 +122,7 @@ def test_late_events_end_as_events_in_time(seed: int) -> None:
     events, _ = segment.events(CONFIG)
     arrival = events.stamp + np.random.default_rng(seed).integers(0, 1500 * MS, len(events.time))
     late = events._replace(stamp=np.where(events.source == COMMAND, events.stamp, arrival))
-    times, live, results = np.append(GRID, arrival.max()), Pass(segment), Results.room(*events.known.shape)
+    times, live, results = np.append(GRID, arrival.max()), Pass(segment), Results.room(*events.codes.shape)
     live.outputs.append(live.core.run(late, results, times, "as-live")[:, :, -1:])
     live.results.append(results)
     live.check(Pass(segment).run(late, times[-1:]))

@@ -209,7 +209,7 @@ def test_derivatives_are_those_of_the_innovations(plant: PLANTS) -> None:
     arm = pf.ArmModel(name="one", update_period=PERIOD, delay=DELAY, axes={"x": axis})
     config = pf.FusionConfig(arm=arm, process={"x": pf.Process(drift=1e-3)}, sensors={"camera": pf.Sensor(sd=1e-3)})
     segment = build(run, config)
-    outcome = np.zeros_like(segment.measurement_rows.known)
+    outcome = np.zeros_like(segment.measurement_rows.codes)
 
     def with_axis(**fields: Any) -> pf.FusionConfig:
         return changed(config, arm=changed(arm, axes={"x": changed(axis, **fields)}))
@@ -226,7 +226,7 @@ def test_derivatives_are_those_of_the_innovations(plant: PLANTS) -> None:
         sags = (changed(LOWER, **{key: getattr(LOWER, key) + sign * 1e-6}) for sign in (-1, 1))
         beside.append((*(with_axis(sag=one) for one in sags), 2e-6))
     _, d_nu, _ = linearised(segment, config, outcome, beside)
-    fused = segment.measurement_rows.known[:, 0] == pf.Outcome.FUSED
+    fused = segment.measurement_rows.codes[:, 0] == pf.Outcome.FUSED
     for found, (low, high, width) in zip(d_nu[:, fused, 0], beside, strict=True):
         down, up = (innovations(segment, one, outcome).innovation[fused, 0] for one in (low, high))
         wanted = (up - down) / width

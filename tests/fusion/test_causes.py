@@ -217,7 +217,7 @@ def test_score_and_information_are_those_of_generalised_least_squares() -> None:
     measured = est.measurements.of("camera", "a")
     time = measured.time
     covariance = 4e-6 + 0.3e-3**2 * np.minimum.outer(time, time) + SD**2 * np.eye(len(time))
-    stamp, command = est.segments[0].given("a")
+    stamp, command = est.segments[0].commands_of("a")
     led, late, early = (
         response(known.arm.axes["a"], PERIOD, DELAY, stamp, command, 0.0, np.rint((time + by) * 1e9).astype(np.int64))
         for by in (0.0, -PERIOD, PERIOD)

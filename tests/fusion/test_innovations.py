@@ -37,7 +37,7 @@ def check(run: Run, config: FusionConfig) -> Results:
     segment = build(run, config)
     found, est = innovations(segment, config), fuse(run, config)
     order = np.argsort(segment.events(config)[1])
-    given = segment.measurement_rows.known[order] != ABSENT
+    given = segment.measurement_rows.codes[order] != ABSENT
     for part in ("outcome", "innovation", "innovation_sd"):  # in the order of processing: it is the same filter
         np.testing.assert_array_equal(getattr(found, part)[order][given], getattr(est.measurements, part))
     known = found.outcome.copy()
@@ -166,7 +166,7 @@ def test_derivatives_are_those_of_the_joint_gaussian(
     run, config = Case(arm, times=np.arange(8) * 28 * MS, process=noise, seen=PARTS).made()
     segment, paths = build(run, config), numbers(config, "radial")
     order = np.argsort(segment.events(config)[1])
-    outcome = np.zeros_like(segment.measurement_rows.known)
+    outcome = np.zeros_like(segment.measurement_rows.codes)
     _, d_nu, d_s = linearised(segment, config, outcome, [beside(config, path) for path in paths])
     assert len(paths) > 20
     for path, by_nu, by_s in zip(paths, d_nu[:, order, 0], d_s[:, order, 0], strict=True):

@@ -465,7 +465,7 @@ def test_a_million_steps_leave_the_covariance_as_it_was() -> None:
     }
     core, model, events = core_of(Case(one(UNDER), times=np.arange(count) * T, process=process, seen=seen))
     assert len(events.time) > 1_000_000
-    last, results, sds = events.time[-1000:], Results.room(*events.known.shape), list[float]()
+    last, results, sds = events.time[-1000:], Results.room(*events.codes.shape), list[float]()
     for begin in range(0, len(events.time) - 5000, 5000):
         outputs = core.run(events, results, events.time[begin : begin + 1], span=(begin, begin + 5000))
         assert (outputs[1:6:2] >= 0.0).all()

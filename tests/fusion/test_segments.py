@@ -64,7 +64,7 @@ def measurements(*rows: tuple[float, float]) -> Rows:
 
 def outcomes(segment: Segment) -> list[str]:
     """Of every value that is given, by sensor, stamp and axis."""
-    return [Outcome(code).word for code in segment.measurement_rows.known.ravel() if code != ABSENT]
+    return [Outcome(code).word for code in segment.measurement_rows.codes.ravel() if code != ABSENT]
 
 
 def commanded(
@@ -73,7 +73,7 @@ def commanded(
     """The commands that act on the radial axis, (stamp, u)."""
     run = Run.from_arrays(np.array(stamp, dtype=np.int64), {"radial": value}, clock=clock, start=start)
     segment = build(run, config())
-    times, values = segment.given("radial")
+    times, values = segment.commands_of("radial")
     assert times.tolist() == segment.commands.tolist()
     return list(zip(times.tolist(), values.round(12).tolist(), strict=True))
 
@@ -133,7 +133,7 @@ def test_events_come_in_the_total_order(case: tuple[Run, FusionConfig]) -> None:
         values = [logged[axis][row] if axis in logged else np.nan for axis in run.axes]
         np.testing.assert_array_equal(events.value[at], values)
         np.testing.assert_array_equal(segment.measurement_rows.value[row_of[at]], values)
-        np.testing.assert_array_equal(events.known[at] != ABSENT, [axis in logged for axis in run.axes])
+        np.testing.assert_array_equal(events.codes[at] != ABSENT, [axis in logged for axis in run.axes])
 
 
 def reasons(run: Run, conf: FusionConfig, name: str, row: int, axis: str) -> set[str]:
@@ -165,9 +165,9 @@ def test_a_measurement_is_left_out_only_for_a_reason_it_has(case: tuple[Run, Fus
     events, _ = segment.events(conf)
     for at, (_, source, _, row) in enumerate(order_by_hand(run, conf)):
         for number, axis in enumerate(run.axes):
-            if source != COMMAND and events.known[at, number] != ABSENT:
+            if source != COMMAND and events.codes[at, number] != ABSENT:
                 wanted = reasons(run, conf, segment.sensors[source], row, axis) or {"fused"}
-                assert Outcome(events.known[at, number]).word in wanted
+                assert Outcome(events.codes[at, number]).word in wanted
 
 
 def test_an_axis_that_the_arm_has_not_is_refused() -> None:
@@ -238,8 +238,8 @@ def test_an_axis_has_its_own_commands_and_start() -> None:
     segment = build(Run.from_arrays(stamp, values, start={"radial": 0.4}), config())
     assert segment.axes == ("vertical", "radial")
     assert segment.start == {"radial": 0.4, "vertical": 0.2}
-    assert [part.tolist() for part in segment.given("radial")] == [[stamp[0], stamp[2]], [0.5, 0.7]]
-    assert [part.tolist() for part in segment.given("vertical")] == [stamp[1:], [0.2, 0.3]]
+    assert [part.tolist() for part in segment.commands_of("radial")] == [[stamp[0], stamp[2]], [0.5, 0.7]]
+    assert [part.tolist() for part in segment.commands_of("vertical")] == [stamp[1:], [0.2, 0.3]]
     assert segment.commands.tolist() == output_times(segment, config(), None).tolist() == stamp
     assert segment.origin == ORIGIN
 
@@ -252,11 +252,11 @@ def test_a_command_is_an_event_for_each_distinct_delay() -> None:
     events, place = segment.events(FusionConfig(arm=arm))
     assert not len(place)
     assert events.time.tolist() == [ORIGIN + 10 * MS, ORIGIN + DELAY]
-    assert (events.known == Outcome.FUSED).tolist() == [[False, False, True], [True, True, False]]
+    assert (events.codes == Outcome.FUSED).tolist() == [[False, False, True], [True, True, False]]
     other = FusionConfig(arm=msgspec.structs.replace(arm, delay=0.01))
     events, _ = segment.events(other)  # another configuration's times need no new segment
     assert events.time.tolist() == [ORIGIN + 10 * MS]
-    assert (events.known == Outcome.FUSED).all()
+    assert (events.codes == Outcome.FUSED).all()
 
 
 @pytest.mark.parametrize("clock", ["stamps", "regular"])

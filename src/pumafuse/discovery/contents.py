@@ -358,7 +358,7 @@ def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
 def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
     """A column beside an orientation as the axis that it is by that."""
     for attitude in attitudes:
-        if axis := attitude.place.get(signal.column):
+        if axis := attitude.coordinates.get(signal.column):
             unit = {"unit": attitude.place_unit, "basis": "name"} if attitude.place_unit else {}
             return replace(signal, axis=axis, **unit)
     return signal

@@ -48,7 +48,7 @@ def sketch(name: str, undecided: UndecidedError, folder: Path) -> str:
     streams = [stream for part in clocked for stream in streams_of(part) or [Stream(part.stem, None, "", part, {})]]
     if len(streams) == 1:  # of a table that holds both, each column may be either
         for table in (["command"], ["sensors", "measured"]):
-            lines += [*_place(table, streams[0], folder), *(f"# {line}" for line in _columns(streams[0]))]
+            lines += [*_source(table, streams[0], folder), *(f"# {line}" for line in _columns(streams[0]))]
     else:
         for stream in streams:
             lines += ["", *(f"# {line}" for line in _source(["sensors", stream.name], stream, folder)[1:])]
@@ -105,10 +105,10 @@ def _unused(roles: Roles, folder: Path) -> Iterator[str]:
 
 
 def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
-    return [*_place(table, stream, folder), *_columns(stream)]
+    return [*_location(table, stream, folder), *_columns(stream)]
 
 
-def _place(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
+def _location(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
     part, clock = stream.part, stream.part.clock
     assert clock is not None
     lines = ["", _line(_header(table), printable(stream.why, 200)), _line(_pair("file", _from(folder, part.file)))]

@@ -54,7 +54,7 @@ def following(
     Where one ``is_moved`` by the other, as an arm by its commands, a stop or a load may hold it off.
     """
     origin = int(leader[0][leader[0] != NO_STAMP].min(initial=2**62))
-    (t, u), (s, z) = known(*leader, origin), known(*follower, origin)
+    (t, u), (s, z) = in_seconds(*leader, origin), in_seconds(*follower, origin)
     inside = (s > t[0] if len(t) else s > np.inf) & (s < t[-1] if len(t) else False)
     s, z = s[inside], z[inside]
     if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
@@ -118,7 +118,7 @@ def _in_motion(value: FloatArray) -> BoolArray:
     return moves if _FEWEST <= moves.sum() < _MOSTLY * len(value) else np.ones(len(value), dtype=np.bool_)
 
 
-def known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
+def in_seconds(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
     """Seconds after an origin [ns] and values of the rows that have both, in order, without what no robot reaches."""
     valid = (stamp != NO_STAMP) & (np.abs(value) < _BEYOND)
     time, order = np.unique((stamp[valid] - origin) / 1e9, return_index=True)

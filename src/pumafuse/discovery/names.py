@@ -181,13 +181,13 @@ def likeliest_first(columns: Iterable[str]) -> list[str]:
     """Columns in the order in which their names tell something: who, as many of each role, or when; then the others."""
     count = Counter[str]()
 
-    def place(column: str) -> tuple[bool, int]:
+    def rank(column: str) -> tuple[bool, int]:
         parts = words(leaf(column))
         about = "when" if not _TELLING.isdisjoint(parts) else _role(parts, frozenset()) or ""
         count[about] += 1
         return not about, count[about]
 
-    return sorted(columns, key=place)
+    return sorted(columns, key=rank)
 
 
 def no_position(column: str) -> str | None:

@@ -52,7 +52,7 @@ class Attitude:
     quaternion: FloatArray  # x, y, z, w, NaN in rows that have none, (rows, 4)
     basis: str  # how it is known what they are
     # which axes the columns beside them are, where its own names say it
-    place: Mapping[str, str] = field(default_factory=dict[str, str])
+    coordinates: Mapping[str, str] = field(default_factory=dict[str, str])
     place_unit: str = ""  # of these; empty: their names say it
     doubt: str = ""  # what may be wrong, as a question; empty: nothing
 

@@ -20,7 +20,7 @@ import numpy as np
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..logs.run import Run, Source
 from ..units import MS
-from .following import following, isolated, known
+from .following import following, in_seconds, isolated
 from .paths import (
     ASIDE,
     Basis,
@@ -142,8 +142,8 @@ def aligned(runs: Sequence[Run], first: str, second: str) -> Alignment | None:
 def noise(command: Source, source: Source, axis: str, lag: float) -> float:
     """Noise of a sensor beside the path of its axis [m or rad]; infinite where it has too few rows for one."""
     origin = int(command.stamp[command.stamp != NO_STAMP].min(initial=2**62))
-    s, z = _thinned(*known(*_clean(source.stamp, source.values[axis]), origin))
-    told = known(command.stamp, command.values[axis], origin)
+    s, z = _thinned(*in_seconds(*_clean(source.stamp, source.values[axis]), origin))
+    told = in_seconds(command.stamp, command.values[axis], origin)
     return path(told, lag, s, z).sd if len(s) >= _FEWEST else math.inf
 
 
@@ -228,7 +228,7 @@ def _axis(run: Run, name: str, first: Source, second: Source) -> _Axis | None:
     if between is None or behind is None or abs(between.correlation) < _FOLLOWS:
         return None
     origin = int(run.command.stamp[run.command.stamp != NO_STAMP].min())
-    (s, z1), (x, z2) = (_thinned(*known(*row, origin)) for row in rows)
+    (s, z1), (x, z2) = (_thinned(*in_seconds(*row, origin)) for row in rows)
     if len(s) < _FEWEST:
         return None
     after = np.searchsorted(s, x - between.lag)
@@ -237,7 +237,7 @@ def _axis(run: Run, name: str, first: Source, second: Source) -> _Axis | None:
     inside &= s[after] - s[after - 1] < _PAUSE * float(np.diff(s).mean())
     if inside.sum() < _FEWEST:
         return None
-    by_first = path(known(*told, origin), behind.lag, s, z1)
+    by_first = path(in_seconds(*told, origin), behind.lag, s, z1)
     return _Axis(name, by_first, s, z1, x[inside], z2[inside], between.lag, between.slope)
 
 
@@ -284,7 +284,7 @@ class _Linear:
     axis: _Axis
     at: FloatArray  # when the rows of the second were valid [s]
     columns: FloatArray  # responses, levels of both, position, less the speed, and what is left, weighted, (n, k + 5)
-    rest: FloatArray  # what is left of each row [sd], (n,)
+    left: FloatArray  # what is left of each row [sd], (n,)
     speed: FloatArray  # of what it tells [sd/s], (n,)
     shrunk: Shrunk  # the coefficients of the responses
     noise: _Noise  # what to believe next
@@ -292,7 +292,7 @@ class _Linear:
     def late(self, swapped: bool) -> tuple[FloatArray, FloatArray]:
         """What is left of the rows of the second sensor [sd], of the first if they are swapped, and speeds [sd/s]."""
         rows = slice(len(self.axis.s)) if swapped else slice(len(self.axis.s), None)
-        return self.rest[rows], self.speed[rows]
+        return self.left[rows], self.speed[rows]
 
 
 def _linear(axis: _Axis, noise: _Noise, latency: float, fitted: bool) -> _Linear:

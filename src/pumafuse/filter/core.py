@@ -219,7 +219,7 @@ def linearise(
     Returns:
         Derivatives of ν and of S, (k, n, A) each.
     """
-    d_nu, d_s = np.zeros((2, len(tangents), *events.known.shape))
+    d_nu, d_s = np.zeros((2, len(tangents), *events.codes.shape))
     models = struct_of(model), (_Model * len(tangents))(*map(struct_of, tangents))
     tables = *_tables(events, results), at(d_nu), at(d_s)
     checked(library.pf_linearise(*map(ctypes.byref, models), len(tangents), origin, *tables))
@@ -231,7 +231,7 @@ def classify(model: Model, events: Events, origin: int, too_late: BoolArray) -> 
 
     ``origin`` is the first command's stamp [ns]; rows that are ``too_late``, (n,), come far behind earlier ones.
     """
-    codes = np.empty_like(events.known)
+    codes = np.empty_like(events.codes)
     structs = ctypes.byref(struct_of(model)), ctypes.byref(_events_of(events))
     library.pf_classify(*structs, origin, at(too_late), at(codes))
     return codes

@@ -38,7 +38,7 @@ class Events(NamedTuple):
     stamp: TimeArray
     value: FloatArray
     spread: FloatArray
-    known: CodeArray
+    codes: CodeArray
     arrival: TimeArray = np.zeros(0, dtype=np.int64)
 
     @staticmethod
@@ -62,8 +62,8 @@ class Events(NamedTuple):
 
     def columns(self, axes: list[int]) -> Events:
         """The events with the values of some axes alone."""
-        value, spread, codes = (np.ascontiguousarray(part[:, axes]) for part in (self.value, self.spread, self.known))
-        return self._replace(value=value, spread=spread, known=codes)
+        value, spread, codes = (np.ascontiguousarray(part[:, axes]) for part in (self.value, self.spread, self.codes))
+        return self._replace(value=value, spread=spread, codes=codes)
 
 
 class Results(NamedTuple):

@@ -300,7 +300,7 @@ class Filter:
     """The axes of an arm at rest at ``origin`` [ns], and the events that they are to follow."""
 
     def __init__(self, plants: Sequence[Plant], model: Model, origin: int, events: Events) -> None:
-        self.sensors, self.events, self.decides = model.sensor, events, events.known == Outcome.FUSED
+        self.sensors, self.events, self.decides = model.sensor, events, events.codes == Outcome.FUSED
         self.axes: list[Axis] = []
         for a, plant in enumerate(plants):
             commands_here = self.decides[:, a] & (events.source == COMMAND)

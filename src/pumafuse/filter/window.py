@@ -61,7 +61,7 @@ class Window(Handle):
         self.outcome = codes.from_address(port.outcome)
         self.innovation = numbers.from_address(port.innovation)
         self._outputs, self._fused = np.zeros((len(Output), len(model.axis))), np.zeros(len(model.axis), dtype=np.int64)
-        self._found = at(self._outputs), at(self._fused)
+        self._answer = at(self._outputs), at(self._fused)
 
     @property
     def origin(self) -> int | None:
@@ -85,7 +85,7 @@ class Window(Handle):
         stream's own coordinates and SI, and when the last measurement was valid that it knows of [ns]; None as long as
         the axis has no start level.
         """
-        library.pf_live_estimate(self._core, time, after, *self._found)
+        library.pf_live_estimate(self._core, time, after, *self._answer)
         rows = zip(self._outputs.T.tolist(), self._fused.tolist(), strict=True)
         return [None if math.isnan(outputs[0]) else (outputs, fused) for outputs, fused in rows]
 

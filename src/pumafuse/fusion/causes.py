@@ -144,7 +144,7 @@ def evidence_of(est: Estimates, axis: str) -> Evidence:
 
 def _middle(config: FusionConfig, segment: Segment, axis: str, decided: BoolArray) -> IntArray:
     """Components in the middle of a segment; so few that their commands, if they are needed, are not too many."""
-    places, commands = np.flatnonzero(decided), len(segment.given(axis)[0])
+    places, commands = np.flatnonzero(decided), len(segment.commands_of(axis)[0])
     most = _ROWS * len(places) // (len(places) + commands) if _needs_commands(config, axis) else _ROWS
     most = min(most, _MOST)
     skipped = max(len(places) - most, 0) // 2
@@ -269,7 +269,7 @@ class _Part:
     time: TimeArray  # when they are valid, int64 ns, (m,)
     scale: FloatArray  # of their sensors, (m,)
     start: float  # where it rests before the commands that the filter is given
-    given: TimeArray  # when these are given, int64 ns, (k,)
+    told_at: TimeArray  # when these are given, int64 ns, (k,)
     command: FloatArray  # these [m or rad], (k,)
 
     @cached_property
@@ -290,7 +290,7 @@ class _Part:
 def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -> _Part:
     """Components with the commands that act meanwhile, or without, where these are many and not needed."""
     arm, time = est.config.arm, est.origin + nanoseconds(measured.time)
-    told_at, command = segment.given(axis)
+    told_at, command = segment.commands_of(axis)
     first, last = np.searchsorted(told_at + round(arm.delay_of(axis) * 1e9), time[[0, -1]]).tolist()
     if last - first > _COMMANDS * len(time) and not _needs_commands(est.config, axis):
         last = first
@@ -342,9 +342,9 @@ def _filtered(part: _Part, models: Sequence[Model], moved: FloatArray) -> tuple[
     """Innovations and their sd by k models (n, k), of measurements moved by (m, k); and whose they are, (n,)."""
     arm, axis, count, measured = part.config.arm, part.axis, len(models), part.measured
     delay = arm.delay_of(axis)
-    acts = part.given + round(delay * 1e9)
+    acts = part.told_at + round(delay * 1e9)
     led = part.start + response(
-        arm.axes[axis], arm.update_period, delay, part.given, part.command, part.start, part.time
+        arm.axes[axis], arm.update_period, delay, part.told_at, part.command, part.start, part.time
     )  # by the commands that the filter is given; those before are taken off
     value = (measured.value - part.scale * (part.led - led))[:, None] + moved
     instants = np.concatenate([acts, part.time])

@@ -150,14 +150,14 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
             and config.sensors[name].is_biased(axis)
             and (codes[rows.source == number] == int(Outcome.FUSED)).any()
         ]
-        for axis, codes in zip(segment.axes, rows.known.T, strict=True)
+        for axis, codes in zip(segment.axes, rows.codes.T, strict=True)
     ]
 
 
 def _undecided(events: Events) -> Results:
     """Room for what becomes of events: until a filter decides what was known of them."""
-    results = Results.room(*events.known.shape)
-    results.outcome[:] = events.known
+    results = Results.room(*events.codes.shape)
+    results.outcome[:] = events.codes
     return results
 
 

@@ -157,7 +157,7 @@ def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
     faults, angles = list[Fault](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
     positions: _Positions = _positions(segment, config) if angles else {}
     for axis in angles:
-        if times := len(wraps(segment.given(axis)[1])):
+        if times := len(wraps(segment.commands_of(axis)[1])):
             words = (
                 f"the commands: an angle that begins anew on {axis} after each turn, {times} times: the model goes back"
                 " by a turn then; turn_deg = 360 beside their column in run.toml makes them go on"
@@ -178,7 +178,7 @@ def _positions(segment: Segment, config: FusionConfig) -> _Positions:
     positions: dict[str, dict[str, Rows]] = {}
     for name, rows in segment.rows_by_sensor().items():
         if (sensor := config.sensors.get(name)) is not None:
-            valid, fused = rows.stamp - round(sensor.latency * 1e9), rows.known == int(Outcome.FUSED)
+            valid, fused = rows.stamp - round(sensor.latency * 1e9), rows.codes == int(Outcome.FUSED)
             positions[name] = {
                 axis: (valid[here], rows.value[here, number] / sensor.scale)
                 for number, axis in enumerate(segment.axes)
@@ -198,7 +198,7 @@ def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) ->
         some: dict[str, Rows] = {}
         for name, (valid, position) in ((name, axes[axis]) for name, axes in positions.items() if axis in axes):
             count = int(np.searchsorted(valid, until - round(config.sensors[name].latency * 1e9), side="right"))
-            if count >= max(_FEW, np.count_nonzero(every[name].known[:, number] != ABSENT) / 2):
+            if count >= max(_FEW, np.count_nonzero(every[name].codes[:, number] != ABSENT) / 2):
                 chosen = slice(None, count, 1 + count // _ENOUGH)
                 alike = without_spikes(position[chosen])
                 some[name] = valid[chosen][alike], position[chosen][alike]
@@ -397,7 +397,7 @@ def _busiest(segment: Segment, period: float) -> Grid:
     length, travelled = Grid.longest(period), np.zeros(1)
     count = 1 + (last - first) // length
     for axis in segment.axes if count > 1 else ():
-        stamp, command = segment.given(axis)
+        stamp, command = segment.commands_of(axis)
         steps = np.abs(np.diff(command, prepend=command[0]))
         share = np.bincount((stamp - first) // length, weights=steps, minlength=count)
         travelled = travelled + share / max(float(steps.sum()), 1e-30)
@@ -613,7 +613,7 @@ def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatAr
 
 def _first_speed(segment: Segment, axis: str) -> float:
     """The commanded speed [m/s] that a segment begins with; 0 where its first steps are not alike."""
-    told_at, command = (part[: _ALIKE + 1] for part in segment.given(axis))
+    told_at, command = (part[: _ALIKE + 1] for part in segment.commands_of(axis))
     steps = np.diff(command)
     if len(steps) < _ALIKE or command[0] != segment.start[axis]:
         return 0.0
@@ -637,7 +637,7 @@ def _evidence(
     """
     model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
     until, score, information = settled(config, axis), 0.0, 0.0
-    (told_at, command), start = segment.given(axis), segment.start[axis]
+    (told_at, command), start = segment.commands_of(axis), segment.start[axis]
     before = np.arange(-min(int(until / period) + 1, _MOST), 0.0)
     earlier = np.concatenate([told_at[0] + np.rint(before * (period * 1e9)).astype(np.int64), told_at])
     moving = np.concatenate([start + before * (period * speed), command])

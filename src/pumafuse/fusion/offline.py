@@ -262,7 +262,7 @@ def _contradictions(segment: Segment, config: FusionConfig, filtered: Filtered, 
 
 def _row_counts(segment: Segment, filtered: Filtered) -> dict[str, dict[str, int]]:
     """What became of the rows of each sensor in one segment, those included that the filter decided on."""
-    source, codes = filtered.events.source, filtered.events.known
+    source, codes = filtered.events.source, filtered.events.codes
     decided = np.flatnonzero((source != COMMAND) & on_any_axis(codes, Outcome.FUSED))
     best = best_of(filtered.results.outcome)[decided]
     cell, size = source[decided].astype(np.int64) * len(Outcome) + best, len(segment.sensors) * len(Outcome)
@@ -287,7 +287,7 @@ def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measu
     first, columns = cut[0], list[tuple[npt.NDArray[Any], ...]]()
     for number, (events, results) in enumerate((part.events, part.results) for part in filtered):
         measured = np.repeat(events.source != COMMAND, len(first.axes))  # (n, 1) & (n, A) is slow
-        rows = np.flatnonzero(measured & (events.known != ABSENT).ravel())
+        rows = np.flatnonzero(measured & (events.codes != ABSENT).ravel())
         row = rows // len(first.axes)
         time, stamp = (seconds(part, first.origin).take(row) for part in (events.time, events.stamp))
         sensor, axis = events.source.take(row), (rows - row * len(first.axes)).astype(np.int16)

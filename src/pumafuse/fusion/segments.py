@@ -131,16 +131,16 @@ class Segment:
         """Commands, one event for each group of axes that share a delay, then measurements; which time moves each."""
         rows, measured, parts, moves = self.command_rows, self.measurement_rows, list[Events](), list[IntArray]()
         for group in sorted(set(groups)):
-            codes = np.where(np.array(groups) == group, rows.known, np.uint8(ABSENT))
-            parts.append(rows._replace(known=codes).where(on_any_axis(codes, Outcome.FUSED)))
+            codes = np.where(np.array(groups) == group, rows.codes, np.uint8(ABSENT))
+            parts.append(rows._replace(codes=codes).where(on_any_axis(codes, Outcome.FUSED)))
             moves.append(np.full(len(parts[-1].time), group))
         sensors = max(groups) + 1 + measured.source.astype(np.int64)
         return joined([*parts, measured]), np.concatenate([*moves, sensors])
 
-    def given(self, axis: str) -> tuple[TimeArray, FloatArray]:
+    def commands_of(self, axis: str) -> tuple[TimeArray, FloatArray]:
         """Stamps [int64 ns] and values [m] of the commands of one axis, (n,)."""
         number, rows = self.axes.index(axis), self.command_rows
-        chosen = np.flatnonzero(rows.known[:, number] == _FUSED)
+        chosen = np.flatnonzero(rows.codes[:, number] == _FUSED)
         return rows.stamp.take(chosen), rows.value[:, number].take(chosen)
 
     def led(self, arm: ArmModel, axis: str, time: TimeArray, model: AxisModel | None = None) -> FloatArray:
@@ -153,7 +153,7 @@ class Segment:
             model: How it answers instead, but for its delay.
         """
         model, delay = model or arm.axes[axis], arm.delay_of(axis)
-        return response(model, arm.update_period, delay, *self.given(axis), self.start[axis], time)
+        return response(model, arm.update_period, delay, *self.commands_of(axis), self.start[axis], time)
 
     def rows_by_sensor(self) -> dict[str, Events]:
         """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
@@ -176,7 +176,7 @@ class Segment:
     def of_axis(self, axis: str, rows: IntArray) -> Segment:
         """The segment with one axis alone, and some of its measurements' ``rows``."""
         column = [self.axes.index(axis)]
-        commands = np.flatnonzero(self.command_rows.known[:, column[0]] == _FUSED)
+        commands = np.flatnonzero(self.command_rows.codes[:, column[0]] == _FUSED)
         return replace(
             self,
             axes=(axis,),
@@ -191,7 +191,7 @@ class Segment:
 
     def highest_speed(self, axis: str, period: float) -> float:
         """Highest commanded speed on an axis [m/s or rad/s]."""
-        return float(np.abs(np.diff(self.given(axis)[1], prepend=self.start[axis])).max(initial=0.0)) / period
+        return float(np.abs(np.diff(self.commands_of(axis)[1], prepend=self.start[axis])).max(initial=0.0)) / period
 
     def end(self, config: FusionConfig) -> int:
         """Where an even grid of estimates ends, int ns: with the last command or measurement.
@@ -199,7 +199,7 @@ class Segment:
         Measurements an hour after the last command are on another clock.
         """
         rows = self.measurement_rows
-        valid = _valid(rows.stamp, self._latency(config)[rows.source])[on_any_axis(rows.known, Outcome.FUSED)]
+        valid = _valid(rows.stamp, self._latency(config)[rows.source])[on_any_axis(rows.codes, Outcome.FUSED)]
         return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
     def asked(self, times: TimeArray, on_grid: bool) -> TimeArray | None:
@@ -244,7 +244,7 @@ def build(
     unstamped = len(run.command.stamp) - len(rows.stamp)
     command_counts = _command_counts(rows.rows(_owned(rows.stamp, span)), unstamped)
     rows = _on_ticks(run, config, rows, notes)
-    used_rows = on_any_axis(rows.known, Outcome.FUSED)
+    used_rows = on_any_axis(rows.codes, Outcome.FUSED)
     origin = begun.origin if begun else int(rows.stamp[used_rows][0])
     ends = run.ends(origin)
     within = rows.stamp <= ends[1]
@@ -253,10 +253,10 @@ def build(
     commands, rows = rows.stamp[used_rows & within], rows.where(within)
     notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
-    late = [axis for axis, codes in zip(run.axes, rows.known.T, strict=True) if _FUSED not in codes]
+    late = [axis for axis, codes in zip(run.axes, rows.codes.T, strict=True) if _FUSED not in codes]
     if late and not begun:
         raise RunError(f"{label}: no command for axis '{late[0]}' {run.interval} after the first command")
-    first_fused = {axis: (rows.known[:, number] == _FUSED).argmax() for number, axis in enumerate(run.axes)}
+    first_fused = {axis: (rows.codes[:, number] == _FUSED).argmax() for number, axis in enumerate(run.axes)}
     first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(first_fused.items())}
     parts = [
         _measurement_rows(run, config, number, used, policy, rows, origin, span, notes) for number in range(len(used))
@@ -266,7 +266,7 @@ def build(
         name: {NOT_SELECTED: len(sensor.stamp[_owned(sensor.stamp, span)])} for name, sensor in run.sensors.items()
     }
     counts |= {name: held for name, (_, held) in zip(used, parts, strict=True)}
-    if run.interval and span == WHOLE and not (measured.known == _FUSED).any():
+    if run.interval and span == WHOLE and not (measured.codes == _FUSED).any():
         raise RunError(f"run '{run.name}': no measurement to use is stamped {run.interval} after the first command")
     return Segment(
         axes=run.axes,
@@ -323,7 +323,7 @@ def as_commanded(run: Run, config: FusionConfig) -> Source:
     if run.clock == "stamps":
         return run.command
     rows = _on_ticks(run, config, _command_rows(run, _policy(config, run.axes, ()), []), [])
-    value = np.where(rows.known == _FUSED, rows.value, np.nan)
+    value = np.where(rows.codes == _FUSED, rows.value, np.nan)
     return Source(rows.stamp, dict(zip(run.axes, value.T, strict=True)), run.command.label)
 
 
@@ -380,12 +380,12 @@ def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
         again = (np.diff(rows.stamp) == 0) & (np.diff(np.nan_to_num(rows.value), axis=0) == 0.0).all(axis=1)
         first = np.maximum.accumulate(np.where(np.append(False, again), 0, np.arange(len(rows.stamp))))
         rows = rows._replace(arrival=rows.arrival.take(first))
-    rows = rows._replace(known=classify(policy, rows, 0, np.zeros_like(missing[order])))
+    rows = rows._replace(codes=classify(policy, rows, 0, np.zeros_like(missing[order])))
     if len(source.stray):
-        rows.known[source.stray[order][:, None] & (rows.known == int(Outcome.INVALID))] = int(Outcome.STRAY)
+        rows.codes[source.stray[order][:, None] & (rows.codes == int(Outcome.INVALID))] = int(Outcome.STRAY)
     note_rows(notes, label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
     for number, axis in enumerate(run.axes):
-        codes, hollow = rows.known[:, number], np.zeros(len(missing), dtype=np.bool_)
+        codes, hollow = rows.codes[:, number], np.zeros(len(missing), dtype=np.bool_)
         hollow[order] = codes == int(Outcome.INVALID)
         note_rows(notes, label, hollow, f"no finite {axis} command: not used")
         if not (codes == _FUSED).any():
@@ -395,7 +395,7 @@ def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
 
 def _command_counts(rows: Events, unstamped: int) -> dict[str, int]:
     """How many rows of the commands are what, those without a stamp too; of a stamp the last one counts."""
-    best = best_of(rows.known)
+    best = best_of(rows.codes)
     again, hidden = best == int(Outcome.DUPLICATE), np.diff(rows.stamp, append=NEVER) == 0
     return {
         "used": int(np.count_nonzero(best == _FUSED)),
@@ -421,7 +421,7 @@ def _on_ticks(run: Run, config: FusionConfig, rows: Events, notes: list[str]) ->
     if run.clock == "stamps":
         return rows
     label = run.command.label
-    rows = rows.where(on_any_axis(rows.known, Outcome.FUSED))
+    rows = rows.where(on_any_axis(rows.codes, Outcome.FUSED))
     distinct, tick = np.unique(rows.stamp, return_inverse=True)
     grid, note = regular_grid(distinct, config.arm.update_period, label)
     notes.extend([] if note is None else [note])
@@ -447,8 +447,8 @@ def _measurement_rows(
     order = in_order(source.stamp)
     latency = 0 if sensor is None else round(sensor.latency * 1e9)
     rows = _table(source, run.axes, order, number, latency)
-    rows = rows._replace(known=classify(policy, rows, origin, lag[order] > TOLERATED_STEP_BACK_NS))
-    rows.known[~used[order]] = ABSENT
+    rows = rows._replace(codes=classify(policy, rows, origin, lag[order] > TOLERATED_STEP_BACK_NS))
+    rows.codes[~used[order]] = ABSENT
     if sensor is not None:
         notes += _hold(rows, commands, config, name, label, run.axes, origin)
     kept = rows.where(used[order])
@@ -459,10 +459,10 @@ def _measurement_rows(
         note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
         return kept, counts
     note_rows(notes, label, missing, f"no stamp: {Outcome.INVALID.word}")
-    if ((rows.known == _FUSED) | (rows.known == ABSENT)).all():
+    if ((rows.codes == _FUSED) | (rows.codes == ABSENT)).all():
         return kept, counts
-    codes = np.empty_like(rows.known)
-    codes[order] = rows.known
+    codes = np.empty_like(rows.codes)
+    codes[order] = rows.codes
     for kind, reason in _REASONS.items():
         note_rows(notes, label, on_any_axis(codes, kind), f"{reason}: {kind.word}")
     for column, axis in enumerate(run.axes):
@@ -487,12 +487,12 @@ def _hold(
     notes = list[str]()
     for column, axis in enumerate(axes):
         rows_seen, told = (
-            np.flatnonzero(table_of_rows.known[:, column] == _FUSED) for table_of_rows in (rows, commands)
+            np.flatnonzero(table_of_rows.codes[:, column] == _FUSED) for table_of_rows in (rows, commands)
         )
         stamp, command = rows.stamp[rows_seen], (commands.stamp[told], commands.value[told, column])
         again, times = held(stamp, rows.value[rows_seen, column], command, latest_follow(config, name, axis))
         if again.any():
-            rows.known[rows_seen[again], column] = int(Outcome.HELD)
+            rows.codes[rows_seen[again], column] = int(Outcome.HELD)
             first, last = seconds(stamp[again][[0, -1]], origin).tolist()
             slow = f"{axis} gives each value {times} times, as a sensor that is slower than its rows"
             froze = f"{axis} repeats its value to the last digit while the commands move it (did it freeze?)"
@@ -512,7 +512,7 @@ def latest_follow(config: FusionConfig, sensor: str, axis: str) -> int:
 def _measurement_counts(kept: Events, stamp: TimeArray) -> dict[str, int]:
     """How many rows of a sensor are what, those of every ``stamp``, of which ``kept`` are in the part to use."""
     unstamped = int(np.count_nonzero(stamp == NO_STAMP))
-    best = best_of(kept.known)[kept.stamp != NO_STAMP]
+    best = best_of(kept.codes)[kept.stamp != NO_STAMP]
     number = np.bincount(best, minlength=len(Outcome)).tolist()
     of_outcomes = {outcome.word: number[outcome] for outcome in Outcome}
     return counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(stamp) - unstamped - len(best)})

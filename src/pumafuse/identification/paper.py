@@ -24,7 +24,7 @@ _SIGMAS, _SHARE = 3.0, 0.02  # of the noise at rest, of the step: threshold of m
 
 def onset(trial: Trial) -> float:
     """When the arm first is further from rest than 3 standard deviations and 2 % of the step [s]; NaN: never."""
-    level, sd = _rest(trial)
+    level, sd = _level_at_rest(trial)
     away = np.abs(trial.position - level)
     moved = (away > max(_SIGMAS * sd, _SHARE * abs(trial.step))) & (trial.time >= 0.0)
     return float(trial.time[np.argmax(moved)]) if moved.any() else np.nan
@@ -32,7 +32,7 @@ def onset(trial: Trial) -> float:
 
 def fit_as_published(trial: Trial, fitted: StepFit) -> StepFit:
     """Fit the plant anew with delay, gain and zero as read off; the search starts from what was ``fitted``."""
-    seen, (level, _), order = onset(trial), _rest(trial), fitted.order
+    seen, (level, _), order = onset(trial), _level_at_rest(trial), fitted.order
     gain = (float(trial.position[-_LAST:].mean()) - level) / trial.step
     delay = seen if seen < trial.time[-1] else 0.0
     read = replace(fitted, shape=fitted.shape._replace(delay=delay), gain=gain, zero=level, parameters=order)
@@ -68,7 +68,7 @@ def minimise(trials: Sequence[Trial], read: Sequence[StepFit]) -> tuple[float, f
     return float(minimum.x[0]), float(minimum.x[1]) if order == 2 else 0.0
 
 
-def _rest(trial: Trial) -> tuple[float, float]:
+def _level_at_rest(trial: Trial) -> tuple[float, float]:
     """Level and standard deviation [m] of the samples before the command; of the first five where those are fewer."""
     level = trial.position[: max(int(np.searchsorted(trial.time, 0.0)), _REST)]
     return float(level.mean()), float(level.std(ddof=1))

@@ -189,10 +189,10 @@ def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[Ax
     segment, arm = build(run, config), config.arm
     rows, part = segment.measurement_rows, list[tuple[AxisVerification, Trace]]()
     for number, axis in enumerate(segment.axes):
-        told_at, command = segment.given(axis)
+        told_at, command = segment.commands_of(axis)
         first = segment.start[axis]
         for index, source in enumerate(segment.sensors):
-            here = np.flatnonzero((rows.source == index) & (rows.known[:, number] == Outcome.FUSED))
+            here = np.flatnonzero((rows.source == index) & (rows.codes[:, number] == Outcome.FUSED))
             if len(here) < _FEWEST or not np.ptp(command) > 0.0:
                 continue
             time, value = rows.time[here], rows.value[here, number] - first

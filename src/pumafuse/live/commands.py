@@ -28,12 +28,12 @@ class Commands:
     def __init__(self, start: Sequence[float]) -> None:
         """No command yet; ``start`` is the level [m] of each axis before its first one, NaN: that of the first one."""
         self._start = start
-        self._given: list[list[tuple[int, float]]] = [[] for _ in start]  # stamps and values, by stamp
+        self._told: list[list[tuple[int, float]]] = [[] for _ in start]  # stamps and values, by stamp
         self._ends = [(math.inf, -math.inf) for _ in start]
 
     def add(self, stamp: int, codes: bytes, values: Sequence[float], oldest: int) -> None:
         """Add the values [m] of a command that were fused, in the place of what the axis had at that stamp [ns]."""
-        for axis, (told, code, value) in enumerate(zip(self._given, codes, values, strict=True)):
+        for axis, (told, code, value) in enumerate(zip(self._told, codes, values, strict=True)):
             if code != _FUSED:
                 continue
             low, high = self._ends[axis]
@@ -48,7 +48,7 @@ class Commands:
 
     def at(self, axis: int, stamp: int) -> float | None:
         """What is commanded on an axis at ``stamp`` [ns], in m; None before any command."""
-        told = self._given[axis]
+        told = self._told[axis]
         row = bisect_left(told, (stamp + 1,))
         return told[row - 1][1] if row else self._before(axis) if told else None
 
@@ -59,11 +59,11 @@ class Commands:
 
     def latest(self) -> list[tuple[int, float, float] | None]:
         """Of each axis stamp [ns], value and step [m] of its latest command; None before any."""
-        return [self._latest(axis, told) if told else None for axis, told in enumerate(self._given)]
+        return [self._latest(axis, told) if told else None for axis, told in enumerate(self._told)]
 
     def forget(self, after: int) -> None:
         """Take back those that are stamped after ``after`` [ns]."""
-        for told in self._given:
+        for told in self._told:
             del told[bisect_left(told, (after + 1,)) :]
 
     def _latest(self, axis: int, told: list[tuple[int, float]]) -> tuple[int, float, float]:
@@ -73,7 +73,7 @@ class Commands:
     def _before(self, axis: int) -> float:
         """Where an axis rests before its first command [m]."""
         start = self._start[axis]
-        return self._given[axis][0][1] if math.isnan(start) else start
+        return self._told[axis][0][1] if math.isnan(start) else start
 
 
 class CommandWatch:

@@ -69,7 +69,7 @@ class Recent:
     def __init__(self, config: FusionConfig) -> None:
         self._config, self._axes, self._sensors = config, tuple(config.arm.axes), tuple(config.sensors)
         self._settled = round(max(settled(config, axis) for axis in self._axes) * 1e9)
-        self._rest = _REST_NS - np.array([2, 1, 0]) * round(config.arm.update_period * 1e9)
+        self._rests = _REST_NS - np.array([2, 1, 0]) * round(config.arm.update_period * 1e9)
         self.restart()
 
     def restart(self) -> None:
@@ -127,7 +127,7 @@ class Recent:
         start = {name: level for name, level in self._start.items() if name in names}
         told = rows(np.flatnonzero(commands), "commands")
         rested = [np.insert(part, 0, part[np.isfinite(part)][:1].repeat(3)) for part in told.values.values()]
-        stamp = np.insert(told.stamp, 0, told.stamp[0] - self._rest)
+        stamp = np.insert(told.stamp, 0, told.stamp[0] - self._rests)
         command = Source(stamp, dict(zip(told.values, rested, strict=True)), "commands", apart=True)
         age, process = (now - self._first) / 1e9, self._config.process
         strayed = {
@@ -148,13 +148,13 @@ class _Trouble:
 
     fault: Fault  # as the last look has found it
     travel: float = 0.0  # how far apart the commands of its axes were then [m or rad]
-    found: int = 0  # in how many looks in a row it was found
+    seen: int = 0  # in how many looks in a row it was found
     missed: int = 0  # in how many looks in a row it was not, though they would have shown it
 
     @property
     def is_said(self) -> bool:
         """Whether it was found often enough."""
-        return self.found >= (1 if self.fault.cause == "set" else _TWICE)
+        return self.seen >= (1 if self.fault.cause == "set" else _TWICE)
 
 
 class Diagnosis:
@@ -216,7 +216,7 @@ class Diagnosis:
     # ---- faults of the log ------------------------------------------------------------------------------------------
 
     def _look_for_faults(self, run: Run, segment: Segment, config: FusionConfig, now: int) -> None:
-        travel = {axis: float(np.ptp(segment.given(axis)[1])) for axis in segment.axes}
+        travel = {axis: float(np.ptp(segment.commands_of(axis)[1])) for axis in segment.axes}
         explained = {name for (names, *_), trouble in self._troubles.items() if trouble.is_said for name in names}
         faults = [
             fault
@@ -228,7 +228,7 @@ class Diagnosis:
             key = _key(fault)
             trouble = self._troubles.setdefault(key, _Trouble(fault))
             was_said = trouble.is_said
-            trouble.fault, trouble.missed, trouble.found = fault, 0, trouble.found + 1
+            trouble.fault, trouble.missed, trouble.seen = fault, 0, trouble.seen + 1
             trouble.travel = max((travel[axis] for axis in fault.axes), default=0.0)
             if trouble.is_said and not was_said and not self._is_set_back(fault):
                 self._log.write(str(key), f"{fault.sentence} (by {now / 1e9:.3f} s)")
@@ -263,7 +263,7 @@ class Diagnosis:
         named = [fault for fault in (*faults, *said) if isinstance(fault.cause, str)]
         faulty = {each for fault in named for each in (*fault.sensors, *fault.axes)}
         evidence, clearest = cache(partial(evidence_of, estimates)), dict[str, tuple[tuple[float, bool], str, Fault]]()
-        steps = {axis: np.diff(estimates.segments[0].given(axis)[1]) for axis in estimates.axes}
+        steps = {axis: np.diff(estimates.segments[0].commands_of(axis)[1]) for axis in estimates.axes}
         moving = [axis for axis, step in steps.items() if np.count_nonzero(step) > _MOVING * len(step)]
         for axis, name in product(moving, estimates.measurements.sensors):
             verdict = consistency(estimates, name, axis, partial(evidence, axis))

@@ -135,7 +135,7 @@ class LiveEstimator:
         self._strangers = 0
         self._doubtful = 0  # commands that may have to be taken back
         self._answers: dict[bytes, UpdateResult] = {}
-        self._aside: list[_Counted] = []  # what was refused since the commands' clock may be another one
+        self._set_aside: list[_Counted] = []  # what was refused since the commands' clock may be another one
         self._behind: list[_Counted] = []  # what came since that clock may be set back within the window
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
@@ -325,8 +325,8 @@ class LiveEstimator:
                 return refusal
         elif clock.newest is not None and stamp > clock.newest:
             clock.settle(stamp)
-        if sensor is None and self._aside:
-            clock.other, self._aside = [], []
+        if sensor is None and self._set_aside:
+            clock.other, self._set_aside = [], []
         if self._event_log is not None:
             self._event_log.append(*event)
         result = self._take_in_time(event, parsed)
@@ -458,9 +458,9 @@ class LiveEstimator:
             ahead = f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others"
             result = self._refuse(sensor, values, _INVALID, ahead)
         if len(clock.other) == 1 and command:
-            self._aside = []
-        if clock.other and len(self._aside) < _MOST_ASIDE:
-            self._aside.append(_Counted(event._replace(values=dict(values)), result, is_late))
+            self._set_aside = []
+        if clock.other and len(self._set_aside) < _MOST_ASIDE:
+            self._set_aside.append(_Counted(event._replace(values=dict(values)), result, is_late))
         return result
 
     def _forget(self, after: int) -> None:
@@ -480,7 +480,7 @@ class LiveEstimator:
 
     def _start_anew(self, event: _Event, newest: int) -> UpdateResult:
         """A new segment from the events that have shown the commands' clock to be another."""
-        set_aside, self._aside = self._aside, []
+        set_aside, self._set_aside = self._set_aside, []
         first = next(counted.event.stamp for counted in set_aside if counted.event.sensor is None)
         way = "back" if first < newest else "ahead"
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
@@ -517,7 +517,7 @@ class LiveEstimator:
         if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
             frame_start = FrameStart(self.config.frame, self.axes)
             try:
-                frame_start.place(event.stamp, x, y)
+                frame_start.begin(event.stamp, x, y)
             except RunError as error:
                 return self._refuse(None, event.values, _INVALID, str(error))
             early = [earlier for earlier in self._early if earlier.stamp >= oldest]

@@ -39,7 +39,7 @@ class FrameStart:
             self.placed = self.placed or placed_at(self._frame, others["x"], others["y"], "start")
         return in_axes | {axis: value for axis, (value, _) in self.in_axes(others, None).items()}
 
-    def place(self, stamp: int, x: float, y: float) -> None:
+    def begin(self, stamp: int, x: float, y: float) -> None:
         """Start the frame at a command's x and y [m]."""
         assert self._frame is not None
         self.placed, self.since = placed_at(self._frame, x, y, "command"), stamp

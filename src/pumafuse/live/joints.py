@@ -45,7 +45,7 @@ class Joints:
 
     def restart(self) -> None:
         """Begin anew by another clock."""
-        self._given, self._told = list[int](), list[Told]()
+        self._told_at, self._told = list[int](), list[Told]()
 
     def told(self, values: Mapping[str, Any]) -> Told | None:
         """Where an event tells the joints to be; None if it tells of none."""
@@ -76,29 +76,29 @@ class Joints:
         A joint that answers later is told later, on the line from command to command, as
         :meth:`pumafuse.logs.run.Source.delayed` has it.
         """
-        at = bisect_left(self._given, stamp)
-        again = at < len(self._given) and self._given[at] == stamp
-        self._given[at : at + again], self._told[at : at + again] = [stamp], [told]
-        until = self._given[at + 1] + self._latest if at + 1 < len(self._given) else stamp
-        end = max(bisect_left(self._given, until), at + 1) if self._late else at + 1
-        command = {self._given[row]: self._delayed(row) for row in range(at, end)}
-        while len(self._given) > 1 and self._given[1] <= oldest - self._latest:  # one is on the line to the next
-            del self._given[0], self._told[0]
+        at = bisect_left(self._told_at, stamp)
+        again = at < len(self._told_at) and self._told_at[at] == stamp
+        self._told_at[at : at + again], self._told[at : at + again] = [stamp], [told]
+        until = self._told_at[at + 1] + self._latest if at + 1 < len(self._told_at) else stamp
+        end = max(bisect_left(self._told_at, until), at + 1) if self._late else at + 1
+        command = {self._told_at[row]: self._delayed(row) for row in range(at, end)}
+        while len(self._told_at) > 1 and self._told_at[1] <= oldest - self._latest:  # one is on the line to the next
+            del self._told_at[0], self._told[0]
         return command
 
     def _delayed(self, row: int) -> Told:
         """Where a command tells the joints to be, those that are later by what was told before."""
         told = list(self._told[row])
         for joint, by in self._late.items():
-            at = self._given[row] - by
-            before = max(bisect_right(self._given, at) - 1, 0)
-            after = min(before + 1, len(self._given) - 1)
-            share = max(at - self._given[before], 0) / max(self._given[after] - self._given[before], 1)
+            at = self._told_at[row] - by
+            before = max(bisect_right(self._told_at, at) - 1, 0)
+            after = min(before + 1, len(self._told_at) - 1)
+            share = max(at - self._told_at[before], 0) / max(self._told_at[after] - self._told_at[before], 1)
             value = self._told[before][joint]
             told[joint] = value + share * (self._told[after][joint] - value)
         return tuple(told)
 
     def forget(self, after: int) -> None:
         """Take back the commands stamped after an instant [ns]; what came before does not depend on them."""
-        row = bisect_right(self._given, after)
-        del self._given[row:], self._told[row:]
+        row = bisect_right(self._told_at, after)
+        del self._told_at[row:], self._told[row:]

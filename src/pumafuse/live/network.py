@@ -54,7 +54,7 @@ class UdpListener:
     """Lines from datagrams of one or more lines."""
 
     def __init__(self, socket_address: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
-        self._place, self._allowed = socket_address, allowed
+        self._address, self._allowed = socket_address, allowed
         self._notify, self._log = notify, RateLimitedLog(notify)
         self._backlog = Backlog[bytes]("datagrams", self._log)
         self._room = memoryview(bytearray(_LARGEST))  # of the next one: to make it each time scatters memory
@@ -62,10 +62,10 @@ class UdpListener:
 
     def start(self) -> None:
         """Open the socket."""
-        self._socket = socket.socket(self._place[0], socket.SOCK_DGRAM)
+        self._socket = socket.socket(self._address[0], socket.SOCK_DGRAM)
         with contextlib.suppress(OSError):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-        self._name = self._backlog.name = _listen(self._socket, "udp", self._place[1], self._notify)
+        self._name = self._backlog.name = _listen(self._socket, "udp", self._address[1], self._notify)
         self._socket.setblocking(False)
 
     def get(self) -> list[bytes]:
@@ -83,7 +83,7 @@ class UdpListener:
         self._receive(_MOST_LEFT)
         self._lost()  # for the last time
         self._socket.close()
-        return _lines(self._backlog.rest())
+        return _lines(self._backlog.remaining())
 
     def summary(self) -> str:
         """How many came, and how many were lost or refused."""
@@ -163,7 +163,7 @@ def _read_lines(
             some = True
             if whole := lines.cut(piece):
                 put(whole)
-    if remainder := lines.rest():
+    if remainder := lines.remaining():
         put(remainder)
     return some
 
@@ -173,16 +173,16 @@ class TcpListener(_Tcp):
 
     def __init__(self, socket_address: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
         super().__init__(notify)
-        self._place, self._allowed = socket_address, allowed
+        self._address, self._allowed = socket_address, allowed
         self._open, self._silent = set[socket.socket](), dict[socket.socket, None]()
         self._accepted = self._refused = 0
 
     def start(self) -> None:
         """Listen."""
-        self._socket = socket.socket(self._place[0], socket.SOCK_STREAM)
+        self._socket = socket.socket(self._address[0], socket.SOCK_STREAM)
         if os.name == "posix":  # elsewhere two could listen at one port
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._name = _listen(self._socket, "tcp-listen", self._place[1], self._notify)
+        self._name = _listen(self._socket, "tcp-listen", self._address[1], self._notify)
         _in_a_thread(self._accept_all)
 
     def summary(self) -> str:
@@ -234,7 +234,7 @@ class _Client:
 
     def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
         self._name, self._log = address.text, RateLimitedLog(notify)
-        self._place = (address.host, address.port)
+        self._address = (address.host, address.port)
         self._made, self._open = 0, False
         self._stopped = threading.Event()
 
@@ -256,7 +256,7 @@ class _Client:
         wait = _FIRST_WAIT
         while not self._stopped.is_set():
             try:
-                connection = socket.create_connection(self._place, _PATIENCE)
+                connection = socket.create_connection(self._address, _PATIENCE)
             except (OSError, UnicodeError) as error:
                 reason = getattr(error, "strerror", None) or "no answer"
                 self._log.write("unreachable", f"{self._name}: cannot be reached: {reason}; tried again in {wait:g} s")
@@ -317,7 +317,7 @@ class EventClient(_Client):
         """The events that have come and were not given yet; no connection is made any more."""
         self._end()
         with self._came:
-            return self._backlog.rest()
+            return self._backlog.remaining()
 
     def summary(self) -> str:
         """How often the connection was made, how many events came, and how many were lost."""
@@ -438,7 +438,7 @@ class UdpSender:
     """Sender of estimates as datagrams of one line each, whether anybody receives them or not."""
 
     def __init__(self, text: str) -> None:
-        family, self._place = receiver(text)
+        family, self._address = receiver(text)
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._text, self._lost = text, 0
@@ -447,7 +447,7 @@ class UdpSender:
         """Send lines; what the system does not take is counted."""
         for line in lines:
             try:
-                self._socket.sendto(line, self._place)
+                self._socket.sendto(line, self._address)
             except OSError:  # no room, no way there, or too long: the next one may get through
                 self._lost += 1
 

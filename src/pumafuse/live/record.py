@@ -47,7 +47,7 @@ _QUATERNION = ["qx", "qy", "qz", "qw"]  # columns
 class _Row(NamedTuple):
     stamp: int
     sensor: str | None
-    given: list[str]  # axes with a value, and whether it has an orientation and a noise
+    filled: list[str]  # axes with a value, and whether it has an orientation and a noise
     line: bytes
 
 
@@ -76,7 +76,7 @@ class Recorder:
         self._frame, self._start, self._notify = config.frame, dict(start), notify
         self._first = self._folder = folder = folder.absolute()
         self.late = 0  # rows left out, more than 1 s behind an earlier one of their source: no recorded run's may be
-        self.lost = self._given = 0  # rows that the disk refused for too long, and that the writer has got
+        self.lost = self._taken = 0  # rows that the disk refused for too long, and that the writer has got
         self._log = RateLimitedLog(notify)
         self._segment = self._folders = 1
         check_writable(folder, force=False, markers=(), ours=lambda _: False)
@@ -136,8 +136,8 @@ class Recorder:
         """Write what is left; a disk that does not take it within five seconds does not get it."""
         self._flush_until(sure)
         self._writer.close()
-        self.lost += self._given - self._writer.rows
-        self._given = self._writer.rows
+        self.lost += self._taken - self._writer.rows
+        self._taken = self._writer.rows
         with suppress(OSError):  # nothing ever came
             self._first.rmdir()
 
@@ -159,7 +159,7 @@ class Recorder:
     def _state(self) -> str:
         written = self._writer.rows
         parts = [f"{written} rows written"]
-        parts += [f"{self._given - written} wait"] if self._writer.trouble and self._given > written else []
+        parts += [f"{self._taken - written} wait"] if self._writer.trouble and self._taken > written else []
         parts += [f"{self.late} left out, more than 1 s behind their source's newest"] if self.late else []
         parts += [f"{self.lost} lost"] if self.lost else []
         return ", ".join(parts)
@@ -194,10 +194,10 @@ class Recorder:
             if row.stamp < newest - TOLERATED_STEP_BACK_NS:
                 self.late += 1
                 continue
-            if not row.given and row.sensor not in self._seen:  # of no axis yet
+            if not row.filled and row.sensor not in self._seen:  # of no axis yet
                 continue
             self._newest[row.sensor] = max(newest, row.stamp)
-            self._seen.setdefault(row.sensor, set()).update(row.given)
+            self._seen.setdefault(row.sensor, set()).update(row.filled)
             by_source.setdefault(row.sensor, []).append(row.line)
         listed = self._listed | by_source.keys()
         number = sum(map(len, by_source.values()))
@@ -206,7 +206,7 @@ class Recorder:
         elif number:
             rows = {_file(sensor): b"".join(lines) for sensor, lines in by_source.items()}
             if self._writer.hand_over(Job(self._folder, rows, self._manifest(listed), number)):
-                self._given += number
+                self._taken += number
                 self._listed = listed
             else:
                 self.lost += number
@@ -260,7 +260,7 @@ class Writer:
         self._header, self._beside = header, beside
         self._begin(Path())
         self._jobs = queue.SimpleQueue[Job | None]()
-        self._given = self._done = 0  # bytes; each is counted by one thread alone
+        self._taken = self._done = 0  # bytes; each is counted by one thread alone
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._work, name="record", daemon=True)  # a dead disk may hold it
         self._thread.start()
@@ -268,9 +268,9 @@ class Writer:
     def hand_over(self, job: Job) -> bool:
         """Take a job in if there is room for it; whether there was."""
         size = sum(map(len, job.rows.values()))
-        if self._given - self._done + size > _MOST_WAITING:
+        if self._taken - self._done + size > _MOST_WAITING:
             return False
-        self._given += size
+        self._taken += size
         self._jobs.put(job)
         return True
 

@@ -112,7 +112,7 @@ class Ros2Source:
     def stop(self) -> list[Event]:
         """The events that have come and were not given yet."""
         self._receive(time.monotonic())
-        return self._backlog.rest()
+        return self._backlog.remaining()
 
     def close(self) -> None:
         """End the node."""

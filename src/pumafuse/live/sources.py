@@ -37,7 +37,7 @@ def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
         except OSError as error:
             raise RunError(f"standard input: cannot be read: {error.strerror}") from None
         if not piece:
-            yield lines.rest()
+            yield lines.remaining()
             return
         yield lines.cut(piece)
 

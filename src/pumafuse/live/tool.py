@@ -203,25 +203,25 @@ class CommandedTurn:
     def __init__(self, arm: ArmModel) -> None:
         self._axes: list[Record] = turning_axes(arm)
         self._delay = [round(arm.delay_of(axis) * 1e9) for axis in TURNING]
-        self._given: list[int] = []
+        self._told_at: list[int] = []
         self._vector: list[list[float]] = []
         self._motion: list[list[Record]] = []  # of each axis, after each of them
         self._start = [math.nan] * len(TURNING)
 
     def add(self, stamp: int, vector: list[float], oldest: int) -> int | None:
         """Add rx, ry, rz [rad] in the place of what had the same stamp; from when on that turns the tool otherwise."""
-        row = bisect_left(self._given, stamp)
-        again = row < len(self._given) and self._given[row] == stamp
+        row = bisect_left(self._told_at, stamp)
+        again = row < len(self._told_at) and self._told_at[row] == stamp
         if again and self._vector[row] == vector:
             return None
-        self._given[row : row + again], self._vector[row : row + again] = [stamp], [vector]
+        self._told_at[row : row + again], self._vector[row : row + again] = [stamp], [vector]
         if row == 0:
             self._start = vector
         del self._motion[row:]
-        for later in range(row, len(self._given)):
+        for later in range(row, len(self._told_at)):
             self._motion.append([self._after(later, axis) for axis in range(len(TURNING))])
-        if len(self._given) > 2 and self._given[2] <= oldest:  # one acts then, and one may be given anew
-            del self._given[0], self._vector[0], self._motion[0]
+        if len(self._told_at) > 2 and self._told_at[2] <= oldest:  # one acts then, and one may be given anew
+            del self._told_at[0], self._vector[0], self._motion[0]
         return stamp + min(self._delay) if row else ALWAYS
 
     def _after(self, row: int, axis: int) -> Record:
@@ -233,16 +233,16 @@ class CommandedTurn:
     def _commands(self, chosen: slice, axis: int) -> tuple[TimeArray, FloatArray]:
         """Stamps of commands, and an axis relative to where it starts."""
         relative = np.array([vector[axis] - self._start[axis] for vector in self._vector[chosen]])
-        return np.array(self._given[chosen], dtype=np.int64), relative
+        return np.array(self._told_at[chosen], dtype=np.int64), relative
 
     def at(self, time: IntArray) -> FloatArray:
         """rx, ry and rz [rad] at some instants, int64 ns, ascending, (n,) → (n, 3); NaN before any command is known."""
         turned = np.full((len(time), len(TURNING)), np.nan)
-        if not self._given:
+        if not self._told_at:
             return turned
         first, last = int(time[0]), int(time[-1])
         for axis, delay in enumerate(self._delay):
-            row, end = (bisect_right(self._given, instant - delay) for instant in (first, last))
+            row, end = (bisect_right(self._told_at, instant - delay) for instant in (first, last))
             motion = self._motion[row - 1][axis].copy() if row else at_rest()
             moved = follow(self._axes[axis], motion, *self._commands(slice(row, end), axis), time)
             turned[:, axis] = self._start[axis] + moved
@@ -250,11 +250,11 @@ class CommandedTurn:
 
     def forget(self, after: int) -> int | None:
         """Take back the commands stamped after an instant [ns]; from when on the tool is turned otherwise then [ns]."""
-        row = bisect_right(self._given, after)
-        if row == len(self._given):
+        row = bisect_right(self._told_at, after)
+        if row == len(self._told_at):
             return None
-        since = self._given[row] + min(self._delay)
-        del self._given[row:], self._vector[row:], self._motion[row:]
+        since = self._told_at[row] + min(self._delay)
+        del self._told_at[row:], self._vector[row:], self._motion[row:]
         return since if row else ALWAYS
 
 

@@ -50,7 +50,7 @@ class Lines:
             self._torn, self._too_long = b"", True
         return lines
 
-    def rest(self) -> list[bytes]:
+    def remaining(self) -> list[bytes]:
         """The last line, if the stream ended without a line end."""
         left, self._torn = self._torn, b""
         return [left] if left else []

@@ -49,7 +49,7 @@ class Recording:
 
 def read(path: Path, entity: str, fields: Sequence[str] | None) -> Table:
     """An entity, its rows in the order in which they were logged."""
-    place_of_entity, components_seen = _place(entity), dict[str, set[str]]()
+    place_of_entity, components_seen = _path(entity), dict[str, set[str]]()
     with _opened(path, place_of_entity) as opened:
         table = joined(_parts(opened.chunks, place_of_entity, fields, components_seen), f"entity '{place_of_entity}'")
     if table is None:
@@ -87,7 +87,7 @@ def topics(path: Path) -> tuple[Topic, ...]:
 
 def recording_of(path: Path, entity: str, time: str, unit: str) -> Recording:
     """What a result needs to open on top of the Rerun recording that it was made from, by the entity of its stamps."""
-    entity_place = _place(entity)
+    entity_place = _path(entity)
     with _opened(path, entity_place) as opened:
         chunk = next(chunk for name, chunk in opened.chunks if name == entity_place)
     is_timeline = time in chunk.column_names and time not in _components(chunk)
@@ -117,7 +117,7 @@ def _parts(
             yield kept.take(pc.sort_indices(kept[_ROW]))  # a copy: what was dropped leaves the memory
 
 
-def _place(entity: str) -> str:
+def _path(entity: str) -> str:
     return f"/{entity.strip('/')}"
 
 

@@ -104,7 +104,7 @@ def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
     row = max(_longest(late), _longest(off < -0.5))
     clear = min(float(np.abs(np.mean(np.exp(2j * np.pi * off)))), 1.0)
     spread = math.sqrt(-2.0 * math.log(clear)) / (2.0 * math.pi) if clear > 0.0 else math.inf
-    beside = _aside(ticks, late, spread)
+    beside = _commands_aside(ticks, late, spread)
     least = max(_LEAST_CLEAR, 3.0 / math.sqrt(len(off) + 9))  # of stamps without ticks one in e⁹ reaches this
     doubts = {
         f"and more than {_MOST_ASTRAY:.0%} is too many": np.mean(np.abs(off) > 0.5) > _MOST_ASTRAY,
@@ -118,7 +118,7 @@ def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
     return next((words for words, holds in doubts.items() if holds), None)
 
 
-def _aside(ticks: IntArray, late: BoolArray, spread: float) -> float:
+def _commands_aside(ticks: IntArray, late: BoolArray, spread: float) -> float:
     """Expected number of commands a tick aside: by the jitter beside a free tick, or in a queue behind one."""
     free = np.concatenate(([False], np.diff(ticks) > 1))
     order = np.arange(len(ticks))

@@ -716,7 +716,7 @@ def _source(
     stamp, of_time = time.stamps(table)
     values, faults = dict[str, FloatArray](), list[str | None](of_time)
     for axis, columns in axes.items():
-        parts = [_own(table, column) for column in columns]
+        parts = [_numbers(table, column) for column in columns]
         for column in columns:
             kind = column.kind or "length"
             if units.setdefault(axis, kind) != kind:
@@ -754,12 +754,12 @@ def _posed(
             raise RunError(f"{table.path}: no column for joint '{joint}' of the [robot]; there are {', '.join(joints)}")
         if wrong := next((joint.column for joint in joints[joint] if joint.kind not in (kind, None)), None):
             raise RunError(f"{table.path}: column '{wrong}' is no {kind}, which joint '{joint}' moves by")
-        values.append(np.sum([_own(table, joint)[0] for joint in joints[joint]], 0))
+        values.append(np.sum([_numbers(table, joint)[0] for joint in joints[joint]], 0))
     units |= dict.fromkeys(CARTESIAN, "length")
     return source.posed(Joints(chain, np.column_stack(values)))
 
 
-def _own(table: tables.Table, column: manifest.Column) -> tuple[FloatArray, str | None]:
+def _numbers(table: tables.Table, column: manifest.Column) -> tuple[FloatArray, str | None]:
     """The numbers of a column, NaN in rows that are another axis's, and a note; an angle that begins anew goes on."""
     numbers, note = table.numbers(column.column, column.ending)
     chosen = np.where(tables.meets(table, column.where), numbers, np.nan) if column.where else numbers

@@ -103,7 +103,7 @@ def _pieces(
         est = _piece(run, config, chosen, rate, *begun, (after, until))
         span = [(instant - est.origin) / 1e9 for instant in (after, until)]
         yield est, (span[0], span[1]), 1.0 if until == NEVER else log.done / log.rows
-        told_at = [est.segments[0].given(axis)[0] for axis in est.axes]
+        told_at = [est.segments[0].commands_of(axis)[0] for axis in est.axes]
         log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in told_at]))
         after = until
 
@@ -154,7 +154,7 @@ def _piece(
     filtered = filter_piece(segment, core, config, times, span)
     first = span[0] == ALWAYS
     if not first:  # for those who ask where the commands lead: the arm rests at what was commanded before
-        segment = replace(segment, start={axis: float(segment.given(axis)[1][0]) for axis in segment.axes})
+        segment = replace(segment, start={axis: float(segment.commands_of(axis)[1][0]) for axis in segment.axes})
     part = Part(in_place, segment, times, filtered)
     est = estimates_of(run, in_place, placed, config, [part])
     notes = [*clock_faults(in_place, config.arm.update_period, []), *sensor_faults(segment, config)]

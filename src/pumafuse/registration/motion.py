@@ -92,7 +92,7 @@ class Answer:
         self.turns = all(motion.quaternion is not None for motion in command)  # whether the orientation is commanded
         self._time = time
         self._start = [float(motion.time[0]) for motion in command]
-        self._given: list[TimeArray] = [
+        self._told_at: list[TimeArray] = [
             np.round((motion.time - motion.time[0]) * _NS).astype(np.int64) for motion in command
         ]
         self._position = [motion.position for motion in command]
@@ -128,7 +128,7 @@ class Answer:
     def _through(self, levels: Sequence[FloatArray], plant: Plant) -> FloatArray:
         """Three axes of all runs through a plant, (n, 3)."""
         axis, responses = AxisModel(plant=FirstOrder(time_constant=plant.time_constant)), list[FloatArray]()
-        for start, told_at, level, time in zip(self._start, self._given, levels, self._time, strict=True):
+        for start, told_at, level, time in zip(self._start, self._told_at, levels, self._time, strict=True):
             at = np.round((time - plant.delay - start) * _NS).astype(np.int64)
             answers = [
                 first + response(axis, _PERIOD, 0.0, told_at, column, first, at)

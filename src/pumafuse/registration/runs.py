@@ -134,7 +134,7 @@ def register(
     if fixed and config is None:
         raise ConfigError(f"--fix {fixed[0]}: as configured where? Give a configuration (-c)")
     names = _sensors(every, config, sensor)
-    left = [] if sensor else [name for name in _known(every, config) if name not in {*names, *along_base}]
+    left = [] if sensor else [name for name in _sensors_of(every, config) if name not in {*names, *along_base}]
     framed = {name for run in every for name in own_frames(run)} & set(left) if left and config is None else set[str]()
     instead = _AS_CONFIGURED if config else _ALONG_BASE
     notes = [_not_registered(every, name, _LEFT_OUT if name in framed else instead) for name in left]
@@ -247,7 +247,7 @@ def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | Non
                            f" {', '.join(run.command.values) or 'orientations'}")  # fmt: skip
     if config is not None and not set(CARTESIAN) <= config.arm.axes.keys():
         raise ConfigError(f"arm '{config.arm.name}': sensors are registered along axes x, y and z, which it has not")
-    configured = _known(runs, config)
+    configured = _sensors_of(runs, config)
     if sensor is not None and sensor not in configured:
         raise UnknownNameError("--sensor", "sensor", sensor, configured)
     names = [
@@ -259,7 +259,7 @@ def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | Non
     return names
 
 
-def _known(runs: Sequence[Run], config: FusionConfig | None) -> list[str]:
+def _sensors_of(runs: Sequence[Run], config: FusionConfig | None) -> list[str]:
     """The sensors of all runs; of a configuration only those in it."""
     every = dict.fromkeys(name for run in runs for name in run.sensors)
     return [name for name in every if config is None or name in config.sensors]

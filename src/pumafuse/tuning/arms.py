@@ -199,7 +199,7 @@ class Measured:
         self, recordings: Sequence[Recording], period: float, sensors: Sequence[str], model: AxisModel | None = None
     ) -> None:
         """By these ``sensors``, of an axis of update period ``period`` [s], which sags as the ``model`` does."""
-        self.recordings, self.period, self.sensors, self._known = recordings, period, sensors, model
+        self.recordings, self.period, self.sensors, self._model = recordings, period, sensors, model
         self.count = int(sum(recording.weight.sum() for recording in recordings))
         self.range = max(
             (float(np.ptp(recording.value)) for recording in recordings if len(recording.value)), default=0.0
@@ -208,7 +208,7 @@ class Measured:
 
     def of(self, recordings: Sequence[Recording]) -> Measured:
         """Other recordings of the same axis by the same sensors."""
-        return Measured(recordings, self.period, self.sensors, self._known)
+        return Measured(recordings, self.period, self.sensors, self._model)
 
     @cached_property
     def moving(self) -> BoolArray:
@@ -473,7 +473,7 @@ class Measured:
     @property
     def sags(self) -> bool:
         """Whether the axis is known to sag."""
-        return self._known is not None and self._known.sag is not None
+        return self._model is not None and self._model.sag is not None
 
     def _columns(self, recording: Recording) -> FloatArray:
         """The measurements, and for each sensor but the first which are its, (s, m)."""
@@ -499,8 +499,8 @@ class Measured:
         """Arms as the core takes them, (n,)."""
         records, columns = np.zeros(len(arms), AXIS), np.array(arms).T
         delay, lag, damping, recovery, gain, slope, play, max_speed, *sag = columns
-        if self._known is not None:
-            records[:] = record_of(self._known, self.period, 0.0, 0.0)
+        if self._model is not None:
+            records[:] = record_of(self._model, self.period, 0.0, 0.0)
         records["period"], records["delay"] = self.period, delay
         records["time_constant"] = np.where(damping > 0.0, 0.0, lag)
         records["natural_frequency"], records["damping"] = 2.0 * damping / lag, damping

@@ -187,7 +187,7 @@ def _end(view: _View, best: Point, parameter: Parameter, sign: float, drawn: boo
     return _End(value, profiled, is_open, side.curve(end, profiled) if drawn else [])
 
 
-class _Known(NamedTuple):
+class _Maximum(NamedTuple):
     """A point of a profile: its drop, and where the other coordinates are."""
 
     drop: float
@@ -205,7 +205,7 @@ class _Side:
     """
 
     def __init__(self, view: _View, best: Point, parameter: Parameter, sign: float) -> None:
-        self._view, self._best, self._one, self._bound = view, best, parameter, parameter.at_bound(best.config)
+        self._view, self._best, self._parameter, self._bound = view, best, parameter, parameter.at_bound(best.config)
         self._others = [other for other in view.free if other.key != parameter.key]
         self._every = [*view.free, *([] if self._bound is None else [parameter])]
         slope, sd = np.zeros(len(self._others)), 1.0
@@ -217,15 +217,15 @@ class _Side:
         self._slope = self._unit * slope
         self._vanishing = self._bound is not None and parameter.vanishes
         self._range = np.array([other.range for other in self._others]).reshape(-1, 2).T
-        self._known = {0.0: _Known(0.0, coordinates(best.config, self._others))}  # by distance
+        self._maxima = {0.0: _Maximum(0.0, coordinates(best.config, self._others))}  # by distance
         self._top = view.top + (0.0 if self._bound is None else parameter.log_prior(best.config))
         self.limit = self._distance(parameter.bounds[0 if sign < 0.0 else 1])
 
     def value(self, distance: float) -> float:
         """The parameter at a distance [SI]."""
         if self._vanishing:
-            return self._one.bounds[0] + distance
-        return self._one.value(self._start + distance * self._unit)
+            return self._parameter.bounds[0] + distance
+        return self._parameter.value(self._start + distance * self._unit)
 
     def end(self) -> tuple[float, bool]:
         """The distance at which the profile has dropped by 1.92, or the limit; whether it is from the profile."""
@@ -258,33 +258,33 @@ class _Side:
         distance = next(
             (
                 distance_before
-                for distance_before in self._known
+                for distance_before in self._maxima
                 if math.isclose(distance_before, distance, rel_tol=_SAME)
             ),
             distance,
         )
-        if distance not in self._known:
-            inner = max(distance_before for distance_before in self._known if distance_before < distance)
+        if distance not in self._maxima:
+            inner = max(distance_before for distance_before in self._maxima if distance_before < distance)
             maximum = self._maximum(distance, self._expected(distance))
             if _root(maximum.drop) > _FALLEN * Z95:  # another maximum, perhaps: the one inside goes on
-                beside = self._maximum(distance, self._known[inner].others)
+                beside = self._maximum(distance, self._maxima[inner].others)
                 maximum = min(maximum, beside, key=lambda point: point.drop)
-            self._known[distance] = maximum
-        return _root(self._known[distance].drop)
+            self._maxima[distance] = maximum
+        return _root(self._maxima[distance].drop)
 
     def _may_be_none(self, distance: float) -> bool:
         """Whether a noise that has not dropped at a distance may be 0: on the way there its profile hardly changes."""
-        if not self._one.vanishes or self._unit > 0.0:
+        if not self._parameter.vanishes or self._unit > 0.0:
             return False
-        maximum = self._maximum(self.limit, self._known[distance].others)
+        maximum = self._maximum(self.limit, self._maxima[distance].others)
         if may_be := _root(maximum.drop) < Z95:
-            self._known[self.limit] = maximum
+            self._maxima[self.limit] = maximum
         return may_be
 
     def curve(self, end: float, profiled: bool) -> list[tuple[float, float]]:
         """Points of the profile to one and a half times the end: values [SI] and what the likelihood drops by."""
         middle, value = self.value(0.0), self.value(end)
-        if self._one.log and min(middle, value) > _NEXT_TO_NONE * max(middle, value) and not self._vanishing:
+        if self._parameter.log and min(middle, value) > _NEXT_TO_NONE * max(middle, value) and not self._vanishing:
             places = [share * end for share in _SHARES]
         else:
             places = [self._distance(middle + share * (value - middle)) for share in _SHARES]
@@ -292,18 +292,18 @@ class _Side:
         if profiled:
             for distance in places:
                 self.root(distance)
-            drops = {distance: point.drop for distance, point in self._known.items() if 0.0 < distance <= max(places)}
+            drops = {distance: point.drop for distance, point in self._maxima.items() if 0.0 < distance <= max(places)}
         else:
             drops = {distance: self._drop(distance) for distance in places}
-        return [(self._one.clipped(self.value(at)), -drop) for at, drop in drops.items()]
+        return [(self._parameter.clipped(self.value(at)), -drop) for at, drop in drops.items()]
 
     def _distance(self, value: float) -> float:
-        low, high = self._one.bounds
+        low, high = self._parameter.bounds
         if self._vanishing:
             return value - low
         if not low <= value <= high:
             return np.inf
-        return (self._one.coordinate(value) - self._start) / self._unit
+        return (self._parameter.coordinate(value) - self._start) / self._unit
 
     def _missing(self, distance: float) -> float:
         """The root at a distance less 1.96; 0 where that is next to none."""
@@ -313,25 +313,25 @@ class _Side:
     def _expected(self, distance: float) -> FloatArray:
         """The other coordinates at a distance by those that are known: between two, or onwards from the last."""
         inner, outer = (
-            [distance_before for distance_before in sorted(self._known) if (distance_before > distance) == beyond]
+            [distance_before for distance_before in sorted(self._maxima) if (distance_before > distance) == beyond]
             for beyond in (False, True)
         )
-        last, at = inner[-1], self._known[inner[-1]].others
+        last, at = inner[-1], self._maxima[inner[-1]].others
         if outer:
-            return at + (distance - last) / (outer[0] - last) * (self._known[outer[0]].others - at)
-        slope = self._slope if last == 0.0 else (at - self._known[0.0].others) / last
+            return at + (distance - last) / (outer[0] - last) * (self._maxima[outer[0]].others - at)
+        slope = self._slope if last == 0.0 else (at - self._maxima[0.0].others) / last
         return at + (distance - last) * slope
 
     def _along(self, distance: float, others: FloatArray) -> FusionConfig:
-        config = self._one.put(self._best.config, self._one.clipped(self.value(distance)))
+        config = self._parameter.put(self._best.config, self._parameter.clipped(self.value(distance)))
         return moved(config, self._others, np.clip(others, *self._range))
 
     def _drop(self, distance: float) -> float:
         """What the likelihood drops by with the others where they are expected."""
-        config = self._along(distance, self._known[0.0].others + distance * self._slope)
+        config = self._along(distance, self._maxima[0.0].others + distance * self._slope)
         return self._top - point(self._view.likelihood, config, self._every, self._view.outcomes).log_posterior
 
-    def _maximum(self, distance: float, others: FloatArray) -> _Known:
+    def _maximum(self, distance: float, others: FloatArray) -> _Maximum:
         """The maximum next to these other coordinates."""
         peak = maximise(
             self._view.likelihood,
@@ -341,8 +341,8 @@ class _Side:
             tolerance=_TOLERANCE,
             worth=self._top - _FAR_BELOW,
         )
-        drop = self._top - peak.log_posterior - self._one.log_prior(peak.config)
-        return _Known(drop, coordinates(peak.config, self._others))
+        drop = self._top - peak.log_posterior - self._parameter.log_prior(peak.config)
+        return _Maximum(drop, coordinates(peak.config, self._others))
 
 
 def _root(drop: float) -> float:

@@ -163,7 +163,7 @@ class Likelihood:
             _Part(number, self.axes.index(axis), segment.of_axis(axis, rows), rows, column)
             for number, segment in enumerate(self._segments)
             for column, axis in enumerate(segment.axes)
-            if len(rows := np.flatnonzero(segment.measurement_rows.known[:, column] == Outcome.FUSED))
+            if len(rows := np.flatnonzero(segment.measurement_rows.codes[:, column] == Outcome.FUSED))
         ]
         self.count = np.zeros(len(self.axes), dtype=np.int64)
         measured: dict[str, set[str]] = {}
@@ -186,7 +186,7 @@ class Likelihood:
                     parts.append((time, value, np.full(len(time), names.index(name))))
             if parts:
                 time, value, source = (np.concatenate(column) for column in zip(*parts, strict=True))
-                every = Recording(*segment.given(axis), start, time, value, source, np.ones(len(time)))
+                every = Recording(*segment.commands_of(axis), start, time, value, source, np.ones(len(time)))
                 recordings.append(every.of(np.argsort(time, kind="stable")))
         return Measured(recordings, config.arm.update_period, names, config.arm.axes[axis])
 
@@ -244,7 +244,7 @@ class Likelihood:
         travel = dict.fromkeys(self.axes, 0.0)
         for segment in self._segments:
             for axis in segment.axes:
-                reached = float(np.ptp(np.append(segment.given(axis)[1], segment.start[axis])))
+                reached = float(np.ptp(np.append(segment.commands_of(axis)[1], segment.start[axis])))
                 travel[axis] = max(travel[axis], reached)
         return travel
 
@@ -395,6 +395,6 @@ def _decided(segment: Segment, until: float | None, latest: float | None) -> Seg
         chosen &= rows.time <= segment.origin + round(until * 1e9)
     if latest is not None:
         chosen &= rows.stamp - round(latest * 1e9) >= segment.origin
-    decisions = np.where((rows.known == Outcome.FUSED) & chosen[:, None], rows.known, ABSENT).astype(np.uint8)
+    decisions = np.where((rows.codes == Outcome.FUSED) & chosen[:, None], rows.codes, ABSENT).astype(np.uint8)
     kept = np.flatnonzero((decisions != ABSENT).any(axis=1))
-    return replace(segment, measurement_rows=rows._replace(known=decisions).rows(kept))
+    return replace(segment, measurement_rows=rows._replace(codes=decisions).rows(kept))

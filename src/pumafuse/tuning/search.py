@@ -67,7 +67,7 @@ class Search:
         # for the order of the plant of an axis, its gain, its disturbance and whether it shares a delay
         self.reasons: dict[str, list[str]] = {axis: [] for axis in likelihood.sensors}
 
-    def found(self, config: FusionConfig, one_delay: bool) -> tuple[Point, dict[str, str]]:
+    def best(self, config: FusionConfig, one_delay: bool) -> tuple[Point, dict[str, str]]:
         """The best point from a configuration as given, and the reasons by axis.
 
         With ``one_delay`` all axes whose delay is free share one whatever the measurements say.
@@ -92,7 +92,7 @@ class Search:
                 why.append("its plant rings: what holds the tool off is a disturbance, not noise that shakes the plant")
         return best, {axis: "; ".join(why) for axis, why in self.reasons.items() if why}
 
-    def _own(self, config: FusionConfig) -> list[Parameter]:
+    def _of_axes(self, config: FusionConfig) -> list[Parameter]:
         """The free parameters that belong to an axis."""
         return [parameter for parameter in self.free(config) if parameter.axis is not None]
 
@@ -158,7 +158,7 @@ class Search:
         for axis in calm:
             model = with_disturbance(model, axis, self.arms[axis].spread, _SLOW)
         disturbed = self._maximum(model, axes=calm).config
-        return [point(self.likelihood, disturbed, self._own(disturbed))]
+        return [point(self.likelihood, disturbed, self._of_axes(disturbed))]
 
     def _with_free_noise(self, config: FusionConfig, model: FusionConfig) -> FusionConfig:
         """The configuration with the noises of a model that are free."""
@@ -220,7 +220,7 @@ class Search:
 
     def _from_wider_gates(self, config: FusionConfig) -> FusionConfig:
         """The higher maximum of each axis, this one or that reached by way of wider gates, where any are rejected."""
-        best = point(self.likelihood, config, self._own(config))
+        best = point(self.likelihood, config, self._of_axes(config))
         if not self.likelihood.rejecting(best.results):
             return config
         peaks = [best, self._maximum(config, _WIDER)]
@@ -286,7 +286,7 @@ class Search:
             if without == config:
                 continue
             peaks = [point(self.likelihood, config, self.free(config))]
-            peaks.append(maximise_by_axis(self.likelihood, without, self._own(without), self.notify, _ROUGHLY))
+            peaks.append(maximise_by_axis(self.likelihood, without, self._of_axes(without), self.notify, _ROUGHLY))
             scores = [_penalised(self.likelihood, peak, self.free(peak.config), of_noise=2.0) for peak in peaks]
             config = _best_by_axis(self.likelihood, peaks, scores)
         return config

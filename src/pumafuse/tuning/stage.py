@@ -116,7 +116,7 @@ def run_stage(
         believed |= {
             (name, axis): noise for axis, search in arms.items() for name, noise in search.likely_noise.items()
         }
-    best, orders = Search(likelihood, free, arms, notify).found(start, plan.one_delay)
+    best, orders = Search(likelihood, free, arms, notify).best(start, plan.one_delay)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:

@@ -268,7 +268,7 @@ class Pipeline:
     ) -> None:
         """``searched``: of each stage, the arms of axes that were searched for already."""
         self.runs, self.config, self.plans, self.progress = runs, config, plans, progress
-        self._known = searched or [{} for _ in plans]
+        self._searched = searched or [{} for _ in plans]
         self.whole = likelihood_of(runs, config, plans[-1])  # of all measurements
         self.best = config  # so far, with the gates of the search and all digits
         self.stages: list[Stage] = []  # that are complete; none where the configuration as given is the result
@@ -286,7 +286,7 @@ class Pipeline:
             self.best, self.stages = point.config, stages
             self.progress("searching", point.log_likelihood)
 
-        for plan, searched in zip(self.plans, self._known, strict=True):
+        for plan, searched in zip(self.plans, self._searched, strict=True):
             stages.append(run_stage(self.runs, config, plan, notify, searched))
             config = stages[-1].best.config
         if not any(stage.free for stage in stages):

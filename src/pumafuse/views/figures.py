@@ -327,7 +327,9 @@ def _reach(values: FloatArray) -> float:
 
 
 def _commands(axes: Axes, est: Estimates, name: str) -> None:
-    told = [(seconds(time, est.origin), value) for time, value in (segment.given(name) for segment in est.segments)]
+    told = [
+        (seconds(time, est.origin), value) for time, value in (segment.commands_of(name) for segment in est.segments)
+    ]
     time, value = (np.concatenate(part) for part in zip(*told, strict=True))
     scale = est.config.arm.screen_of(name).scale
     axes.step(time, value * scale, where="post", color=colours.COMMAND, lw=1, label="command")

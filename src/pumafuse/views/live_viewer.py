@@ -49,7 +49,7 @@ class Viewer:
 
     def __init__(self, header: Header, report: Callable[[str], None]) -> None:
         """Start a viewer or a server, unless one is there; on free ports where the usual ones are taken."""
-        self._own: subprocess.Popen[bytes] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
         self._mode, self._report, self._opened = header.mode, report, False
         port = header.port if self._mode == "connect" else _free(0 if self._mode == "web" else header.port)
         self._awaited = [port]
@@ -57,17 +57,17 @@ class Viewer:
             self._web_port, self._data_port = _free(header.web_port), _free(header.port)
             self._awaited.append(_free(0))
         if self._mode != "connect":
-            self._own = _start(_arguments(self._mode, *self._awaited), keep=self._mode == "spawn")
+            self._process = _start(_arguments(self._mode, *self._awaited), keep=self._mode == "spawn")
         self.url = _url(port)
 
     def wait(self) -> bool:
         """Wait until the viewer listens, and report where it is; whether it ever will."""
         begin, reported = time.monotonic(), False
         while not all(map(_listens, self._awaited)):
-            if self._own is None and not reported:
+            if self._process is None and not reported:
                 self._report(f"Rerun: no viewer listens at {self.url}; it is drawn into as soon as one does")
                 reported = True
-            elif self._own and (self._own.poll() is not None or time.monotonic() - begin > _OPENED_WITHIN):
+            elif self._process and (self._process.poll() is not None or time.monotonic() - begin > _OPENED_WITHIN):
                 screen = "; is there a screen? --rerun web needs none" if self._mode == "spawn" else ""
                 why = "was closed" if self._opened else f"cannot be started{screen}"
                 self._report(f"Rerun: the viewer {why}; nothing is drawn")
@@ -79,18 +79,18 @@ class Viewer:
             for server in (_guard(self._web_port, page, policy), _guard(self._data_port, data)):
                 threading.Thread(target=server.serve_forever, daemon=True).start()
             self._report(f"Rerun: open http://{HOST}:{self._web_port}/?url={quote(_url(self._data_port), safe='')}")
-        elif self._own is None or not self._opened:
+        elif self._process is None or not self._opened:
             self._report(f"Rerun: drawing into the viewer at {self.url}")
         self._opened = True
         return True
 
     def end(self) -> None:
         """End a server started here; a viewer's window stays open."""
-        if self._own is not None and self._mode == "web":
-            self._own.terminate()
+        if self._process is not None and self._mode == "web":
+            self._process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._own.wait(0.3)
-            self._own.kill()
+                self._process.wait(0.3)
+            self._process.kill()
 
 
 def _url(port: int) -> str:
