@@ -294,7 +294,7 @@ class Both:
         self.stream.end()
 
     def end(self) -> None:
-        self.stream.take(self.lines.rest())
+        self.stream.take(self.lines.remaining())
         self.stream.end()
 
     def keep(self, lines: list[bytes]) -> None:

@@ -48,7 +48,7 @@ def sketch(name: str, undecided: UndecidedError, folder: Path) -> str:
     streams = [stream for part in clocked for stream in streams_of(part) or [Stream(part.stem, None, "", part, {})]]
     if len(streams) == 1:  # of a table that holds both, each column may be either
         for table in (["command"], ["sensors", "measured"]):
-            lines += [*_source(table, streams[0], folder), *(f"# {line}" for line in _columns(streams[0]))]
+            lines += [*_location(table, streams[0], folder), *(f"# {line}" for line in _columns(streams[0]))]
     else:
         for stream in streams:
             lines += ["", *(f"# {line}" for line in _source(["sensors", stream.name], stream, folder)[1:])]
