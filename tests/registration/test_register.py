@@ -32,11 +32,10 @@ def same_branch(vector: np.ndarray, near: tuple[float, ...]) -> np.ndarray:
 def test_a_set_up_is_found(orientation: bool) -> None:
     """Frames and markers anywhere: rotation to 0.05 degrees, marker to 0.3 mm, lag to 0.3 ms, from a bad start on.
 
-    The lag of turning is that of its own, to 0.5 ms, also where only a marker beside the tool point tells it.
     From a short time constant on the search of the last one would be stuck among the steps of held commands.
     """
     for seed in (0, 1, 2, 51):
-        setup = Setup(seed, orientation=orientation, seconds=20.0)
+        setup = Setup(seed, orientation=orientation, shared=not orientation, seconds=20.0)
         found = registered(*([one] for one in setup.run()))
         assert found.findings == ()
         assert found.frame is not None and found.marker is not None and found.position is not None
@@ -44,10 +43,12 @@ def test_a_set_up_is_found(orientation: bool) -> None:
         np.testing.assert_allclose(found.frame.at, setup.at, atol=3e-3)
         np.testing.assert_allclose(found.marker.at, setup.marker, atol=3e-4)
         assert found.position.lag.value == pytest.approx(setup.lags[0], abs=3e-4)
-        assert found.rotation is not None
-        assert found.rotation.lag.value == pytest.approx(setup.lags[1], abs=5e-4)
         if orientation:
+            assert found.rotation is not None
             assert degrees(found.marker, setup.turn) < 0.05
+            assert found.rotation.lag.value == pytest.approx(setup.lags[1], abs=5e-4)
+        else:
+            assert found.rotation is None
 
 
 @pytest.mark.long
@@ -60,30 +61,29 @@ def test_intervals_hold(orientation: bool) -> None:
     """
     inside: dict[str, list[bool]] = {}
     for seed in range(0 if orientation else 100, 100 if orientation else 200):
-        setup = Setup(seed, orientation=orientation)
+        setup = Setup(seed, orientation=orientation, shared=not orientation)
         found = registered(*([one] for one in setup.run()))
-        assert found.frame is not None and found.marker is not None
-        assert found.position is not None and found.rotation is not None
+        assert found.frame is not None and found.marker is not None and found.position is not None
         assert abs(found.position.lag.value - setup.lags[0]) < 3e-4
         numbers = {
             "at": (setup.at, found.frame.at_ci95),
             "rotation": (same_branch(setup.frame.as_rotvec(), found.frame.rotation), found.frame.rotation_ci95),
             "marker": (setup.marker, found.marker.at_ci95),
-            "lag": (setup.lags, [found.position.lag.ci95, found.rotation.lag.ci95]),
+            "lag": ([setup.lags[0]], [found.position.lag.ci95]),
         }
         if orientation:
+            assert found.rotation is not None
             turn = same_branch(setup.turn.as_rotvec(), found.marker.rotation)
             numbers["marker's rotation"] = turn, found.marker.rotation_ci95
+            numbers["lag"][0].append(setup.lags[1])
+            numbers["lag"][1].append(found.rotation.lag.ci95)
         for kind, (true, between) in numbers.items():
             inside.setdefault(kind, []).extend(
                 low <= one <= high for one, (low, high) in zip(true, between, strict=True)
             )
     shares = {kind: float(np.mean(one)) for kind, one in inside.items()}
     chance = {kind: 3.0 * np.sqrt(0.95 * 0.05 / len(one)) for kind, one in inside.items()}
-    outside = {kind: share for kind, share in shares.items() if abs(share - 0.95) > chance[kind]}
-    if not orientation and outside.keys() == {"marker"}:
-        pytest.xfail(f"where a marker's lever tells when the tool turns, its intervals hold in {outside['marker']:.0%}")
-    assert outside == {}
+    assert {kind: share for kind, share in shares.items() if abs(share - 0.95) > chance[kind]} == {}
 
 
 @pytest.mark.long
@@ -197,7 +197,7 @@ def test_what_a_motion_does_not_tell_is_named(finding: Finding) -> None:
     """Each in all of 8 set-ups, with and without orientations."""
     for seed in range(8):
         of = MOTIONS.get(finding, lambda _: {"seconds": 20.0})(seed)
-        found = made(finding, seed, orientation=seed % 2 == 0, **of)
+        found = made(finding, seed, orientation=seed % 2 == 0, shared=seed % 2 == 1, **of)
         assert finding in [one.finding for one in found.findings], seed
 
 
@@ -300,14 +300,11 @@ def test_positions_that_are_turned_without_the_attitude_are_named() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("orientation", [True, False])
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("share", [0.0, 0.01])
 def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: bool) -> None:
-    """What is seen goes far and the tool point by 0, 1 or 12 mm: no lengths are of another unit, and all is found.
-
-    Of the last it is told when the tool moves, too, which is not when it turns.
-    """
+    """What is seen goes far and the tool point by 0 or 1 mm: no lengths are of another unit, and all is found."""
     for seed in range(5):
-        setup = Setup(seed, directions=share * np.eye(3), orientation=orientation, shared=share < 0.1)
+        setup = Setup(seed, directions=share * np.eye(3), orientation=orientation, shared=True)
         found = registered(*([one] for one in setup.run()))
         assert found.frame is not None and found.marker is not None and found.position is not None, seed
         assert Finding.SCALE not in [one.finding for one in found.findings]
@@ -321,7 +318,7 @@ def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: boo
 def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None:
     """Of an arm that errs by 0.5 mm and 0.2 degrees; not one that is turned by a degree, or stands 5 mm beside it."""
     for turn, move in ((0.0, 0.0), (1.0, 0.0), (0.0, 5e-3)):
-        setup = Setup(6, seconds=20.0, orientation=orientation, wrong=1.0)
+        setup = Setup(6, seconds=20.0, orientation=orientation, shared=not orientation, wrong=1.0)
         setup.frame = Rotation.from_rotvec([0.0, 0.0, turn], degrees=True)
         setup.marker = np.zeros(3)
         middle = np.array([0.5, -0.2, 0.4])  # of what it sees, about which the sensor is turned: that stays in place

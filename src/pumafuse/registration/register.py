@@ -36,7 +36,6 @@ _ODD = 0.025  # likewise, where lengths differ by what is no unit
 _ANOTHER = 3.0  # times as far as commanded: another unit
 _UNEXPLAINED = 0.05  # likewise, beyond its noise: arms leave 1 % of a motion, a tool that turns untold 10
 _LOOSELY = 0.2  # likewise, where joints lag apart by as much as a whole lag
-_SURE = 0.03  # s, of half the interval of the lag of turning: a marker's lever tells it, or it is that of positions
 _AS_IT_IS = np.eye(3)
 _AROUND = Rotation.create_group("T").as_matrix()  # all around, 60 degrees apart at most from the next
 _TURNS = np.radians(0.5)  # of the tool, root mean square: arms err by as much in orientation
@@ -311,15 +310,11 @@ def _coarse(
     turn = Rotation.from_rotvec(marker.rotation).as_matrix()
     markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
     begin = State(first @ rotation, path.mean(axis=0), at, turn, scale, plant, plant)
-    held, free = (
-        _free(np.eye(3), markers, turn=False, scale=is_free, own_lag=is_free and markers.size > 0)
-        for is_free in (False, moves)
-    )
+    held, free = (_free(np.eye(3), markers, turn=False, scale=is_free, own_lag=False) for is_free in (False, moves))
     nearer = fitted(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
     again = _plant(nearer.position.lag)
     both = (fitted(rows, start, free) for start in (begin, nearer._replace(position=again, angle=again)))
-    best = min(both, key=lambda fit: fit.left() / fit.state.scale)
-    return best._replace(state=best.state._replace(angle=best.state.position))  # few rows may not tell that of turning
+    return min(both, key=lambda fit: fit.left() / fit.state.scale)
 
 
 def _plant(lag: float) -> Plant:
@@ -467,11 +462,9 @@ def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     elif begin.either and not (begin.attitude and told.shape[1]):
         findings.append(Found(finding=Finding.PLANE))
     moves = bool(np.std(poses.position, axis=0).max() > _BESIDE)
-    allowed = partial(_free, held, told, turn=begin.attitude and not fix_marker, scale=False)
-    own_lag = rows.answer.turns and len(told.T) > 0 and moves  # else nothing tells the lag of positions
-    fit = fitted(rows, state, allowed(own_lag=own_lag))
-    if own_lag and not begin.attitude and fit.half_widths(_numbers(fit.state, begin.mean)[1])[15] > _SURE:
-        own_lag, fit = False, fitted(rows, state, allowed(own_lag=False))
+    own_lag = begin.attitude and len(told.T) > 0 and moves  # else nothing tells the lag of positions
+    turn = begin.attitude and not fix_marker
+    fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own_lag=own_lag))
     spread = float(np.std(rows.centred))
     odd = any(finding.finding is Finding.SCALE and not finding.unit for finding in findings)
     most = (_LOOSELY if loosely else _ODD if odd else _UNEXPLAINED) * spread

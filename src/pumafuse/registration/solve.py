@@ -3,8 +3,7 @@
 A row is off by e = p + R m − c − s S (z − z̄) [m] and, where the sensor tells an orientation, by the rotation that
 takes S R_sensor Qᵀ to R [rad]; p, R are the arm's response, z and R_sensor what is measured, S the frame's rotation,
 m the marker's place, Q its rotation, c where the mean z̄ of what is measured lies, s a scale. A row counts as
-Cauchy's distribution would have it, by how far it is off for the direction: an arm errs along its path more than across
-it, and what it errs little in tells the more.
+Cauchy's distribution would have it, by how far it is off as a whole: no axes are preferred.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ SIZE = 17
 CAUCHY = 3.0  # standard deviations from which a row counts half
 MEDIAN = 1.5382  # of the length of three standard normal deviates
 _LEAST = 1e-9  # m or rad: rounding
-_ROUNDS, _EVEN = 5, 0.2  # of a covariance; how much of it is the same in all directions: sensors are noisy in each
 _STEPS = 50  # at most
 _HALVED = 6  # times that a step which leads up is halved
 _ENOUGH = 1e-8  # of the sum per row: a step that gains less is the last
@@ -83,20 +81,16 @@ class Off(NamedTuple):
         """The standard deviation of each block, by the median."""
         return np.array([max(median(_length(block)) / MEDIAN, _LEAST) for block in self.blocks])
 
-    def whitening(self) -> list[FloatArray]:
-        """By what to multiply each block for standard deviations of 1 along all directions, (3, 3)."""
-        return [_whitening(block) for block in self.blocks]
-
     def rms(self) -> list[float]:
         """Of each block, over rows that are within ten medians."""
         lengths = [_length(block) for block in self.blocks]
         kept = [length[length <= 10.0 * median(length) + _LEAST] for length in lengths]
         return [float(np.sqrt(np.mean(length**2))) for length in kept]
 
-    def cost(self, whitening: Sequence[FloatArray]) -> float:
+    def cost(self, noise: FloatArray) -> float:
         """Cauchy's sum."""
-        white = [block @ by for block, by in zip(self.blocks, whitening, strict=True)]
-        return float(sum(np.log1p((_length(block) / CAUCHY) ** 2).sum() for block in white))
+        pairs = zip(self.blocks, noise.tolist(), strict=True)
+        return float(sum(np.log1p((_length(lengths) / (CAUCHY * sd)) ** 2).sum() for lengths, sd in pairs))
 
 
 class Fit(NamedTuple):
@@ -120,16 +114,16 @@ def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
     """The robust least squares from a start; the steps that are allowed are columns, (17, k)."""
     off = residual(rows, state)
     for _ in range(_STEPS):
-        whitening = off.whitening()
-        told = _normal(rows, state, off, whitening, free, expected=False)
+        noise = off.noise()
+        told = _normal(rows, state, off, noise, free, expected=False)
         step = told.step()
         if -(told.score.sum(axis=0) @ step) < _ENOUGH * len(rows.centred):
             break
-        better = _better(rows, state, free @ step, off.cost(whitening), whitening)
+        better = _better(rows, state, free @ step, off.cost(noise), noise)
         if better is None:
             break
         state, off = better
-    return Fit(state, off, free, _normal(rows, state, off, off.whitening(), free, expected=True))
+    return Fit(state, off, free, _normal(rows, state, off, off.noise(), free, expected=True))
 
 
 def residual(rows: Rows, state: State) -> Off:
@@ -143,39 +137,33 @@ def residual(rows: Rows, state: State) -> Off:
     return Off(blocks, poses)
 
 
-def _better(
-    rows: Rows, state: State, step: FloatArray, cost: float, whitening: Sequence[FloatArray]
-) -> tuple[State, Off] | None:
+def _better(rows: Rows, state: State, step: FloatArray, cost: float, noise: FloatArray) -> tuple[State, Off] | None:
     """After a step, halved until it leads down; None where it does not."""
     for _ in range(_HALVED):
         moved = state.moved(step)
         off = residual(rows, moved)
-        if off.cost(whitening) < cost:
+        if off.cost(noise) < cost:
             return moved, off
         step = 0.5 * step
     return None
 
 
-def _normal(
-    rows: Rows, state: State, off: Off, whitening: Sequence[FloatArray], free: FloatArray, *, expected: bool
-) -> Blocks:
+def _normal(rows: Rows, state: State, off: Off, noise: FloatArray, free: FloatArray, *, expected: bool) -> Blocks:
     """The information of the free steps and the slope of half the sum, of each block of rows."""
-    return tell([slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, whitening, expected=expected)
+    return tell([slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, noise, expected=expected)
 
 
-def tell(
-    slope: Sequence[FloatArray], off: Sequence[FloatArray], whitening: Sequence[FloatArray], *, expected: bool
-) -> Blocks:
+def tell(slope: Sequence[FloatArray], off: Sequence[FloatArray], noise: FloatArray, *, expected: bool) -> Blocks:
     """What rows tell of a step that are so far off and change so with it, positions and orientations together.
 
     The information is that of Cauchy's curvature where it is the ``expected`` one, of which intervals are made; else
     the larger one of Gauss and Newton, which leads down more safely.
     """
     parts = list[Blocks]()
-    for inner, residual, by in zip(slope, off, whitening, strict=True):
-        white = residual @ by
-        weight = weights(_length(white), 1.0)
-        parts.append(blocks(by @ inner, white, curvature(weight) if expected else weight, weight))
+    for inner, residual, sd in zip(slope, off, noise.tolist(), strict=True):
+        weight = weights(_length(residual), sd)
+        told = curvature(weight) if expected else weight
+        parts.append(blocks(inner, residual, told / sd**2, weight / sd**2))
     return Blocks(*(np.sum(blocks, axis=0) for blocks in zip(*parts, strict=True)))
 
 
@@ -208,21 +196,6 @@ def slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
     angle[:, :, TURN] = state.rotation @ rows.turned @ state.turn.T
     angle[:, :, ANGLE] = np.stack(turned, axis=-1)
     return [jacobian, angle]
-
-
-def _whitening(block: FloatArray) -> FloatArray:
-    """The inverse root of the covariance of a block, by Tyler's estimator with shrinkage (Chen, Wiesel and Hero 2011).
-
-    It heeds directions alone, so that outliers count as other rows do; the size is that of the median.
-    """
-    root = np.eye(3)
-    for _ in range(_ROUNDS):
-        direction = block / (_length(block @ root) + _LEAST)[:, None]
-        shape = direction.T @ direction
-        shape *= (1.0 - _EVEN) / max(float(np.trace(shape)), 1e-300)
-        square, axes = np.linalg.eigh(shape + _EVEN / 3.0 * np.eye(3))
-        root = axes / np.sqrt(square) @ axes.T
-    return root / max(median(_length(block @ root)) / MEDIAN, _LEAST)
 
 
 def _length(vectors: FloatArray) -> FloatArray:
