@@ -68,6 +68,15 @@ def test_an_axis_that_a_stop_holds_off_is_not_early(stop: float) -> None:
     assert early is not None and early.lag == pytest.approx(-0.1, abs=0.01)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_curve_that_explains_no_more_is_not_believed(seed: int) -> None:
+    """One slow stroke by a clock that is 0.1 s ahead: with another curve any lag explains it, and it stays early."""
+    t, s = np.arange(0.0, 6.0, 0.005), np.arange(0.2, 5.7, 0.027)
+    z = 0.5 * (1.0 - np.cos(np.pi * (s + 0.1) / 6.0)) + np.random.default_rng(seed).normal(scale=0.01, size=len(s))
+    found = following((stamped(t), 0.5 * (1.0 - np.cos(np.pi * t / 6.0))), (stamped(s), z), is_moved=True)
+    assert found is not None and found.lag == pytest.approx(-0.1, abs=0.05)
+
+
 def test_an_axis_that_goes_a_quarter_as_far_has_the_zero_of_its_commands() -> None:
     """It begins where they do; three quarters of the motion are no offset."""
     t = np.arange(0.0, 40.0, 0.02)

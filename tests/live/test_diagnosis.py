@@ -350,6 +350,17 @@ def test_the_shipped_scan_says_nothing() -> None:
     assert notices == [] and live.health().faults == ()
 
 
+def test_error_bars_that_are_too_wide_are_no_fault_of_a_stream() -> None:
+    """The arm strays ten times less than the configuration has it: `fuse` of a log names it, a stream does not."""
+    run, config = tracked()
+    process = {
+        axis: msgspec.structs.replace(one, drift=10.0 * one.drift, input_noise=10.0 * one.input_noise)
+        for axis, one in config.process.items()
+    }
+    notices, _ = said(run, msgspec.structs.replace(config, process=process))
+    assert not notices
+
+
 @pytest.mark.long
 def test_hours_of_a_good_stream_say_nothing() -> None:
     """Eight hours of stamps: a tracker of 10 Hz, a camera of 4, a lag that the model has, noise as configured.

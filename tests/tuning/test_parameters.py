@@ -216,3 +216,12 @@ def test_an_axis_is_copied_with_all_its_numbers() -> None:
     for key in names():
         assert mixed[key] == (after if "radial" in key else before)[key], key
     assert all(not math.isclose(before[key], after[key]) for key in names())
+
+
+@pytest.mark.parametrize("gain", [0.25, 1.0, 2.0])
+def test_a_gain_may_be_a_fifth_to_four_times_what_is_configured(gain: float) -> None:
+    """Never 0 or less, which no arm has, however small it is."""
+    axes = {name: replaced(axis, gain=pf.Gain(intercept=gain)) for name, axis in CONFIG.arm.axes.items()}
+    config = replaced(CONFIG, arm=replaced(CONFIG.arm, axes=axes))
+    gains = [one for one in parameters(config, config, SENSORS, ["gain"]) if one.path[-1] == "intercept"]
+    assert gains and all(one.bounds == pytest.approx((0.2 * gain, 4.0 * gain)) for one in gains)
