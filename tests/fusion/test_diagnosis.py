@@ -16,6 +16,7 @@ from pumafuse.arrays import FloatArray
 from pumafuse.filter.response import response
 from pumafuse.fusion.faults import not_following, sensor_faults
 from pumafuse.fusion.segments import build
+from pumafuse.fusion.summary import summarise
 from pumafuse.logs.clock import clock_faults
 from pumafuse.logs.run import Source
 from tuning_runs import scenario, with_sensors
@@ -123,14 +124,34 @@ def test_a_scale_that_no_unit_explains_is_a_warning(factor: float, words: str) -
 
 @of_every_log
 def test_exchanged_columns_are_named_with_both_correlations(log: str, sensor: str) -> None:
-    """Each follows the commands of the other, and not its own."""
-    first, second = (axis for axis in logged(log)[0].axes[:: 2 if log == "scan1" else 1][:2])
-    (note, *_) = notes(of_sensor(log, sensor, exchanged(first, second)), log)
-    assert f"sensor '{sensor}' follows on {first} the commands of {second} (correlation +" in note
-    assert f"on {second} the commands of {first}" in note and "are its columns exchanged" in note
-    ratio = [float(part.split(")")[0].split()[0].rstrip(",")) for part in note.split("(correlation ")[1:]]
-    own = [float(part.split(")")[0].split()[-1]) for part in note.split("with those of ")[1:]]
-    assert min(ratio) > 0.95 and max(map(abs, own)) < 0.5
+    """Each follows the commands of the other, and not its own; no turn makes it so, as two exchanged are a mirror."""
+    axes = logged(log)[0].axes
+    for first, second in {(axes[0], axes[-1]), tuple(axes[-2:])}:
+        (note, *_) = notes(of_sensor(log, sensor, exchanged(first, second)), log)
+        assert f"sensor '{sensor}' follows on {first} the commands of {second} (correlation +" in note
+        assert f"on {second} the commands of {first}" in note and "are its columns exchanged" in note
+        ratio = [float(part.split(")")[0].split()[0].rstrip(",")) for part in note.split("(correlation ")[1:]]
+        own = [float(part.split(")")[0].split()[-1]) for part in note.split("with those of ")[1:]]
+        assert min(ratio) > 0.95 and max(map(abs, own)) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "shown"),
+    [
+        (later(0.4), "another clock"),
+        (exchanged("radial", "vertical"), "exchanged columns"),
+        (scaled(2.5), "another size"),
+    ],
+)
+def test_a_verdict_names_the_fault_and_no_noise(change: Change, shown: str) -> None:
+    """What a clock or a unit does to the innovations, no other process noise mends."""
+    sensor = {"tracker": change(logged("scan1")[0].sensors["tracker"])}
+    run = replace(logged("scan1")[0], sensors=sensor)
+    est = pf.fuse(run, logged("scan1")[1])
+    (faulty, *_) = [axis for name, axis in est.faults if name == "tracker"]
+    of_axis = summarise(est).axes[faulty].sensors["tracker"]
+    assert of_axis.finding == "faulty" and of_axis.causes == []
+    assert shown in of_axis.verdict and "noise" not in of_axis.verdict
 
 
 @of_every_log
@@ -283,7 +304,7 @@ def test_a_sensor_that_measures_within_a_turn_is_no_other_zero_and_may_have_a_si
     config = pf.FusionConfig(arm=arm, sensors={"imu": pf.Sensor(sd=1e-3, turn=turn, bias_sd=0.2)})
     for sign, words in ((1.0, []), (-1.0, ["sensor 'imu' moves against the commands of yaw"])):
         run = pf.Run.from_arrays(time, {"yaw": u}, {"imu": (time, {"yaw": (sign * position - 0.1) % turn})})
-        assert [one.split(" (")[0] for one in sensor_faults(build(run, config), config)] == words
+        assert [fault.sentence.split(" (")[0] for fault in sensor_faults(build(run, config), config)] == words
 
 
 def test_a_misspelt_sensor_is_named_with_the_other_name() -> None:
@@ -332,7 +353,8 @@ def test_of_a_sensor_the_share_of_all_its_components_is_said() -> None:
 
 def alarms(run: pf.Run, config: pf.FusionConfig) -> list[str]:
     segment = build(run, config)
-    return [*clock_faults(run, config.arm.update_period, run.sensors), *sensor_faults(segment, config)]
+    faults = sensor_faults(segment, config)
+    return [*clock_faults(run, config.arm.update_period, run.sensors), *(fault.sentence for fault in faults)]
 
 
 @pytest.mark.parametrize("log", LOGS)

@@ -217,6 +217,18 @@ def test_what_stands_for_none_is_told_by_the_whole_file(tmp_path: Path, none: fl
     assert found.rows["tracker"] == expected.rows["tracker"]
 
 
+def test_a_fault_is_the_verdict_of_pieces_and_whole(tmp_path: Path) -> None:
+    """A camera that moves against the commands of y: no noise is its cause."""
+
+    def is_turned(given: dict[str, tuple[Rows, np.ndarray]]) -> None:
+        given["camera"][0]["y"] = 1.0 - given["camera"][0]["y"]
+
+    for summary in both_ways(written(tmp_path / "log", single=False, damage=is_turned), tmp_path):
+        of_camera = {axis: of_axis.sensors["camera"] for axis, of_axis in summary.axes.items()}
+        assert of_camera["y"].finding == "faulty" and "motion against the commands" in of_camera["y"].verdict
+        assert of_camera["x"].finding != "faulty"
+
+
 @pytest.mark.parametrize("single", [True, False])
 def test_what_stands_for_none_in_a_piece_may_be_a_position_in_the_file(tmp_path: Path, single: bool) -> None:
     """999 m is ten times as far as all else of its piece; but much later once there are 150 m."""

@@ -36,12 +36,16 @@ class Finding(enum.Enum):
 
     FEW = "few"  # too few to tell
     REJECTED = "rejected"  # many were: the others were selected to fit
+    FAULTY = "faulty"  # a fault of the log makes them other than expected
     CONSISTENT = "consistent"
     UNTESTED = "untested"  # as expected, but fitted to this run, and what strays may be the sensor or the arm
     AT_BOUND = "at bound"  # consistent, but no measurement determined the noise
     NOT_WHITE = "not white"  # as large as expected, but correlated
     TOO_LARGE = "too large"  # innovations, for their predicted sd
     TOO_SMALL = "too small"
+
+
+_OTHER_THAN_EXPECTED = Finding.REJECTED, Finding.NOT_WHITE, Finding.TOO_LARGE, Finding.TOO_SMALL
 
 
 @dataclass(frozen=True)
@@ -58,11 +62,17 @@ class Consistency:
     kind: Kind = "length"  # of the axis
     at_bound: bool = False  # whether the sensor's sd is at a bound of what can be fitted
     untested: bool = False  # whether nothing tells its noise from what the arm strays
+    fault: str = ""  # what is wrong with the log, as Fault.cause; "": nothing
     evidence: Callable[[], Evidence] = dict  # of causes, looked for where it makes a difference
 
     @cached_property
     def finding(self) -> Finding:
-        """What the numbers say."""
+        """What the numbers say, or which fault explains them."""
+        finding = self._by_numbers
+        return Finding.FAULTY if self.fault and finding in _OTHER_THAN_EXPECTED else finding
+
+    @property
+    def _by_numbers(self) -> Finding:
         low, high = self.nis_band
         if self.count < _FEW:
             return Finding.FEW
@@ -164,6 +174,7 @@ def consistency(
         kind=est.config.arm.axes[axis].kind,
         at_bound=configured.is_at_bound(axis),
         untested=est.fitted and _is_told_by_one(est, sensor, axis),
+        fault=est.faults.get((sensor, axis), ""),
         evidence=evidence or (lambda: evidence_of(est, axis)),
     )
 

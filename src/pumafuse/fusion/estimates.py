@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
@@ -165,6 +165,8 @@ class Estimates:
         selected: The sensors that were asked for; None: all that are configured.
         placed: The frame in which the axes are, if there is one.
         fitted: Whether the configuration was fitted to this very run, so that the run is no test of it.
+        faults: What is wrong with the log of a sensor on an axis, where it is not where the commands lead: a cause of
+            :class:`pumafuse.fusion.faults.Fault`.
     """
 
     run: str
@@ -191,6 +193,7 @@ class Estimates:
     selected: tuple[str, ...] | None = None
     placed: Placed | None = None
     fitted: bool = False
+    faults: Mapping[tuple[str, str], str] = field(default_factory=dict[tuple[str, str], str])
 
     def __getitem__(self, axis: str) -> AxisEstimate:
         """The estimates of one axis.

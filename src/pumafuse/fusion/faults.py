@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -79,12 +79,27 @@ class Fault:
         return self.cause == other.cause and alike and not set(self.axes).isdisjoint(other.axes)
 
 
-def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
-    """A sentence on each fault of a configured sensor, or of the commands."""
+def sensor_faults(segment: Segment, config: FusionConfig) -> list[Fault]:
+    """Each fault of a configured sensor, or of the commands, with which there may be estimates.
+
+    Raises:
+        RunError: Estimates would be wrong by construction.
+    """
     faults = faults_of(segment, config)
     if refused := [fault.sentence for fault in faults if fault.refused]:
         raise RunError(refused[0])
-    return [fault.sentence for fault in faults]
+    return faults
+
+
+def by_axis(faults: Iterable[Fault]) -> dict[tuple[str, str], str]:
+    """By sensor and axis why measurements are not where the commands lead; a constant by which they are off apart."""
+    return {
+        (name, axis): fault.cause
+        for fault in faults
+        if isinstance(fault.cause, str) and fault.cause != "zero"
+        for name in fault.sensors
+        for axis in fault.axes
+    }
 
 
 def faults_of(segment: Segment, config: FusionConfig, origin: int | None = None) -> list[Fault]:
@@ -568,14 +583,13 @@ def _turned_frame(
         return None
     value, led, before = (rows[over:] - rows[:-over] for rows in (value, led, before))
     parts = np.arange(len(value)) * _PARTS // len(value)
-    turn, along, back = _turn(value, led, led - before)
+    turn, of_columns, along, back = _turn(value, led, led - before)
     angle = angle_of(turn)
-    exchanged = math.cos(angle) < _ALIGNED and bool((np.abs(turn).max(axis=0) > _EXCHANGED).all())
-    if angle < _TURNED or back > _STRAIGHTER * along or exchanged:
+    if angle < _TURNED or back > _STRAIGHTER * along or (math.cos(angle) < _ALIGNED and of_columns):
         return None
     others = np.array(
         [
-            angle_of(turn.T @ _turn(*(rows[parts != part] for rows in (value, led, led - before)))[0])
+            angle_of(turn.T @ _turn(*(rows[parts != part] for rows in (value, led, led - before))).rotation)
             for part in range(_PARTS)
         ]
     )
@@ -589,23 +603,31 @@ def _common(first: TimeArray, other: TimeArray) -> TimeArray:
     return first[(beside == first) & (np.diff(first, prepend=first[:1] - 1) > 0)]
 
 
-def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> tuple[FloatArray, float, float]:
-    """The rotation by which measurements are turned against a response, (k, k), and the RMS along axes and turned back.
+class _Turn(NamedTuple):
+    """How measurements are turned against a response."""
 
-    Where a response does not go, nothing tells of a turn: there it is none.
-    """
+    rotation: FloatArray  # (k, k)
+    of_columns: bool  # whether each column is another one, or against one: also as a mirror, which no rotation is
+    along: float  # RMS of what is left of the measurements along their axes [m]
+    back: float  # and when they are turned back [m]
+
+
+def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> _Turn:
+    """The turn of measurements against a response; where that does not go, nothing tells of one: there it is none."""
     value, led, step = (np.asarray(rows - rows.mean(axis=0), dtype=np.float64) for rows in (value, led, step))
     regressors = np.hstack([led, step])
     seen = np.asarray(np.linalg.lstsq(regressors, value)[0], dtype=np.float64)[: led.shape[1]]  # value ≈ led · seen + …
     moved = led.T @ led
-    turn = nearest(seen.T @ moved + _HARDLY * float(np.linalg.norm(moved, 2)) * np.eye(len(moved)))
+    turned = seen.T @ moved + _HARDLY * float(np.linalg.norm(moved, 2)) * np.eye(len(moved))
+    rotation, (left, _, right) = nearest(turned), np.linalg.svd(turned)
+    of_columns = bool((np.abs(left @ right).max(axis=0) > _EXCHANGED).all())
 
     def misfit(rotated: FloatArray) -> float:
-        left = value - rotated
-        late = np.asarray(np.linalg.lstsq(step, left)[0], dtype=np.float64)
-        return math.sqrt(float(np.sum((left - step @ late) ** 2)) / len(left))
+        off = value - rotated
+        late = np.asarray(np.linalg.lstsq(step, off)[0], dtype=np.float64)
+        return math.sqrt(float(np.sum((off - step @ late) ** 2)) / len(off))
 
-    return turn, misfit(led), misfit(led @ turn.T)
+    return _Turn(rotation, of_columns, misfit(led), misfit(led @ rotation.T))
 
 
 # ---- a begin in mid-motion, a latency below 0 ---------------------------------------------------------

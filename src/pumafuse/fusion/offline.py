@@ -21,7 +21,7 @@ from ..units import Kind, seconds
 from .config import FusionConfig
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
-from .faults import latency_questions, sensor_faults, starts_in_motion
+from .faults import Fault, by_axis, latency_questions, sensor_faults, starts_in_motion
 from .placing import in_base
 from .score import late_rows, reference_track
 from .segments import NO_STAMP_WORD, Segment, added, best_of, build, counted, on_any_axis, output_times
@@ -83,11 +83,11 @@ def fuse(
     chosen = None if sensors is None else config.sensor_names(sensors)
     in_place, placed, config = in_base(run, config)
     logged, jumps = segments(in_place)
-    parts, faults, moving = list[Part](), list[str](), list[str]()
+    parts, clocks, faults, moving = list[Part](), list[str](), list[Fault](), list[str]()
 
     def filtered(number: int, part: Run) -> Part:
         asked = [name for name in config.sensor_names(chosen) if name in part.sensors]
-        faults.extend(clock_faults(part, config.arm.update_period, asked))
+        clocks.extend(clock_faults(part, config.arm.update_period, asked))
         segment = build(part, config, chosen)
         faults.extend(sensor_faults(segment, config))
         moving.extend(starts_in_motion(segment, config))
@@ -99,11 +99,11 @@ def fuse(
 
     parts += [filtered(number, part) for number, part in enumerate(logged)]
     est = estimates_of(run, in_place, placed, config, parts, mode, engine)
-    notes = [*faults, *found_by(est, parts), *moving]
+    notes = [*clocks, *(fault.sentence for fault in faults), *found_by(est, parts), *moving]
     notes += latency_questions(config, parts[0].segment.sensors)
     notes += [*jumps, *_uncovered(est), *config.arm.validity.excess(est.speed, est.radius)]
     parts.clear()  # their tables are as large as what est has of them
-    est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen)
+    est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen, faults=by_axis(faults))
     warn(f"run '{run.name}': {note}" for note in est.notes)
     return est
 

@@ -16,6 +16,18 @@ _WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps
 _SURELY = 40.0  # log-likelihood that a cause gains: no chance; a real arm does not move by one noise all the time
 _DETAIL = 1.2, 0.2  # factor on NIS, and correlation, within which it is a detail that a model of an arm lacks
 _FAR = 6.0  # standard deviations by which more are rejected than is many
+SHOWS = {  # what a sensor with a fault of the log shows
+    "turns": "an angle that begins anew after each turn",
+    "unit": "motion of another size",
+    "columns": "exchanged columns",
+    "sign": "motion against the commands",
+    "clock": "another clock",
+    "set": "a clock that was set",
+    "frame": "a frame that is turned",
+    "nothing": "a motion that follows nothing",
+    "motion": "motion while the commands rest",
+    "zero": "another zero",
+}
 _TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
 
 
@@ -79,6 +91,8 @@ def sentence(consistency: Consistency) -> str:
     match consistency.finding:
         case Finding.REJECTED:
             return f"{nis}, but {consistency.rejected:.0%} were {_TOO_SMALL.format(sd=sd)}"
+        case Finding.FAULTY:
+            return f"{nis}: it shows {SHOWS[consistency.fault]}, see the warning"
         case Finding.NOT_WHITE:
             white = f"consistent in size, but not white (lag {lag}: {consistency.correlation[lag - 1]:+.2f})"
             return f"{nis}: {white}" + (f": {causes}" if causes else "")

@@ -28,7 +28,7 @@ from ..fusion.estimates import Estimates
 from ..fusion.faults import Fault, faults_of, settled
 from ..fusion.offline import judged
 from ..fusion.segments import Segment, build
-from ..fusion.verdicts import likeliest, sentence
+from ..fusion.verdicts import SHOWS, likeliest, sentence
 from ..logs.run import Run, Source
 from .rate_limit import RateLimitedLog
 
@@ -48,17 +48,6 @@ _LARGE, _HUGE = 4.0, 100.0  # NIS in each quarter of a second, and over all of i
 _CHANCE = 1e-12  # that a second of good measurements has so large a NIS: one in 10⁵ years at 10 axes
 _CALM_NS = 5_000_000_000  # of usual innovations, after which it is over
 _MOST_ROWS = 4096  # of a second that are judged
-_SHOWS = {
-    "turns": "an angle that begins anew after each turn",
-    "unit": "motion of another size",
-    "columns": "exchanged columns",
-    "sign": "motion against the commands",
-    "clock": "another clock",
-    "frame": "a frame that is turned",
-    "nothing": "a motion that follows nothing",
-    "motion": "motion while the commands rest",
-    "zero": "another zero",
-}
 
 _Key: TypeAlias = tuple[tuple[str, ...], str | Cause | Finding, int]  # sensors, the cause of their fault, and when
 
@@ -250,7 +239,7 @@ class Diagnosis:
             return
         del self._troubles[key]
         if trouble.is_said and not is_replaced and cause != "set":
-            shows = _SHOWS[cause] if isinstance(cause, str) else "what the verdict says"
+            shows = SHOWS[cause] if isinstance(cause, str) else "what the verdict says"
             self._log.write(f"{key} over", f"{_named(sensors)}: {shows} shows no more at {now / 1e9:.3f} s")
 
     def _unexpected(self, estimates: Estimates, faults: Sequence[Fault]) -> list[Fault]:

@@ -22,7 +22,7 @@ from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.engine import filter_piece
 from ..fusion.estimates import Estimates
-from ..fusion.faults import latency_questions, sensor_faults, starts_in_motion
+from ..fusion.faults import by_axis, latency_questions, sensor_faults, starts_in_motion
 from ..fusion.offline import Part, estimates_of, found_by
 from ..fusion.placing import in_base
 from ..fusion.segments import Segment, build, no_estimates, output_times
@@ -157,8 +157,10 @@ def _piece(
         segment = replace(segment, start={axis: float(segment.commands_of(axis)[1][0]) for axis in segment.axes})
     part = Part(in_place, segment, times, filtered)
     est = estimates_of(run, in_place, placed, config, [part])
-    notes = [*clock_faults(in_place, config.arm.update_period, []), *sensor_faults(segment, config)]
+    faults = sensor_faults(segment, config)
+    notes = [*clock_faults(in_place, config.arm.update_period, []), *(fault.sentence for fault in faults)]
     notes += found_by(est, [part])
     if first:
         notes += [*starts_in_motion(segment, config), *latency_questions(config, segment.sensors)]
-    return replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen)
+    notes += sensor_problems(est)
+    return replace(est, notes=tuple(notes), rate=rate, selected=chosen, faults=by_axis(faults))

@@ -141,7 +141,9 @@ def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
     if not sum(fused):
         return SensorSummary(outcomes=outcomes, skill=skill)
     innovations = [digest.innovations.get((axis, name), Innovations(0.0, {})) for digest in having]
+    faults = [fault for part in having if (fault := part.est.faults.get((name, axis)))]
     consistency = _consistency(parts, innovations, digests[0].est.config, name, axis)
+    consistency = replace(consistency, fault=faults[0] if faults else "")
     rms, sd = (pooled_number(key, [getattr(part, key) for part in parts], fused) or 0.0 for key in _SIZES)
     bias = digests[-1].est.biases.get(name, {}).get(axis)
     return sensor_summary(axis, outcomes, consistency, rms, sd, bias, skill)
