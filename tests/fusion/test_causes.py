@@ -60,6 +60,7 @@ def recorded(
     model: pf.ArmModel | None = None,
     process: float = 1.0,
     late: float = LATENCY,
+    jitter: float = 0.0,
     others: Mapping[str, float] | None = None,
     seed: int = 1,
     axes: Sequence[str] = AXES,
@@ -75,6 +76,7 @@ def recorded(
         model: The true arm.
         process: Factor on the process noise.
         late: The sensor's true latency [s].
+        jitter: It scatters evenly by as much to either side [s].
         others: More sensors by name with their sd, as late as they are configured.
         seed: Of all noise.
         axes: Which all have the same commands.
@@ -98,7 +100,8 @@ def recorded(
         values["camera"][axis] = seen(position + SD * noise(rng.standard_normal(len(valid))))
         for name, sd in (others or {}).items():
             values[name][axis] = position + sd * rng.standard_normal(len(valid))
-    stamps = {name: valid + round((late if name == "camera" else 0.0) * 1e9) for name in values}
+    stamps = dict.fromkeys(values, valid)
+    stamps["camera"] = valid + np.rint((late + jitter * rng.uniform(-1.0, 1.0, len(valid))) * 1e9).astype(np.int64)
     sensors = {name: (stamps[name], values[name]) for name in values}
     return pf.Run.from_arrays(given, dict.fromkeys(axes, command), sensors)
 
@@ -154,6 +157,7 @@ WORLDS = {
     "outliers": (lambda: recorded(noise=with_outliers), config(), Cause.OUTLIERS, 0.0),
     "stamped 20 ms late": (lambda: recorded(late=LATENCY + 0.02), config(), Cause.LAG, 0.02),
     "stamped 20 ms early": (lambda: recorded(late=LATENCY - 0.02), config(), Cause.LAG, -0.02),
+    "jitter": (lambda: recorded(jitter=9e-3), config(), Cause.JITTER, 9e-3 / math.sqrt(3.0)),
     "a delay": (lambda: recorded(model=arm(delay=DELAY + 0.03)), config(), Cause.LAG, 0.03),
     "a delay of several periods": (lambda: recorded(model=arm(delay=DELAY + 0.09)), config(), Cause.LAG, 0.09),
     "a plant": (lambda: recorded(model=arm(TAU + 0.03)), config(), Cause.PLANT, 0.03),

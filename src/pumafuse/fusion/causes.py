@@ -57,6 +57,7 @@ _MANEUVERS = (3.0, 30.0)  # densities at the usual change of speed, over that of
 _CORRELATED = ((0.3, 0.1), (0.6, 0.1), (1.0, 0.1), (1.0, 0.8))  # drifting and white part, over sd
 _TIMES = (1.5, 4.0, 15.0)  # intervals that the drifting part lasts
 _TAILS = ((0.1, 5.0), (0.03, 10.0), (0.01, 30.0))  # share of outliers, and how many times as large they are
+_JITTERS = (1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3)  # s; standard deviation of a latency
 _PLAYS = (1.0, 4.0, 16.0)  # half the play, over sd
 _STILL = 1e-9  # m or rad; a shape that is smaller is none
 _LIMITS = (0.95, 0.85, 0.7)  # of the speed, over the highest
@@ -81,6 +82,7 @@ class Cause(enum.Enum):
     OUTLIERS = "outliers"  # a few innovations are far larger than the others
     PROCESS = "process", "factor"  # the process noise
     MANEUVERS = "maneuvers"  # process noise where the commanded speed changes
+    JITTER = "jitter", "shift"  # a sensor's latency scatters from row to row
     LATENCY = "latency", "shift"  # of a sensor beside others
     LAG = "lag", "shift"  # of the arm, or the latency of the only sensor, which is named then
     PLANT = "plant", "shift"  # likewise of the plant
@@ -202,17 +204,19 @@ def _least_of_correlated(evidence: Evidence, first: Suspect) -> float:
 
 
 def _weighed(evidence: Evidence) -> Iterator[Suspect]:
-    factors: dict[tuple[Cause, str], list[tuple[float, float]]] = {}
+    sizes: dict[tuple[Cause, str], list[tuple[float, float]]] = {}
     for (cause, sensor, which), weight in evidence.items():
-        if cause in (Cause.NOISE, Cause.PROCESS):
-            factors.setdefault((cause, sensor), [(1.0, 0.0)]).append((which, weight.gain))
+        if cause in (Cause.NOISE, Cause.PROCESS, Cause.JITTER):
+            sizes.setdefault((cause, sensor), [] if cause is Cause.JITTER else [(1.0, 0.0)]).append(
+                (which, weight.gain)
+            )
         elif weight.information > 0.0:
             size = weight.score / weight.information
             if _is_possible(cause, which, size):
                 yield Suspect(cause, sensor, size * _unit(cause, which), _gain_of_shape(weight))
         else:
             yield Suspect(cause, sensor, 0.0, weight.gain - _HANDICAPS.get(cause, 0.0))
-    for (cause, sensor), tried in factors.items():
+    for (cause, sensor), tried in sizes.items():
         yield Suspect(cause, sensor, *_highest(sorted(tried)))
 
 
@@ -245,14 +249,14 @@ def _unit(cause: Cause, which: float) -> float:
 
 
 def _highest(tried: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """The factor with the largest gain, and that, by a parabola over its logarithm; no factor (0 or ∞) at an end."""
-    factor, gain = (np.array(column) for column in zip(*tried, strict=True))
+    """The size with the largest gain, and that, by a parabola over its logarithm; none (0 or ∞) at an end."""
+    size, gain = (np.array(column) for column in zip(*tried, strict=True))
     top = int(np.argmax(gain))
     if not 0 < top < len(gain) - 1:
         return (np.inf if top else 0.0), float(gain[top])
-    x, y = np.log(factor[top - 1 : top + 2] / factor[top]), gain[top - 1 : top + 2]
+    x, y = np.log(size[top - 1 : top + 2] / size[top]), gain[top - 1 : top + 2]
     a, b, c = cast(FloatArray, np.polyfit(x, y, 2)).tolist()
-    return float(factor[top] * np.exp(-b / (2.0 * a))), float(c - b**2 / (4.0 * a))
+    return float(size[top] * np.exp(-b / (2.0 * a))), float(c - b**2 / (4.0 * a))
 
 
 # ---- one pass of the filter -----------------------------------------------------------------------------------------
@@ -276,6 +280,13 @@ class _Part:
     def led(self) -> FloatArray:
         """Where all commands lead the axis at ``time`` [m or rad], (m,)."""
         return self.position(self.config.arm.axes[self.axis], self.time)
+
+    @cached_property
+    def speed(self) -> FloatArray:
+        """Of where commands lead, over two update periods [m/s or rad/s], (m,)."""
+        ns = round(self.config.arm.update_period * 1e9)
+        late, early = (self.position(self.config.arm.axes[self.axis], self.time + by) for by in (ns, -ns))
+        return 0.5e9 / ns * (late - early)
 
     @property
     def sensors(self) -> list[int]:
@@ -304,15 +315,18 @@ def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -
 
 def _of_part(part: _Part) -> Evidence:
     measured, base = part.measured, _model(part)
-    other = [*_process(part, base), *_sensors(part, base)]
+    jitters = dict(_jitters(part, base))
+    other = [*_process(part, base), *_sensors(part, base), *((tried, base) for tried in jitters)]
     shapes = {tried: x for tried, x in _shapes(part) if np.abs(x).max() > _STILL}
     unit = _SMALL * float(np.nanmin(base.view["sd"]))
     moves = {tried: unit / float(np.abs(x).max()) for tried, x in shapes.items()}
     moved = np.zeros((len(part.time), 1 + len(other) + len(shapes)))
     for column, (tried, x) in enumerate(shapes.items(), 1 + len(other)):
         moved[:, column] = moves[tried] * x
+    spread = np.ones_like(moved)
+    spread[:, 1 + len(other) - len(jitters) : 1 + len(other)] = np.column_stack(list(jitters.values()))
     models = [base, *(model for _, model in other), *(base for _ in shapes)]
-    nu, sd, sensor = _filtered(part, models, moved)
+    nu, sd, sensor = _filtered(part, models, moved, spread)
     normalised = nu / sd
     density = -np.log(sd) - 0.5 * normalised**2
     gains = (density - density[:, :1]).sum(axis=0)
@@ -338,8 +352,13 @@ def _model(part: _Part) -> Model:
     return filter_model(part.config, [part.axis], names, {part.axis: part.start}, [biased])
 
 
-def _filtered(part: _Part, models: Sequence[Model], moved: FloatArray) -> tuple[FloatArray, FloatArray, IndexArray]:
-    """Innovations and their sd by k models (n, k), of measurements moved by (m, k); and whose they are, (n,)."""
+def _filtered(
+    part: _Part, models: Sequence[Model], moved: FloatArray, spread: FloatArray
+) -> tuple[FloatArray, FloatArray, IndexArray]:
+    """Innovations and their sd by k models (n, k), and whose they are, (n,).
+
+    Measurements are moved, and their noise is scaled, by (m, k).
+    """
     arm, axis, count, measured = part.config.arm, part.axis, len(models), part.measured
     delay = arm.delay_of(axis)
     acts = part.told_at + round(delay * 1e9)
@@ -351,6 +370,7 @@ def _filtered(part: _Part, models: Sequence[Model], moved: FloatArray) -> tuple[
     order = np.argsort(instants, kind="stable")  # commands first
     instants = instants[order]
     values = np.concatenate([np.repeat(part.command[:, None], count, axis=1), value])[order]
+    spread = np.concatenate([np.ones((len(acts), count)), spread])[order]
     source = np.concatenate([np.full(len(acts), COMMAND, dtype=np.int16), measured.sensor])[order]
     outcome = np.concatenate([np.zeros(len(acts), dtype=np.uint8), measured.outcome])[order]
     codes = np.zeros(values.shape, dtype=np.uint8)
@@ -358,7 +378,7 @@ def _filtered(part: _Part, models: Sequence[Model], moved: FloatArray) -> tuple[
     results.outcome[:] = outcome[:, None]
     axes, view = np.concatenate([model.axis for model in models]), np.hstack([model.view for model in models])
     core = Filter(Model(axes, models[0].sensor, view), min(part.segment.origin, int(instants[0])))
-    events = Events(instants, source, instants, values, np.zeros((0, count)), codes)
+    events = Events(instants, source, instants, values, spread, codes)
     core.run(events, results, np.zeros(0, dtype=np.int64), "repeated")
     fused = (source != COMMAND) & (outcome == int(Outcome.FUSED))
     return results.innovation[fused], results.innovation_sd[fused], source[fused]
@@ -409,6 +429,15 @@ def _sensors(part: _Part, base: Model) -> Iterator[tuple[Tried, Model]]:
         for which, ((drifting, white), lasting) in enumerate(product(_CORRELATED, _TIMES) if interval > 0.0 else ()):
             noise = {"sd": white * sd, "bias_drift_sd": drifting * sd, "bias_time": lasting * interval}
             yield Tried(Cause.CORRELATED, name, which), _seen(base, number, **noise)
+
+
+def _jitters(part: _Part, base: Model) -> Iterator[tuple[Tried, FloatArray]]:
+    """By what the noise of each component is scaled if the latency of a sensor scatters, (m,)."""
+    moved = np.abs(part.scale * part.speed)
+    for number in part.sensors:
+        noise = moved * (part.measured.sensor == number) / base.view["sd"][number, 0]
+        for latency_sd in _JITTERS:
+            yield Tried(Cause.JITTER, part.measured.sensors[number], latency_sd), np.hypot(1.0, latency_sd * noise)
 
 
 def _seen(base: Model, sensor: int, **numbers: float) -> Model:

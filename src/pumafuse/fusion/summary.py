@@ -40,7 +40,7 @@ class FoundCause(toml.Reported, frozen=True, kw_only=True):
         words: As in the verdict.
         factor: By what a noise is to be multiplied; also null beyond what was tried.
         share: Of the position, or of a scale, by which it errs.
-        shift: By how much a latency or a lag is too small [s].
+        shift: By how much a latency or a lag is too small, or a latency scatters [s].
         size: Of a constant or of play [m or rad].
     """
 

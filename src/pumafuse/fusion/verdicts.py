@@ -144,6 +144,9 @@ def in_words(suspect: Suspect, consistency: Consistency) -> str:
         case Cause.OUTLIERS:
             larger = f"a few innovations{of_sensor} are far larger than the others"
             return f"{larger}: outliers of the sensor, or jerks of the arm"
+        case Cause.JITTER:
+            by = f" by {size * MS:.2g} ms" if 0.0 < size < math.inf else ""
+            return f"the latency{of_sensor} scatters{by} from row to row (latency_sd_ms)"
         case Cause.LATENCY:
             return f"latency_ms{of_sensor} is {size * MS:.3g} ms too {small}"
         case Cause.LAG | Cause.PLANT:
