@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -53,6 +54,13 @@ def sources(draw: st.DrawFn, axes: tuple[str, ...]) -> Source:
     stamp = draw(stamps)
     values = {axis: draw(st.lists(nanometres, min_size=len(stamp), max_size=len(stamp))) for axis in axes}
     return source(stamp, values)
+
+
+def test_arrivals_come_back() -> None:
+    """When rows came is saved where it is told."""
+    command = replace(source([0, 28_000_000], {"x": [1, 2]}), arrival=np.array([5, 28_000_009]))
+    again = through(Run("log", command, {"eye": source([0], {"x": [3]})}))
+    assert again.command.arrival.tolist() == [5, 28_000_009] and len(again.sensors["eye"].arrival) == 0
 
 
 @settings(max_examples=60)

@@ -315,8 +315,9 @@ def test_when_rows_came_is_a_column_of_any_unit(tmp_path: Path) -> None:
     """Empty: at its stamp; a command between two has come with the next one; axes with rows of their own have none."""
     columns = {"t_s": [0.0, 0.1, 0.2], "came": pa.array([5.0, None, 230.0]), "x_m": [0.0, 0.1, 0.2]}
     arrived = 'time = "t_s"\narrived = { column = "came", unit = "ms" }\n'
-    command = read(tmp_path, f'{arrived}x = "x_m"', columns).command
-    assert command.arrival.tolist() == [5_000_000, 100_000_000, 230_000_000]
+    run = read(tmp_path, f'{arrived}x = "x_m"', columns)
+    assert run.command.arrival.tolist() == [5_000_000, 100_000_000, 230_000_000]
+    assert any("do not tell when they came: 1, taken as at their stamp" in note for note in run.notes)
     finer = read(tmp_path, f'{arrived}x = "x_m"\ninterpolation_ms = 50', columns).command
     assert finer.arrival.tolist() == [5_000_000, 100_000_000, 100_000_000, 230_000_000, 230_000_000]
     own_rows = 'x = { column = "x_m", where = { came = 5 } }'

@@ -45,8 +45,9 @@ def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
 def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Event]]:
     """A run's events in the order of their arrival, at ``speed`` times its own pace; an empty list while it is quiet.
 
-    A row arrives when its stamp says, one that steps back with the row before it; measurements come before commands
-    of the same instant. What the run has in joints comes so: the configuration has its robot.
+    A row arrives when the run says that it came; where it does not say, when its stamp says, and one that steps back
+    with the row before it. Measurements come before commands of the same instant. What the run has in joints comes so:
+    the configuration has its robot.
     """
     if run.clock != "stamps" and run.has_orientation:
         raise RunError(f"run '{run.name}': with orientations its clock = '{run.clock}' cannot be replayed; fuse it")
@@ -57,7 +58,8 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
 def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     """When each event arrives [ns], ascending, (n,), and the events."""
     sources = [*run.sensors.items(), ("", as_commanded(run, config))]
-    arrival = np.concatenate([np.maximum.accumulate(source.stamp) for _, source in sources])
+    told = (source.arrival if len(source.arrival) else source.stamp for _, source in sources)
+    arrival = np.concatenate([np.maximum.accumulate(stamp) for stamp in told])
     events = [event for name, source in sources for event in _events(name, source.in_joints())]
     order = np.argsort(arrival, kind="stable")
     return arrival[order], [events[row] for row in order.tolist()]

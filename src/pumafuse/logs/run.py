@@ -621,6 +621,8 @@ def of_tables(
             source = replace(source, noise=entry.noise.factor(read[entry.rows].plain(entry.noise.column)[0]))
         if entry.arrived is not None:
             arrival, _ = entry.arrived.stamps(read[entry.rows])
+            if untold := np.count_nonzero(arrival == NO_STAMP):
+                notes.append(f"{entry.label}: rows that do not tell when they came: {untold}, taken as at their stamp")
             source = replace(source, arrival=np.where(arrival == NO_STAMP, source.stamp, arrival))
         if chain is not None and entry.joints:
             source = _posed(source, read[entry.rows], entry.joints, chain, units)

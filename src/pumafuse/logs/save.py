@@ -68,8 +68,9 @@ def _entry(run: Run, source: Source, file: str, folder: Path) -> dict[str, Any]:
     }
     if len(source.noise):
         columns[NOISE] = pa.array(source.noise)
-    stamp = pa.array(seconds(source.stamp), from_pandas=True)
-    tables.write(pa.table({"time_s": stamp, **columns}), folder / file)
+    clocks = {"time": source.stamp} | ({"arrived": source.arrival} if len(source.arrival) else {})
+    stamps = {f"{key}_s": pa.array(seconds(clock), from_pandas=True) for key, clock in clocks.items()}
+    tables.write(pa.table({**stamps, **columns}), folder / file)
     noise = {NOISE: {"sd": NOISE, "typical": 1.0}} if len(source.noise) else {}
     named = {axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}
-    return {"file": file, "time": "time_s", **named, **noise}
+    return {"file": file, **{key: f"{key}_s" for key in clocks}, **named, **noise}
