@@ -94,7 +94,11 @@ class Cause(enum.Enum):
     LIMIT = "limit"  # of the speed
 
 
-_ALIKE = {Cause.MANEUVERS: Cause.PROCESS, Cause.PLANT: Cause.LAG}  # the better one of two is named
+_ALIKE = {  # the better one of two is named
+    Cause.MANEUVERS: Cause.PROCESS,
+    Cause.PLANT: Cause.LAG,
+    Cause.JITTER: Cause.NOISE,
+}
 _HANDICAPS = {
     Cause.CORRELATED: 8.0,  # two numbers more: the logarithm of some thousand measurements
     Cause.MANEUVERS: _CLOSE,  # a special case of process noise: to be named only if it is clearly the better one
