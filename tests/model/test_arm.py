@@ -300,3 +300,22 @@ def test_validity_counts_only_what_is_exceeded(
     """A sentence for each, with the excess; beyond by less than is shown is within; an unknown radius is no limit."""
     sentences = limits.excess({"length": speed}, radius)
     assert all(words in sentence for words, sentence in zip(exceeded, sentences, strict=True))
+
+
+def test_what_bends_an_axis_is_said_with_its_size_and_interval() -> None:
+    """In the units of its kind; the slopes of a sag are told as what they are beside its line; else nothing is said."""
+    plant = FirstOrder(time_constant=0.05)
+    assert AxisModel(plant=plant, play=0.0).bends == []
+    length = AxisModel(plant=plant, play=2e-4, play_ci95=(1.5e-4, 2.5e-4), max_speed=0.3)
+    assert length.bends == [
+        "play: 0.2 (0.15 to 0.25) mm, half of which over its speed adds to its lag",
+        "fastest speed: about 300 mm/s, up to which its lag holds",
+    ]
+    sag = Sag(offset=0.01, slope=-0.2, knee=0.5, slope_beyond=-0.6, slope_beyond_ci95=(-0.64, -0.56))
+    angle = AxisModel(kind="angle", plant=plant, sag=sag)
+    assert angle.bends == [
+        "sag: off by 0.573 deg at 0, and moves 0.8 times as far as commanded",
+        "sag: above about 28.65 deg it moves 0.5 (0.45 to 0.55) times as far as elsewhere",
+    ]
+    arm = ArmModel(name="bent", update_period=0.02, delay=0.0, axes={"x": length, "turn": angle})
+    assert arm.bends() == [f"x: {'; '.join(length.bends)}", f"turn: {'; '.join(angle.bends)}"]

@@ -175,6 +175,8 @@ def test_pieces_are_the_whole(log: Path, tmp_path: Path, how: dict[str, Any]) ->
     expected, found = both_ways(log, tmp_path, progress=shares.append, **how)
     assert len(shares) > 5 and shares == sorted(shares) and shares[-1] == 1.0
     assert any(f"fused in {len(shares)} pieces" in note for note in found.notes)
+    overruns = [[note for note in summary.notes if "ask for more" in note] for summary in (found, expected)]
+    assert overruns[0] == overruns[1] and len(overruns[0]) == 1
     assert found.estimates == expected.estimates and found.duration_s == expected.duration_s
     if how.get("part", (None, None))[1] is None:  # what comes behind the part is not read
         assert (found.commands, found.rows) == (expected.commands, expected.rows)

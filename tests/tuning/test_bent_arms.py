@@ -41,10 +41,14 @@ def test_play_is_found_from_any_value() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("degrees", [None, 290.0])
 def test_a_fastest_speed_is_found(degrees: float | None) -> None:
-    """365 degrees a second, from none and from 290: within a hundredth, and written with its interval."""
+    """365 degrees a second, from none and from 290: within a hundredth, and written with its interval.
+
+    What of the commands is beyond it is named.
+    """
     found = tuned("saturating-servo", max_speed=degrees and degrees * 0.0174533)
     assert found.params["axes.joint.max_speed_deg_s"] == pytest.approx(365.0, rel=0.01)
     assert "max_speed_deg_s_ci95" in found.config.arm.to_toml()
+    assert any("of 3001 commands ask for more than the 36" in note for note in found.details.notes)
 
 
 @pytest.mark.long

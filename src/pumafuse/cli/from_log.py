@@ -89,7 +89,7 @@ def run(
     est = replace(est, fitted=True)
     results.check_fused(est.counts, est.config)
     summary = results.write(est, output, force, lambda new: draw(new, est, recorded, extras), texts["run.toml"])
-    show_lags(fitted.details, fitted.config.arm.update_period)
+    show_lags(fitted.details, fitted.config.arm)
     show(summary)
     strays = _off_the_path(surveyed, summary)
     slow = otherwise_than_at_first(surveyed, fitted.details.lags, fitted.config.arm)

@@ -48,6 +48,8 @@ def run(
     configured = FusionConfig.load(config)
     configured.sensor_names(sensors)  # before any run is read
     warn(configured.arm.doubts())
+    for line in configured.arm.bends():
+        say(line)
     making = results.Making(configured, sensors, rate, mode, engine, part, extras)
     job = partial(_fuse, making, force)
     if len(runs) == 1:

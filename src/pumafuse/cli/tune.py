@@ -14,6 +14,7 @@ from .. import folders
 from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, ROBOT_FILE, FusionConfig
 from ..logs.run import Run
+from ..model.arm import ArmModel
 from ..tuning.arms import BENDS
 from ..tuning.parameters import kinds_of
 from ..tuning.summary import TuningSummary
@@ -78,7 +79,7 @@ def run(
     if json:
         say(tuning.to_json().removesuffix("\n"))
     else:
-        _show(tuning.details, tuning.config.arm.update_period)
+        _show(tuning.details, tuning.config.arm)
         say(f"written to {output}\nnext: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR")
     end(tuning.details)
 
@@ -100,21 +101,21 @@ def fitting() -> Generator[Progress]:
         )
 
 
-def show_lags(summary: TuningSummary, period: float) -> None:
-    """Print the lags, and play, fastest speeds and sags where there are any; period [s]."""
+def show_lags(summary: TuningSummary, arm: ArmModel) -> None:
+    """Print the lags, and play, fastest speeds and sags where there are any."""
     shown = ("lag of ", *(f".{bend}" for bend in (*BENDS, "sag")))
     rows = [row[:-1] for row in formatting.fitted(summary) if any(part in row[0] for part in shown)]
     print_tables([table(_HEADINGS, rows)])
-    say(formatting.lag(period))
+    say("\n".join(formatting.lag(arm)))
 
 
-def _show(summary: TuningSummary, period: float) -> None:
-    """Print the summary on stdout; period [s]."""
+def _show(summary: TuningSummary, arm: ArmModel) -> None:
+    """Print the summary on stdout."""
     parameters = table([*_HEADINGS, ""], formatting.fitted(summary))
     parameters.columns[0].no_wrap = True
     print_tables([parameters])
     if summary.lags:
-        say(formatting.lag(period))
+        say("\n".join(formatting.lag(arm)))
     lines = [*formatting.chosen(summary.orders), *summary.not_identifiable]
     pairs = sorted(summary.correlations, key=lambda pair: -abs(pair.correlation))
     lines += [formatting.together(pair) for pair in pairs[:_PAIRS]]

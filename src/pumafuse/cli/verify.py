@@ -45,7 +45,7 @@ def run(
         say_json([toml.reported(result, result.kind) for result in verified])
     else:
         print_tables(table(*of_kind) for of_kind in reports.verifications(verified))
-        say("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
+        say("\n".join([*formatting.lag(model), *map(reports.verdict, verified)]))
         if report is not None:
             say(f"written to {report}")
     if not all(result.holds for result in verified):

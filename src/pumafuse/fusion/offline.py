@@ -22,6 +22,7 @@ from .config import FusionConfig
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .faults import Fault, by_axis, latency_questions, sensor_faults, starts_in_motion
+from .overruns import overrun_notes, overruns
 from .placing import in_base
 from .score import late_rows, reference_track
 from .segments import NO_STAMP_WORD, Segment, added, best_of, build, counted, on_any_axis, output_times
@@ -102,6 +103,7 @@ def fuse(
     notes = [*clocks, *(fault.sentence for fault in faults), *found_by(est, parts), *moving]
     notes += latency_questions(config, parts[0].segment.sensors)
     notes += [*jumps, *_uncovered(est), *config.arm.validity.excess(est.speed, est.radius)]
+    notes += overrun_notes([overruns(part.segment, config.arm) for part in parts], config.arm, est.origin)
     parts.clear()  # their tables are as large as what est has of them
     est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen, faults=by_axis(faults))
     warn(f"run '{run.name}': {note}" for note in est.notes)

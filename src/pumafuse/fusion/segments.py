@@ -242,13 +242,13 @@ def build(
     policy = _policy(config, run.axes, used)
     rows = _command_rows(run, policy, notes)
     unstamped = len(run.command.stamp) - len(rows.stamp)
-    command_counts = _command_counts(rows.rows(_owned(rows.stamp, span)), unstamped)
+    command_counts = _command_counts(rows.rows(owned(rows.stamp, span)), unstamped)
     rows = _on_ticks(run, config, rows, notes)
     used_rows = on_any_axis(rows.codes, Outcome.FUSED)
     origin = begun.origin if begun else int(rows.stamp[used_rows][0])
     ends = run.ends(origin)
     within = rows.stamp <= ends[1]
-    outside = int(np.count_nonzero((used_rows & ~within)[_owned(rows.stamp, span)]))
+    outside = int(np.count_nonzero((used_rows & ~within)[owned(rows.stamp, span)]))
     command_counts = counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
     commands, rows = rows.stamp[used_rows & within], rows.where(within)
     notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
@@ -263,7 +263,7 @@ def build(
     ]
     measured = joined([Events.empty(len(run.axes)), *(part for part, _ in parts)])
     counts = {
-        name: {NOT_SELECTED: len(sensor.stamp[_owned(sensor.stamp, span)])} for name, sensor in run.sensors.items()
+        name: {NOT_SELECTED: len(sensor.stamp[owned(sensor.stamp, span)])} for name, sensor in run.sensors.items()
     }
     counts |= {name: held for name, (_, held) in zip(used, parts, strict=True)}
     if run.interval and span == WHOLE and not (measured.codes == _FUSED).any():
@@ -452,8 +452,8 @@ def _measurement_rows(
     if sensor is not None:
         notes += _hold(rows, commands, config, name, label, run.axes, origin)
     kept = rows.where(used[order])
-    stamps = source.stamp[_owned(_valid(source.stamp, latency), span)]
-    counts = _measurement_counts(kept.rows(_owned(kept.time, span)), stamps)
+    stamps = source.stamp[owned(_valid(source.stamp, latency), span)]
+    counts = _measurement_counts(kept.rows(owned(kept.time, span)), stamps)
     note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
     if sensor is None:
         note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
@@ -547,7 +547,7 @@ def on_any_axis(codes: CodeArray, kind: Outcome) -> BoolArray:
     return reduce(np.logical_or, (codes == int(kind)).T)
 
 
-def _owned(time: TimeArray, span: tuple[int, int]) -> IntArray | slice:
+def owned(time: TimeArray, span: tuple[int, int]) -> IntArray | slice:
     """Which rows of a piece are its own: those without a stamp too, which no other piece has."""
     if span == WHOLE:
         return slice(None)

@@ -19,6 +19,7 @@ from ..arrays import FloatArray
 from ..errors import ConfigError, RunError
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig, Sensor
+from ..fusion.overruns import overrun_notes, overruns
 from ..fusion.segments import build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
@@ -199,9 +200,9 @@ def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[Ax
             recording = Recording(told_at, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
             measured = Measured([recording], arm.update_period, [source], arm.axes[axis])
             counts = {"used" if word == Outcome.FUSED.word else word: n for word, n in segment.counts[source].items()}
-            notes = [*jumps, *segment.notes] if not part else []
+            notes = [*jumps, *segment.notes, *overrun_notes([overruns(segment, arm)], arm, segment.origin)]
             counted = {"commands": dict(segment.command_counts), "rows": counts}
-            part.append(_verified(measured, run, axis, arm, counted, notes))
+            part.append(_verified(measured, run, axis, arm, counted, [] if part else notes))
     return part
 
 
@@ -370,5 +371,5 @@ def _half_width(measured: Measured, arm: Arm, names: Coordinates, noise: NoiseMo
     What a model leaves over of a run is correlated, and each measurement alone would count far too much: a block of the
     run counts as one observation (Bester, Conley & Hansen, J. Econometrics 165, 2011).
     """
-    _, variance = measured.lag_variances(arm, names, noise, _ANY, _BLOCKS, lambda arm: arm.model.lag(arm.delay, speed))
+    _, variance = measured.variances(arm, names, noise, _ANY, _BLOCKS, lambda arm: arm.model.lag(arm.delay, speed))
     return t_quantile(_BLOCKS - 1) * (variance * _BLOCKS / (_BLOCKS - 1)) ** 0.5

@@ -22,7 +22,7 @@ from .plants import PLANTS, Delay
 PRESETS = {name: Path(__file__).with_name(f"{name}.toml") for name in ("puma560-internal", "puma560-external")}
 CANONICAL_AXES = ("tangential", "radial", "vertical")
 Slope = Annotated[float, msgspec.Meta(gt=-1, le=1e3)]  # at -1 or less a tool would go backwards, at 1000 run away
-_EXCEEDED = 1.005  # share of a limit from which two decimals show that it is exceeded
+EXCEEDED = 1.005  # share of a limit from which two decimals show that it is exceeded
 
 
 class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -89,6 +89,23 @@ class Sag(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
             line = line + (self.slope_below - self.slope) * np.minimum(position - self.knee_below, 0.0)
         return line
 
+    def words(self, screen: Screen) -> list[str]:
+        """How far off it holds the tool, with the intervals, a phrase for each piece that is no offset of 0."""
+        line = (
+            f"off by {self.offset * screen.scale:.4g} {screen.unit} at 0, and moves {1.0 + self.slope:.4g} times as far"
+        )
+        phrases = [f"sag: {line} as commanded"] if self.offset or self.slope else []
+        for side, knee, knee_ci95, slope, slope_ci95 in (
+            ("above", self.knee, self.knee_ci95, self.slope_beyond, self.slope_beyond_ci95),
+            ("below", self.knee_below, self.knee_below_ci95, self.slope_below, self.slope_below_ci95),
+        ):
+            if knee is not None and slope is not None:
+                ends = None if slope_ci95 is None else (1.0 + slope_ci95[0], 1.0 + slope_ci95[1])
+                times = _sized(1.0 + slope, ends, 1.0 / (1.0 + self.slope))
+                at = f"{_sized(knee, knee_ci95, screen.scale)} {screen.unit}"
+                phrases.append(f"sag: {side} {at} it moves {times} times as far as elsewhere")
+        return phrases
+
 
 class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The model of one axis.
@@ -137,6 +154,18 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         gain_error = 1.0 - (self.gain.slope * speed + self.gain.intercept)
         return delay + self.plant.lag + gain_error * (self.gain_recovery or 0.0)
 
+    @property
+    def bends(self) -> list[str]:
+        """Its play, fastest speed and sag, with intervals, and of which motion its lag is; of a linear axis nothing."""
+        screen, phrases = SCREEN[self.kind], list[str]()
+        if self.play:
+            size = f"{_sized(self.play, self.play_ci95, screen.scale)} {screen.unit}"
+            phrases.append(f"play: {size}, half of which over its speed adds to its lag")
+        if self.max_speed:
+            size = f"{_sized(self.max_speed, self.max_speed_ci95, screen.scale)} {screen.unit}/s"
+            phrases.append(f"fastest speed: {size}, up to which its lag holds")
+        return [*phrases, *(self.sag.words(screen) if self.sag else [])]
+
 
 class Joint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A joint of an arm that is commanded in joints and whose axes are those of its tool.
@@ -177,7 +206,7 @@ class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         sentences: list[str] = []
         for kind, fastest in speed.items():
             limit, screen = self.limit_of(kind), SCREEN[kind]
-            if limit is not None and fastest > limit * _EXCEEDED:
+            if limit is not None and fastest > limit * EXCEEDED:
                 shown = f"{limit * screen.fast_scale:g} {screen.fast}"
                 sentences.append(
                     f"commanded speed reaches {fastest * screen.fast_scale:.3g} {screen.fast},"
@@ -332,6 +361,10 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             " it went, which no arm does for long; tune --fit gain finds a recovery"
         ]
 
+    def bends(self) -> list[str]:
+        """A sentence on each axis that has play, a fastest speed or a sag: :attr:`AxisModel.bends`."""
+        return [f"{name}: {'; '.join(axis.bends)}" for name, axis in self.axes.items() if axis.bends]
+
     def lag_of(self, axis: str, speed: float = 0.0) -> float:
         """Total lag [s] of one axis behind the held command at constant velocity: :meth:`AxisModel.lag`."""
         return self.axis(axis).lag(self.delay_of(axis), speed)
@@ -340,6 +373,13 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 def commanded_speed(step: FloatArray, period: float) -> FloatArray:
     """Speed of each command: its step over the update period [s] (the paper's "speed" of a step)."""
     return np.abs(step) / period
+
+
+def _sized(value: float, ci95: Interval | None, scale: float) -> str:
+    """A number with its interval, if there is one, both times ``scale``."""
+    if ci95 is None:
+        return f"about {value * scale:.4g}"
+    return f"{value * scale:.4g} ({ci95[0] * scale:.4g} to {ci95[1] * scale:.4g})"
 
 
 def arm_of(tree: Mapping[str, Any], where: str) -> ArmModel:

@@ -66,8 +66,9 @@ def fuse_to(
                 write[0](results.estimates_table(est))
                 write[1](results.measurements_table(est))
                 if est.reference is not None:
-                    write[2](results.reference_table(est.reference.between(*span), est.config))
-                digests.append(digest(est))
+                    since, until = ((instant - est.origin) / 1e9 for instant in span)
+                    write[2](results.reference_table(est.reference.between(since, until), est.config))
+                digests.append(digest(est, span))
                 if progress is not None:
                     progress(done)
         if not any(digest.estimates for digest in digests):
@@ -86,8 +87,8 @@ def _pieces(
     sensors: Iterable[str] | None,
     rate: float | None,
     part: tuple[float | None, float | None],
-) -> Iterator[tuple[Estimates, tuple[float, float], float]]:
-    """The estimates of each piece, its first and last instant [s], and which share of the run is done by then."""
+) -> Iterator[tuple[Estimates, tuple[int, int], float]]:
+    """The estimates of each piece, after and until which instants [ns], and which share of the run is done by then."""
     chosen = None if sensors is None else config.sensor_names(sensors)
     ahead, overlap = _margins(config)
     begun, after, until = None, ALWAYS, ALWAYS
@@ -101,8 +102,7 @@ def _pieces(
         over = cut - ahead > run.ends(begun[0].origin)[1] + overlap
         until = NEVER if cut == NEVER or over else cut - ahead
         est = _piece(run, config, chosen, rate, *begun, (after, until))
-        span = [(instant - est.origin) / 1e9 for instant in (after, until)]
-        yield est, (span[0], span[1]), 1.0 if until == NEVER else log.done / log.rows
+        yield est, (after, until), 1.0 if until == NEVER else log.done / log.rows
         told_at = [est.segments[0].commands_of(axis)[0] for axis in est.axes]
         log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in told_at]))
         after = until

@@ -20,6 +20,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.consistency import Consistency, chi_square_band, whiteness_of
 from ..fusion.estimates import Estimates
 from ..fusion.offline import UNCOVERED
+from ..fusion.overruns import Overrun, overrun_notes, overruns
 from ..fusion.score import OrientationScore
 from ..fusion.segments import added
 from ..fusion.summary import (
@@ -56,10 +57,11 @@ class Digest(NamedTuple):
     innovations: dict[tuple[str, str], Innovations]  # by axis and sensor, where any was fused
     scored: bool  # whether the run has a reference
     orientation: OrientationScore | None  # the score of the axes rx, ry, rz together
+    overruns: dict[str, Overrun]  # of each axis with a fastest speed the commands beyond it
 
 
-def digest(est: Estimates) -> Digest:
-    """What has to be kept of a piece for the summary of the run."""
+def digest(est: Estimates, span: tuple[int, int]) -> Digest:
+    """What has to be kept of a piece, of commands those after and until two instants [ns], for a run's summary."""
     innovations = dict[tuple[str, str], Innovations]()
     for axis in est.axes:
         evidence = evidence_of(est, axis)
@@ -73,7 +75,8 @@ def digest(est: Estimates) -> Digest:
     small = replace(est, time=est.time[:: max(len(est.time) - 1, 1)].copy(), axes={}, cartesian=None, measurements=none)
     small = replace(small, reference=None, segment=np.zeros(2, dtype=np.int64), segments=())
     axes = {axis: axis_summary(est, axis) for axis in est.axes}
-    return Digest(small, len(est.time), axes, innovations, est.reference is not None, orientation_score(est))
+    beyond = overruns(est.segments[0], est.config.arm, span)
+    return Digest(small, len(est.time), axes, innovations, est.reference is not None, orientation_score(est), beyond)
 
 
 def merged(digests: Sequence[Digest]) -> Summary:
@@ -83,6 +86,7 @@ def merged(digests: Sequence[Digest]) -> Summary:
     axes = {axis: _axis(digests, axis) for axis in digests[0].axes}
     speed: dict[Kind, float] = {kind: max(part.speed[kind] for part in parts) for kind in first.speed}
     notes = [*_notes(parts), *config.arm.validity.excess(speed, None)]
+    notes += overrun_notes([digest.overruns for digest in digests], config.arm, first.origin)
     if digests[0].scored and not any(axis.score for axis in axes.values()):
         notes.append(UNCOVERED)
     if len(parts) > 1:

@@ -174,7 +174,7 @@ class ArmSearch:
     def lag_scatter(self, model: Model, arm: Arm) -> float:
         """How much more the lag scatters over pieces of the runs than the information says, 1 or more (White, 1982)."""
         names = self.freedom.names(model)
-        variances = self._measured.lag_variances(arm, names, self.noise, self.limits, _PIECES, lambda arm: arm.total)
+        variances = self._measured.variances(arm, names, self.noise, self.limits, _PIECES, lambda arm: arm.total)
         return max(1.0, math.sqrt(variances[1] / variances[0])) if variances[0] > 0.0 else 1.0
 
     def _bent(self, freedom: Freedom) -> Bent | None:

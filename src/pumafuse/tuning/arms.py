@@ -51,7 +51,7 @@ _REACH = {
     "play": 0.7, "max_speed": 0.3, "knee": math.inf, "beyond": 0.3, "knee_below": math.inf, "below": 0.3,
 }  # fmt: skip
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
-_NUDGE = 1e-5  # of a coordinate, by which a lag is varied
+_NUDGE = 1e-5  # of a coordinate, by which a size is varied
 _LOG_2PI = math.log(2.0 * math.pi)
 
 Coordinates: TypeAlias = Sequence[str]  # among the fields below
@@ -410,16 +410,16 @@ class Measured:
                 break
         return Fit(best.arm, best.log_posterior, best.information)
 
-    def lag_variances(
-        self, arm: Arm, names: Coordinates, noise: NoiseModel, limits: Limits, pieces: int, lag: Callable[[Arm], float]
+    def variances(
+        self, arm: Arm, names: Coordinates, noise: NoiseModel, limits: Limits, pieces: int, size: Callable[[Arm], float]
     ) -> tuple[float, float]:
-        """The variance of a lag [s²] by the information, and by the scatter of the score over pieces of the recordings.
+        """The variance of a size by the information, and by the scatter of the score over pieces of the recordings.
 
         Both are the same where the model is right (White, Econometrica 50, 1982). Coordinates at a bound stay there.
         """
         free = [name for name, inside in zip(names, limits.inside(arm, names), strict=True) if inside]
         beside = [arm.moved([name], [arm.coordinate(name) + _NUDGE]) for name in free]
-        slope = np.array([(lag(arm_beside) - lag(arm)) / _NUDGE for arm_beside in beside])
+        slope = np.array([(size(arm_beside) - size(arm)) / _NUDGE for arm_beside in beside])
         left, slopes, _ = self._sloped(arm, free, noise)
         scores = np.add.reduceat(slopes * left, np.unique(np.arange(pieces) * len(left) // pieces), axis=1)
         weight = covariance(self._linear(arm, free, noise, limits).information) @ slope

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
+from functools import partial
 from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
-from ..units import Screen
+from ..model.arm import AxisModel
+from ..units import SCREEN
 from .arms import BENDS, BEYOND, SAG, Arm, Fit, Limits, Measured, Recording, lonely
 from .plain import FOLLOWS, PlainArm, independent
 
@@ -34,6 +36,8 @@ _SLIGHT = 0.01  # of a slope that is no sag: of exact data any other slope expla
 _MANY = 1.02  # times those that are near the linear arm
 _KINDS = (("play", "max_speed", "sag"), ("stops",))  # of bends; sags have one knee, stops one on each side
 _SAGS = ("sag", "stops")
+_SLOPES = {"beyond": "slope_beyond", "below": "slope_below"}  # as a sag has them
+_BLOCKS, _STUDENT = 10, 2.262  # of the motion; the 97.5 % point of Student's t distribution of one fewer
 
 
 class Bent(NamedTuple):
@@ -42,19 +46,13 @@ class Bent(NamedTuple):
     arm: Arm  # the arm, fitted to all of the motion
     off: float  # how far it is off where it was not fitted [m]
     linear_off: float  # how far the linear arm is off there [m]
+    sag_half: dict[str, float]  # half the 95 % interval of each number of its sag, by its name in a :class:`Sag`
 
-    def sentences(self, screen: Screen) -> list[str]:
-        """What it has, and what that is worth, in the units of its axis."""
-        play, fastest = (size * screen.scale for size in (self.arm.play, self.arm.max_speed))
-        sentences = [f"play: about {play:.3g} {screen.unit}"] if play else []
-        sentences += [f"fastest speed: about {fastest:.4g} {screen.unit}/s"] if fastest else []
-        sides = ("above", self.arm.knee, self.arm.beyond), ("below", self.arm.knee_below, self.arm.below)
-        for where, knee, slope in sides:
-            if slope:
-                times = f"{1.0 + slope:.3g} times as far as elsewhere"
-                sentences.append(f"sag: {where} about {knee * screen.scale:.3g} {screen.unit} it moves {times}")
+    def sentences(self, model: AxisModel) -> list[str]:
+        """What the model of its axis has, and what that is worth."""
+        screen = SCREEN[model.kind]
         off, linear = self.off * screen.scale, self.linear_off * screen.scale
-        return [*sentences, f"with it {off:.3g} {screen.unit} off where it was not fitted, without it {linear:.3g}"]
+        return [*model.bends, f"with it {off:.3g} {screen.unit} off where it was not fitted, without it {linear:.3g}"]
 
 
 def bent_arm(plain: PlainArm, arm: Arm, free: Collection[str]) -> Bent | None:
@@ -82,7 +80,7 @@ def bent_arm(plain: PlainArm, arm: Arm, free: Collection[str]) -> Bent | None:
     if not chosen:
         return None
     linear, bent = (float(np.sqrt(mean_squares.mean())) for mean_squares in (squares[0], squares[-1]))
-    return Bent(search.whole(chosen), bent, linear)
+    return Bent(search.whole(chosen), bent, linear, search.sag_half(chosen))
 
 
 def _pays(kind: str, left: FloatArray, before: FloatArray) -> bool:
@@ -190,6 +188,19 @@ class _Search:
             self._wholes[key] = max(fits, key=lambda fit: fit.log_posterior).arm
         return self._wholes[key]
 
+    def sag_half(self, kinds: Sequence[str]) -> dict[str, float]:
+        """Half the 95 % interval of each number of the sag of the whole arm, by the scatter over blocks of the motion.
+
+        What an arm leaves is correlated: a block counts as one observation (see :mod:`pumafuse.identification.verify`).
+        """
+        arm, halves = self.whole(kinds), dict[str, float]()
+        (names, limits), noise = self._coordinates(arm, kinds), self.measured.white(arm)
+        for name in (name for name in SAG if name in names):
+            size = partial(Arm.coordinate, name=name)
+            _, variance = self.measured.variances(arm, names, noise, limits, _BLOCKS, size)
+            halves[_SLOPES.get(name, name)] = _STUDENT * math.sqrt(variance * _BLOCKS / (_BLOCKS - 1))
+        return halves
+
     def off(self, kinds: Sequence[str]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""
         first, second = self.halves
@@ -199,12 +210,17 @@ class _Search:
 
     def _fitted(self, measured: Measured, near: Arm, kinds: Sequence[str]) -> Fit:
         """The arm of least squares with these bends near one of the same order."""
+        names, limits = self._coordinates(near, kinds)
+        return measured.fitted(near, names, self._noise, limits)
+
+    def _coordinates(self, arm: Arm, kinds: Sequence[str]) -> tuple[list[str], Limits]:
+        """What is free of an arm of its order with these bends, and within which limits."""
         bends = [name for kind in kinds for name in self._starts[kind] if name != "gain"]
-        limits, names = self._limits, [name for name in self._names if name != "damping" or near.damping]
+        limits, names = self._limits, [name for name in self._names if name != "damping" or arm.damping]
         if "stops" in kinds:  # between them is the middle of what is commanded
             sides = {"knee": (self._middle, self._high), "knee_below": (self._low, self._middle)}
             limits = limits._replace(bounds={**limits.bounds, **sides})
-        return measured.fitted(near, [*names, *bends], self._noise, limits)
+        return [*names, *bends], limits
 
 
 def _best_knees(level: FloatArray, left: FloatArray, count: int, middle: float) -> list[float]:

@@ -24,10 +24,10 @@ from ..errors import PumafuseWarning, UnknownNameError
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor, Start
 from ..logs.axes import in_axes
 from ..logs.run import REFERENCE, Run
-from ..model.arm import ArmModel, AxisModel
+from ..model.arm import ArmModel, AxisModel, Sag
 from ..model.plants import FirstOrder
 from ..toml import Interval
-from ..units import MS, SCREEN, Kind
+from ..units import MS, Kind
 from .arm_search import ArmSearch, Chosen, Freedom, chosen_arms
 from .arms import BENDS, Arm
 from .identifiability import FEW, TuneError, excited_axes
@@ -89,6 +89,7 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
         play_ci95: Its interval.
         max_speed: The fastest that the axis itself goes [m/s or rad/s]; null: no limit was found.
         max_speed_ci95: Its interval.
+        sag: How far a load holds the tool off, with intervals; null: no sag was found.
         drift: How much later it is at the end than at the beginning [s]; null: not known.
         drift_sd: Its standard deviation [s].
         drifts: Whether that is more than chance.
@@ -120,6 +121,7 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
     play_ci95: Interval | None = msgspec.field(name="play_mm_ci95", default=None)
     max_speed: float | None = msgspec.field(name="max_speed_mm_s", default=None)
     max_speed_ci95: Interval | None = msgspec.field(name="max_speed_mm_s_ci95", default=None)
+    sag: Sag | None = None
     drift: float | None = msgspec.field(name="drift_ms", default=None)
     drift_sd: float | None = msgspec.field(name="drift_sd_ms", default=None)
     drifts: bool = False
@@ -220,6 +222,7 @@ class Latency:
                 if hasattr(arm.axes[axis].plant, name):
                     arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(lag, f"{name}_ci95"))
             arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), lag.gain_ci95)
+            arm = changed(arm, ("axes", axis, "sag"), lag.sag)
             for name in ("gain_recovery", *BENDS, "lag"):
                 arm = changed(arm, ("axes", axis, f"{name}_ci95"), getattr(lag, f"{name}_ci95"))
             has_own_delay = arm.axes[axis].delay is not None
@@ -291,7 +294,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     best, sensors, said = _sensors(every, config, trusted, pairs)
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
-    notes = [*turned, *likelihood.notes, *said]
+    notes = [*turned, *likelihood.notes, *said, *likelihood.overruns(config.arm)]
     notes += [f"{axis}: does not move, or {trusted} does not measure it" for axis in still]
     notes += [f"{axis}: {plain.step}" for axis in lags if (plain := searches[axis].plain) and plain.step]
     notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
@@ -489,6 +492,10 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         values |= {bend: getattr(arm, bend), f"{bend}_ci95": interval(bend, getattr(arm, bend))}
     if arm.recovery:
         values |= {"gain_recovery": arm.recovery, "gain_recovery_ci95": interval("gain_recovery", arm.recovery)}
+    if search.bent is not None and (sag := arm.model.sag) is not None:
+        sizes = {name: (getattr(sag, name), _MARGIN * half) for name, half in search.bent.sag_half.items()}
+        ends = {f"{name}_ci95": (size - half, size + half) for name, (size, half) in sizes.items()}
+        values["sag"] = msgspec.structs.replace(sag, **ends)
     lag = AxisLag(
         sensor=trusted,
         lag=arm.total,
@@ -502,7 +509,10 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         kind=kind,
         **values,
     )
-    notes = ["; ".join(search.bent.sentences(SCREEN[kind]))] if search.bent is not None else []
+    notes = list[str]()
+    if search.bent is not None:
+        bends = {name: values[name] for name in ("play_ci95", "max_speed_ci95", "sag") if name in values}
+        notes.append("; ".join(search.bent.sentences(msgspec.structs.replace(arm.model, kind=kind, **bends))))
     return msgspec.structs.replace(lag, notes=[*notes, *_notes(lag, search.limits.bounds["gain"])])
 
 

@@ -30,10 +30,12 @@ from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations, linearised
 from ..fusion.faults import Fault, not_following, starts_in_motion, within_a_turn
+from ..fusion.overruns import overrun_notes, overruns
 from ..fusion.placing import in_base
 from ..fusion.segments import Segment, added, build
 from ..logs.clock import clock_faults, segments
 from ..logs.run import Run
+from ..model.arm import ArmModel
 from .arms import Measured, Recording
 from .parameters import Parameter, changed
 
@@ -158,7 +160,10 @@ class Likelihood:
         }
         self.config = config
         self.axes = tuple(axis for axis in config.arm.axes if any(axis in segment.axes for segment in built))
-        self._segments = [_decided(segment, until, latest) for segment in built]
+        self._segments, self._runs = (
+            [_decided(segment, until, latest) for segment in built],
+            [name for name, _ in named],
+        )
         self._parts = [
             _Part(number, self.axes.index(axis), segment.of_axis(axis, rows), rows, column)
             for number, segment in enumerate(self._segments)
@@ -237,6 +242,14 @@ class Likelihood:
                 late[name] = late.get(name, 0) + int(np.count_nonzero(rows.time > end))
                 every[name] = every.get(name, 0) + len(rows.time)
         return {name: late[name] / count for name, count in every.items() if count}
+
+    def overruns(self, arm: ArmModel) -> list[str]:
+        """A sentence on each axis of each run with commands beyond the fastest speed that an arm goes."""
+        return [
+            f"run '{name}': {note}"
+            for name, segment in zip(self._runs, self._segments, strict=True)
+            for note in overrun_notes([overruns(segment, arm)], arm, segment.origin)
+        ]
 
     @cached_property
     def travel(self) -> dict[str, float]:

@@ -107,7 +107,7 @@ class Search:
             config, why = with_arm(config, axis, choice.arm), self.reasons[axis]
             why += _why(searched[axis].freedom, choice.mixture, choice.model)
             if (bent := searched[axis].bent) is not None:
-                why += bent.sentences(config.arm.screen_of(axis))
+                why += bent.sentences(msgspec.structs.replace(bent.arm.model, kind=config.arm.axes[axis].kind))
             if len(delayed) > 1 and axis in delayed:
                 gain = "" if choice.worth is None else f" (own {choice.worth:+.1f})"
                 why.append(f"delay: {'shared' if choice.shares else 'its own'}{gain}")

@@ -185,7 +185,7 @@ def tune(
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
     seen = validate is not None and any(_same(validate, run) for run in runs)
     notes += _seen_before(config, runs[0] if validate is None else validate, validation)
-    notes += latency_questions(tuned, pipeline.whole.share_after_end)
+    notes += [*latency_questions(tuned, pipeline.whole.share_after_end), *pipeline.whole.overruns(tuned.arm)]
     notes += _validation_notes(validation, seen, interrupted)
     summary = TuningSummary(
         pumafuse=version("pumafuse"),

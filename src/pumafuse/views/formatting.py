@@ -9,7 +9,7 @@ import numpy as np
 
 from ..identification.anova import Level
 from ..identification.estimate import Estimate
-from ..model.arm import Gain
+from ..model.arm import ArmModel, Gain
 from ..model.plants import PLANTS, FirstOrder
 from ..toml import Interval
 from ..units import MS, SCREEN, Kind
@@ -45,12 +45,13 @@ def milliseconds(estimate: Estimate | None) -> str:
     return "–" if estimate is None else with_interval(estimate.value, estimate.ci95, MS)
 
 
-def lag(period: float) -> str:
-    """Which lag is meant, of an arm with this update period [s]."""
-    return (
+def lag(arm: ArmModel) -> list[str]:
+    """Which lag is meant of an arm, and what makes it depend on the motion, a sentence each."""
+    return [
         "lag: behind the held command at constant velocity (dead time, plant and a gain that recovers); behind the path"
-        f" through the commanded points it is T/2 = {0.5 * period * MS:g} ms more"
-    )
+        f" through the commanded points it is T/2 = {0.5 * arm.update_period * MS:g} ms more",
+        *arm.bends(),
+    ]
 
 
 def chosen(orders: Mapping[str, str]) -> list[str]:

@@ -105,7 +105,7 @@ def scatter(identification: Identification) -> TextTable:
 
 def sentences(identification: Identification) -> list[str]:
     """Which lag is meant, what was decided for each axis, and which trials were left out."""
-    lines = [formatting.lag(identification.arm.update_period)]
+    lines = formatting.lag(identification.arm)
     for axis, model in identification.axes.items():
         lines.append(f"{axis}: {model.choice.why}; {model.gain_words}")
         if model.delay_spread > 2.0 * model.delay_noise:
@@ -337,7 +337,7 @@ def write_verification(
     content = {
         "arm": arm,
         "runs": {result.run for result in every},
-        "lag": formatting.lag(arm.update_period),
+        "lag": formatting.lag(arm),
         "worst": max(every, key=lambda result: result.model.rms / max(result.best_in_class.fit.rms, 1e-12)),
         "table_iii": verifications(every),
         "figures": [(step_figures.verification(result, trace), verdict(result)) for result, trace in verified],

@@ -59,7 +59,7 @@ def page(tuning: Tuning, runs: Sequence[Run]) -> str:
             *map(formatting.together, summary.correlations),
             *formatting.chosen(summary.orders),
         ],
-        "lag_words": formatting.lag(tuning.config.arm.update_period),
+        "lag_words": formatting.lag(tuning.config.arm),
         "fitted": formatting.fitted(summary),
         "config": tuning.config,
         "known": configured,
