@@ -1024,6 +1024,56 @@ def test_of_columns_without_names_that_move_at_once_the_one_that_stands_is_the_c
     assert [one.column for (one,) in found.roles.sensors[0].axes.values()] == ["column 2"]
 
 
+def test_what_follows_as_positions_do_is_none_where_velocities_tell_which_are(tmp_path: Path) -> None:
+    """A log of positions, their velocities, and motor currents behind the wanted ones: nothing there was commanded."""
+    t, u, _ = recorded_at_once()
+    wanted, drawn = (9.0 * path(0.8 * t - late)[:, ::-1] - 3.0 for late in (0.0, 0.03))
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, u, np.gradient(u, 0.02, axis=0), drawn, wanted]), "%.6f")
+    assert "which numbers are the commands?" in one_line(RunError, lambda: survey(tmp_path / "log.txt"))
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, drawn, wanted]), "%.6f")  # where nothing says so, they are
+    assert set(survey(tmp_path / "log.txt").run.sensors) == {"measured"}
+
+
+def test_columns_without_names_of_another_joint_that_moves_alike_are_no_second_sensor(tmp_path: Path) -> None:
+    """It follows the same commands, but not as far; an encoder that goes as far is one."""
+    t, u, z = recorded_at_once()
+    coupled, encoder = 1.3 - 0.6 * z[:, 1], path(t - 0.15)[:, 1]
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, u[:, 1], z[:, 1], 2.6 - coupled, encoder]), "%.6f")
+    found = survey(tmp_path / "log.txt")
+    assert of_roles(found) == [["column 2"], ["column 3"], ["column 5"]]
+    assert found.roles is not None
+    (left_out,) = ((list(stream.axes), why) for stream, why in found.roles.left_out)
+    assert left_out == (["column_4"], "they follow nothing as far, at the same level")
+
+
+def test_of_two_columns_without_names_one_may_follow_steps_slowly(tmp_path: Path) -> None:
+    """A square wave has two levels and no middle; an axis that swings behind it is as far, and never quite alike."""
+    t = 0.005 * np.arange(3000)
+    told = np.where(t % 4.0 < 2.1, 0.7, -0.7)
+    seen = np.zeros(len(t))
+    for row in range(1, len(t)):
+        seen[row] = seen[row - 1] + (told[row - 1] - seen[row - 1]) * 0.005 / 0.11
+    np.savetxt(tmp_path / "steps.txt", np.column_stack([t, seen, told]), "%.6f")
+    found = survey(tmp_path / "steps.txt")
+    assert of_roles(found) == [["column 3"], ["column 2"]]
+    assert next(iter(found.relations.values())).correlation < 0.98
+
+
+def test_bodies_that_a_tracker_sees_in_turns_command_each_other_nothing(tmp_path: Path) -> None:
+    """One tool with two bodies, whose positions are a little later on one axis as it turns; their quaternions."""
+    t, u, _, _ = recorded(600)
+    rotation = Rotation.from_rotvec(np.sin(0.9 * t)[:, None] * np.array([0.1, 0.3, 0.2]))
+    other = u + np.array([0.0, 0.1, 0.02]) + 0.002 * np.gradient(u, t, axis=0) * np.array([-9.0, 0.0, 0.5])
+    both = [[("disc", u), ("rod", other)][row % 2] for row in range(2 * len(t))]
+    columns: dict[str, Any] = {"t_s": np.repeat(t, 2), "body": [name for name, _ in both]}
+    for axis in range(3):
+        columns[f"pos{axis}"] = [at[row // 2, axis] for row, (_, at) in enumerate(both)]
+    columns |= {f"rot{part}": np.repeat(rotation.as_quat()[:, part], 2) for part in range(4)}
+    write(tmp_path / "take.csv", columns)
+    said = one_line(RunError, lambda: survey(tmp_path / "take.csv"))
+    assert "which numbers are the commands?" in said and "rot" not in said
+
+
 def test_columns_without_names_are_called_as_nothing(log: Path) -> None:
     """The second column of torques is not that of the commands, nor is a clock in a file of its own a joint."""
     t, u, s, z = recorded()

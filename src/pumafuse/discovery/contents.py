@@ -56,6 +56,7 @@ RANGES: dict[Kind, tuple[str, str, float]] = {  # small and large unit, and beyo
     "length": ("m", "mm", 10.0),
     "angle": ("rad", "deg", 2.0 * math.pi),
 }
+_NUMBER = re.compile(r"\[?\d+\]?$")  # of a column in a list
 _OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
@@ -131,6 +132,7 @@ class Signal:
     basis: str  # how the unit is known: 'name', 'type', 'turn', or 'range', which is a guess
     plain: FloatArray  # its numbers in that unit, (rows,)
     turns: bool = False  # whether it is an angle that begins anew after each turn
+    has_velocity: bool = False  # whether another column adds up to it
     # in which of the rows it is this axis, where others are in rows of their own
     where: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
@@ -305,8 +307,11 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
         clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts)
     used = () if clock is None else tuple(clock.time.columns)
     if clock and is_nameless(signals, clock):
-        left_out |= _velocities([signal for signal in signals if signal.column not in used], clock.stamp)
-        signals = [signal for signal in signals if signal.name not in left_out]
+        sums = _velocities([signal for signal in signals if signal.column not in used], clock.stamp)
+        left_out |= {name: f"velocity: it adds up to {position} by the clock" for name, position in sums.items()}
+        signals = [
+            replace(signal, has_velocity=signal.name in sums.values()) for signal in signals if signal.name not in sums
+        ]
     left_out |= {path: "another clock" if clock else _no_clock(table, path) for path in times}
     accounted = {path for path in left_out if path in used or path.startswith(tuple(f"{path}." for path in used))}
     return replace(
@@ -346,12 +351,9 @@ def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
         1.0 - (power - sign * 2.0 * both) / np.maximum(spread, 1e-30)[:, None] for sign in (1.0, -1.0)
     )
     is_velocity = (as_it_is > _IS_VELOCITY) & ~(np.maximum(as_it_is, mirrored).T > _EITHER)
-    sums_of = {
-        int(column): signals[int(np.argmax(as_it_is[:, column]))] for column in np.flatnonzero(is_velocity.any(axis=0))
-    }
     return {
-        signals[column].name: f"velocity: it adds up to {position.name} by the clock"
-        for column, position in sums_of.items()
+        signals[column].name: signals[int(np.argmax(as_it_is[:, column]))].name
+        for column in np.flatnonzero(is_velocity.any(axis=0)).tolist()
     }
 
 
@@ -369,11 +371,11 @@ def _likeliest(columns: Sequence[str]) -> list[str]:
 
 
 def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
-    """Columns that are no quaternion, which are four of one list, of length 1 in each row."""
+    """Columns that are no quaternion, which are four of one list, or numbered, of length 1 in each row."""
     lists = dict[str, list[Signal]]()
     for signal in signals:
-        if signal.column.endswith("]"):
-            lists.setdefault(leaf(signal.column), []).append(signal)
+        if (number := _NUMBER.search(signal.column)) is not None:
+            lists.setdefault(_called(signal.column[: number.start()], signal.where), []).append(signal)
     for four in lists.values():
         if len(four) == 4 and are_units(np.column_stack([signal.plain for signal in four])):
             left_out |= {signal.name: "of a quaternion" for signal in four}

@@ -21,7 +21,7 @@ from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
 from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
-from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, unused
+from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, period_of, unused
 from .following import LATEST, Following, following
 from .matching import far_shift
 from .names import Role
@@ -54,7 +54,7 @@ class Stream:
 
     name: str
     role: Role | None  # what it is; None: its names do not say
-    why: str  # how that is known
+    why: str  # how that is known; of what is neither, why not, if that is known
     part: Part
     axes: Mapping[str, Sequence[Signal]]  # for each axis its columns, which are added up
     attitude: Attitude | None = None  # its orientation, if it tells one
@@ -182,6 +182,9 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             continue
         if stream.role == "command":
             left_out.append((stream, "other commands: a run has one source of them; exchange the two to use these"))
+            continue
+        if stream.role is None and stream.why:
+            left_out.append((stream, stream.why))
             continue
         stream = _on_one_clock(command, stream)
         axes, why_not = _matched(command, stream)
@@ -476,19 +479,21 @@ def _apart(stream: Stream) -> list[Stream]:
 def _led(stream: Stream) -> list[Stream]:
     """A stream of columns without names, taken apart where some follow others: as far, at the same level, later.
 
-    Or at once, and noisier.
+    Or at once, and noisier. Of two alone one may follow less closely, as no other could be taken for it. Where
+    velocities tell which columns are positions, pairs without any of these are something else, as motor currents.
     """
     source, columns = stream.source, list(stream.axes)
     signals = [signal for some in stream.axes.values() for signal in some]
     if len(columns) > _MOST_APART or not stream.part.clock or not is_nameless(signals, stream.part.clock):
         return [stream]
     leads = dict[str, dict[str, float]]()  # of those that follow it, how late they do
-    ends = {axis: np.quantile(value, (0.0, 0.5, 1.0)) for axis, value in source.values.items()}
+    levels = {axis: np.array([value.min(), value.mean(), value.max()]) for axis, value in source.values.items()}
+    alike = SAME if len(columns) == 2 else _ALIKE
     for leader, other in permutations(columns, 2):
-        if np.abs(ends[leader] - ends[other]).max() > _LEVEL * np.ptp(ends[other]):
+        if np.abs(levels[leader] - levels[other]).max() > _LEVEL * np.ptp(levels[other]):
             continue
         relation = following((source.stamp, source.values[leader]), (source.stamp, source.values[other]))
-        if relation is None or relation.correlation <= _ALIKE or not -_AT_ONCE < relation.lag < MOST_LAG:
+        if relation is None or relation.correlation <= alike or not -_AT_ONCE < relation.lag < MOST_LAG:
             continue
         if relation.lag > _AT_ONCE or _stands_beside(source.values[leader], source.values[other]):
             leads.setdefault(leader, {})[other] = relation.lag
@@ -498,16 +503,25 @@ def _led(stream: Stream) -> list[Stream]:
         free = {other: lag for other, lag in leads[leader].items() if other not in pairs.values()}
         if free:
             pairs[leader] = min(free, key=free.__getitem__)
-    if not pairs:
+    paired, positions = {*pairs, *pairs.values()}, {axis for axis, some in stream.axes.items() if some[0].has_velocity}
+    if not pairs or (positions and positions.isdisjoint(paired)):
         return [stream]
-    unpaired = {axis: some for axis, some in stream.axes.items() if axis not in {*pairs, *pairs.values()}}
+    beside = {other for leader in pairs for other in leads[leader]} - paired
     told, seen = (
         {leader: stream.axes[leader] for leader in pairs},
         {leader: stream.axes[other] for leader, other in pairs.items()},
     )
     command = Stream("commanded", "command", "others follow it as far, later or noisier", stream.part, told)
-    others = {"measured": seen, "others": unpaired}
-    return [command, *(Stream(name, None, "", stream.part, axes) for name, axes in others.items() if axes)]
+    others = (
+        ("measured", "", seen),
+        ("measured", "", {axis: stream.axes[axis] for axis in columns if axis in beside}),
+        (
+            "others",
+            "they follow nothing as far, at the same level",
+            {axis: some for axis, some in stream.axes.items() if axis not in paired | beside},
+        ),
+    )
+    return [command, *(Stream(name, None, why, stream.part, axes) for name, why, axes in others if axes)]
 
 
 def _stands_beside(told: FloatArray, seen: FloatArray) -> bool:
@@ -569,17 +583,25 @@ def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
 
 
 def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]:
-    """How many axes of others run behind a stream, each as far as its motion is the same; by how much, in all [s]."""
+    """How many axes of others run behind a stream, each as far as its motion is the same; by how much, in all [s].
+
+    Less than half a row is at once, and what is later than an arm counts where names say that it is commanded. Where
+    these are most axes, the others only seem late, as two bodies in one frame do that turn.
+    """
     count = late = 0.0
+    latest = LATEST if leader.role == "command" else MOST_LAG
     for other in streams:
         if other is not leader and other.role != "command":
             axes, _ = _matched(leader, other)
             relations = _relations(leader, replace(other, axes=axes))
             if not any(abs(relation.correlation) >= SAME for relation in relations):
                 relations = list(filter(None, [speeds_follow(leader.source, other.source)]))
-            for relation in relations:
-                if abs(relation.correlation) >= SAME and relation.lag > _AT_ONCE:
-                    count, late = count + abs(relation.correlation), late + relation.lag
+            alike = [relation for relation in relations if abs(relation.correlation) >= SAME]
+            at_once = max(_AT_ONCE, 0.5 * period_of(other.source))
+            behind = [relation for relation in alike if at_once < relation.lag < latest]
+            if 2 * len(behind) >= len(alike):
+                count += sum(abs(relation.correlation) for relation in behind)
+                late += sum(relation.lag for relation in behind)
     return round(count, 1), late
 
 
