@@ -1074,6 +1074,36 @@ def test_bodies_that_a_tracker_sees_in_turns_command_each_other_nothing(tmp_path
     assert "which numbers are the commands?" in said and "rot" not in said
 
 
+def test_an_axis_that_moves_before_its_commands_says_nothing_of_another_clock_in_the_same_rows(log: Path) -> None:
+    """A weld: y follows along the seam; the torch is drawn back by another program, and the commands catch up."""
+    t = 0.012 * np.arange(2424)
+    seam = np.minimum(t, 25.8) * 3.4
+    back, lift = (np.clip((t - at) / took, 0.0, 1.0) * 66.0 for at, took in ((29.04, 0.02), (28.6, 0.4)))
+    seen = np.round(np.minimum(np.maximum(t - 0.06, 0.0), 25.8) * 3.4, 1)
+    told = {"y_setpoint_mm": seam, "z_setpoint_mm": 900.0 + back}
+    write(log / "weld.csv", {"t_s": t, **told, "y_actual_mm": seen, "z_actual_mm": np.round(900.0 + lift, 1)})
+    found = survey(log / "weld.csv")
+    assert found.relations["actual", "y"].lag == pytest.approx(0.06, abs=0.012)  # a row
+    assert not any("s late?" in question for question in asked(found))
+
+
+def test_of_a_stroke_at_constant_speed_no_other_clock_is_made(log: Path) -> None:
+    """It stops shortly before the end: at no lag of an arm a trend leaves much of it, at others the stop is not seen.
+
+    Where the last shift at which it is seen does best, none does.
+    """
+    t = 0.015 * np.arange(1800)
+    s = t[7::9]
+    noise = np.random.default_rng(6).normal(scale=0.08, size=s.shape)
+    stroke = 210.0 - 5.2 * np.minimum(t, 24.4)
+    write(log / "target.csv", {"t_s": t, "feed_mm": stroke})
+    write(log / "scale.csv", {"t_s": s, "feed_mm": np.interp(s - 0.09, t, stroke) + noise})
+    found = survey(log)
+    (relation,) = found.relations.values()
+    assert relation.lag == pytest.approx(0.09, abs=0.01)
+    assert not any("clock" in question for question in asked(found))
+
+
 def test_columns_without_names_are_called_as_nothing(log: Path) -> None:
     """The second column of torques is not that of the commands, nor is a clock in a file of its own a joint."""
     t, u, s, z = recorded()

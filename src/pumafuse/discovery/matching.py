@@ -142,14 +142,16 @@ def far_shift(led: Mapping[str, Rows], measured: Mapping[str, Rows], near: tuple
     step = max(period, _FINEST, (span + 2.0 * farthest) / _MOST_FAR)
     grid = Grid.around(begin, span, step, math.ceil(farthest / step))
     lag = apart + step * np.arange(-grid.margin, grid.margin + 1)
-    left, correlation = np.zeros(len(lag)), np.zeros(len(lag))
+    left, correlation, telling = np.zeros(len(lag)), np.zeros(len(lag)), np.zeros(len(lag))
     for axis, (stamp, value) in measured.items():
         fit = _fits(grid.mean(stamp, value), np.interp(grid.time - begin + first, *led[axis])[None], grid.margin)
         left += fit.unexplained[0]
         correlation = np.maximum(correlation, np.abs(fit.correlation[0]))
+        telling += fit.correlation[0] != 0.0
     late, here = _nearest(left, np.arange(len(lag))), (near[0] <= lag) & (lag <= near[1])
     at_once = left[here].min(initial=np.inf) <= left[late] + _MUCH_BETTER
-    if correlation[late] < _CLEARLY or (overlap and at_once):
+    is_edge = telling[max(late - 1, 0) : late + 2].min() < telling[late]  # beside it commands tell nothing, or less
+    if correlation[late] < _CLEARLY or is_edge or (overlap and at_once):
         return None
     return float(lag[late]) + _between(left, late) * step
 
