@@ -1104,6 +1104,16 @@ def test_of_a_stroke_at_constant_speed_no_other_clock_is_made(log: Path) -> None
     assert not any("clock" in question for question in asked(found))
 
 
+@pytest.mark.parametrize("first", [3, 3.0])
+def test_what_counts_poses_is_no_clock_however_it_is_written(first: float, tmp_path: Path) -> None:
+    """Poses at rest, numbered, of which some were left out: there is no time in it, as the refusal says."""
+    _, u, z = recorded_at_once()
+    count = first + np.delete(np.arange(1020), np.arange(200, 220))
+    write(tmp_path / "poses.csv", {"pose_index": count, "goal_q_rad": u[:, 0], "measured_q_rad": z[:, 0]})
+    said = one_line(RunError, lambda: survey(tmp_path / "poses.csv"))
+    assert "no clock for its 1000 rows" in said and "--rate HZ" in said
+
+
 def test_columns_without_names_are_called_as_nothing(log: Path) -> None:
     """The second column of torques is not that of the commands, nor is a clock in a file of its own a joint."""
     t, u, s, z = recorded()

@@ -593,9 +593,10 @@ def _numbered(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
 def _counts(table: Table, name: str) -> float | None:
     """The usual step of a column of whole numbers that rise evenly, as a clock's or a counter's; None of any other."""
     with suppress(RunError):
-        if names.unit_of(name) or not pa.types.is_integer(table.column(name).type):
+        numbers = table.plain(name)[0]
+        if names.unit_of(name) or not (numbers % 1.0 == 0.0).all():
             return None
-        steps = np.diff(table.plain(name)[0])
+        steps = np.diff(numbers)
         usual = float(np.median(steps)) if len(steps) >= _FEWEST_ROWS else 0.0
         if usual > 0.0 and np.mean(np.abs(steps - usual) <= _EVEN * usual) >= _IN_ORDER:
             return usual
