@@ -100,6 +100,20 @@ def test_gates_are_for_what_leaves_its_neighbours_far(spoilt: object, gate: floa
     assert sensors["actual"].gate == gate
 
 
+@pytest.mark.parametrize(("off", "gate"), [(0.0, 0.0), (1.5, 5.0)])
+def test_an_encoder_at_rest_that_flickers_by_a_count_needs_no_gate(off: float, gate: float, tmp_path: Path) -> None:
+    """It rests in most rows, and has no noise; one value that was written otherwise tells nothing of its counts."""
+    t = T * np.arange(1200)
+    u = 40.0 + 15.0 * (1.0 - np.cos(np.clip(t - 1.0, 0.0, 5.0) * 2.0))
+    z, count = np.interp(t - LATE, t, u), 0.02
+    z = np.round(z / count) * count
+    z[500] += 2e-6
+    z[600::80] += count
+    z[560::40] += off
+    _, sensors = guess(survey(log(tmp_path, z, u)))
+    assert sensors["actual"].gate == gate
+
+
 def test_a_camera_whose_latency_steps_tells_nothing_of_the_arms_lag(tmp_path: Path) -> None:
     """40 ms late, from 18 s on 90 ms: said, with its sd, and the arm's lag is right to 2 ms beside an encoder.
 

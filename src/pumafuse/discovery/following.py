@@ -22,6 +22,7 @@ _ALIKE = 1e-6  # of the smallest step, by which sizes of steps differ at least
 _MANY, _COARSER = 0.25, 0.5  # of all steps, those that are of one count; of a count, the coarsest digit it is seen by
 _OUTLYING = 8.0  # sds
 _APART = 5.0  # times as far off as its neighbours are: at the start or the turn of a motion it is three times
+_FLICKERING = 0.1  # of what changes at all, the share that is the flicker of one count, at least
 _ROUNDING = 1e-12  # of a value
 _MOST_OUTLYING = 0.05  # of the changes: each outlier is in two, and of few measurements some are more than a clip takes
 _SLOW, _FASTEST = 0.1, 0.99  # of the way that so many rows do not exceed: less is rest
@@ -208,7 +209,10 @@ def resolution(value: FloatArray) -> float:
 
 
 def isolated(value: FloatArray) -> BoolArray:
-    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,)."""
+    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,).
+
+    Of an encoder that rests in most rows the least third differences are those of one count, by which it flickers.
+    """
     is_isolated = np.zeros(len(value), dtype=np.bool_)
     if len(value) < _FEWEST:
         return is_isolated
@@ -218,7 +222,10 @@ def isolated(value: FloatArray) -> BoolArray:
     )
     middle = neighbours.mean(axis=0)
     off = np.abs(neighbours - middle - positions[:, None] * (positions @ neighbours / 10.0)).max(axis=0)
-    least = np.maximum(_OUTLYING * max(scatter(value), _resolution(value)), _APART * off)
+    third = np.abs(np.diff(value, 3))
+    third = third[third > _ROUNDING * np.abs(value).max()]
+    flicker = SD_OF_MEDIAN * float(np.quantile(third, _FLICKERING)) if len(third) else 0.0
+    least = np.maximum(_OUTLYING * max(scatter(value) or flicker / math.sqrt(20.0), _resolution(value)), _APART * off)
     is_isolated[2:-2] = np.abs(value[2:-2] - middle) > least
     return is_isolated
 
