@@ -193,6 +193,16 @@ def test_what_leaves_and_returns_is_an_outlier_and_a_jerk_is_not() -> None:
     ramp = np.interp(t, [0, 100, 150, 200, 260, 400], [0.0, 0.0, 50.0, 0.0, 10.0, 10.0])
     jumps = np.where(t > 300, 40.0 * np.exp(-np.maximum(t - 301, 0) / 1.0), 0.0) + np.where(t > 350, 30.0, 0.0)
     value = ramp + jumps + rng.normal(0.0, 0.01, len(t))
-    assert not isolated(value).any()
+    assert not isolated(t, value).any()
     value[[50, 120, 230]] += 20.0
-    assert np.flatnonzero(isolated(value)).tolist() == [50, 120, 230]
+    assert np.flatnonzero(isolated(t, value)).tolist() == [50, 120, 230]
+
+
+def test_a_row_that_is_measured_late_and_stamped_so_is_no_outlier() -> None:
+    """By its place among the rows it is 4 mm off, by its time it lies on the path of the others."""
+    rng, t = np.random.default_rng(5), np.arange(500) * 0.01
+    t[20::50] += 4e-3
+    value = np.sin(t) + rng.normal(0.0, 1e-5, len(t))
+    assert not isolated(t, value).any()
+    value[[75, 305]] += 0.01
+    assert np.flatnonzero(isolated(t, value)).tolist() == [75, 305]

@@ -60,7 +60,7 @@ def following(
     s, z = s[inside], z[inside]
     if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
         return None
-    noise, steps, outliers, moves = scatter(z), _resolution(z), float(isolated(z).mean()), _in_motion(z)
+    noise, steps, outliers, moves = scatter(z), _resolution(z), float(isolated(s, z).mean()), _in_motion(z)
 
     def at(lag: float, correlation: float, slope: float) -> tuple[float, float, Following]:
         led = np.interp(s - lag, t, u)
@@ -208,25 +208,23 @@ def resolution(value: FloatArray) -> float:
     return (float(counts.mean()) if len(counts) > _MANY * len(steps) else digit) / math.sqrt(12.0)
 
 
-def isolated(value: FloatArray) -> BoolArray:
-    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,).
+def isolated(time: FloatArray, value: FloatArray) -> BoolArray:
+    """Which values leave their neighbours, two on each side that lie on a line over time, and are back at once, (n,).
 
     Of an encoder that rests in most rows the least third differences are those of one count, by which it flickers.
     """
     is_isolated = np.zeros(len(value), dtype=np.bool_)
     if len(value) < _FEWEST:
         return is_isolated
-    neighbours, positions = (
-        np.stack([value[:-4], value[1:-3], value[3:-1], value[4:]]),
-        np.array([-2.0, -1.0, 1.0, 2.0]),
-    )
-    middle = neighbours.mean(axis=0)
-    off = np.abs(neighbours - middle - positions[:, None] * (positions @ neighbours / 10.0)).max(axis=0)
+    at, neighbours = (np.stack([part[:-4], part[1:-3], part[3:-1], part[4:]]) for part in (time, value))
+    mean, level = at.mean(axis=0), neighbours.mean(axis=0)
+    slope = ((at - mean) * neighbours).sum(axis=0) / np.maximum(((at - mean) ** 2).sum(axis=0), 1e-30)
+    off = np.abs(neighbours - level - slope * (at - mean)).max(axis=0)
     third = np.abs(np.diff(value, 3))
     third = third[third > _ROUNDING * np.abs(value).max()]
     flicker = SD_OF_MEDIAN * float(np.quantile(third, _FLICKERING)) if len(third) else 0.0
     least = np.maximum(_OUTLYING * max(scatter(value) or flicker / math.sqrt(20.0), _resolution(value)), _APART * off)
-    is_isolated[2:-2] = np.abs(value[2:-2] - middle) > least
+    is_isolated[2:-2] = np.abs(value[2:-2] - level - slope * (time[2:-2] - mean)) > least
     return is_isolated
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, TimeArray
 from ..errors import RunError
 from ..logs.run import REFERENCE, Run
 from ..units import Kind
@@ -187,7 +187,8 @@ def _sensor(
     elif first and name != first and name in latencies:
         words = f"so much later than {first}; add how old a measurement of that one is"
     turns = survey.roles is not None and any(sensor.turns for sensor in survey.roles.sensors if sensor.name == name)
-    gates = [_gate(value) for value in survey.run.sensors[name].values.values()]
+    source = survey.run.sensors[name]
+    gates = [_gate(*source.series(axis)) for axis in source.values]
     gate = min((gate for gate in gates if gate), default=0.0)
     by_axis = SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns)
     if pair is None:
@@ -208,17 +209,17 @@ def _start(survey: Survey, axis: str, name: str, following: Following, misfit: f
     return level if abs(level - float(told[0])) > unsure else None
 
 
-def _gate(value: FloatArray) -> float:
+def _gate(stamp: TimeArray, value: FloatArray) -> float:
     """The gate for a sensor with such values: narrow for many outliers, wide for a few glitches, none for jerks."""
-    value = value[np.isfinite(value)]
     if not len(value):
         return 0.0
-    is_isolated = isolated(value)
+    time = (stamp - stamp[0]) / 1e9
+    is_isolated = isolated(time, value)
     if is_isolated.sum() >= _FEWEST_OUTLIERS and is_isolated.mean() > _OUTLIERS:
         return _GATE
     for every in range(1, _LONGEST_GLITCH + 1):  # by which a glitch of so many rows is one
         some = value[::every]
-        rows = np.flatnonzero(isolated(some))
+        rows = np.flatnonzero(isolated(time[::every], some))
         beside = 0.5 * (some[rows - 1] + some[rows + 1])
         if (np.abs(some[rows] - beside) > _FAR * np.ptp(np.delete(some, rows))).any():
             return _WIDE_GATE

@@ -249,7 +249,7 @@ def _clean(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
     moves = np.bincount(run, minlength=1)[run] <= _STILL if len(run) else valid[:0]
     stamp, value = stamp[moves], value[moves]
     for _ in range(_CLEANED):
-        kept = ~isolated(value)
+        kept = ~isolated((stamp - stamp[:1]) / 1e9, value)
         stamp, value = stamp[kept], value[kept]
     return stamp, value
 
