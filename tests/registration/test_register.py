@@ -32,10 +32,12 @@ def same_branch(vector: np.ndarray, near: tuple[float, ...]) -> np.ndarray:
 def test_a_set_up_is_found(orientation: bool) -> None:
     """Frames and markers anywhere: rotation to 0.05 degrees, marker to 0.3 mm, lag to 0.3 ms, from a bad start on.
 
-    From a short time constant on the search of the last one would be stuck among the steps of held commands.
+    The lag of turning is that of its own, to 0.5 ms, also where only a marker beside the tool point tells it.
+    From a short time constant on the search of seed 51 would be stuck among the steps of held commands, and that of
+    5037 from a long one, if a marker alone tells when the tool turns.
     """
-    for seed in (0, 1, 2, 51):
-        setup = Setup(seed, orientation=orientation, shared=not orientation, seconds=20.0)
+    for seed in (0, 1, 2, 51, 5037):
+        setup = Setup(seed, orientation=orientation, seconds=20.0)
         found = registered(*([one] for one in setup.run()))
         assert found.findings == ()
         assert found.frame is not None and found.marker is not None and found.position is not None
@@ -43,12 +45,10 @@ def test_a_set_up_is_found(orientation: bool) -> None:
         np.testing.assert_allclose(found.frame.at, setup.at, atol=3e-3)
         np.testing.assert_allclose(found.marker.at, setup.marker, atol=3e-4)
         assert found.position.lag.value == pytest.approx(setup.lags[0], abs=3e-4)
+        assert found.rotation is not None
+        assert found.rotation.lag.value == pytest.approx(setup.lags[1], abs=5e-4)
         if orientation:
-            assert found.rotation is not None
             assert degrees(found.marker, setup.turn) < 0.05
-            assert found.rotation.lag.value == pytest.approx(setup.lags[1], abs=5e-4)
-        else:
-            assert found.rotation is None
 
 
 @pytest.mark.long
@@ -61,22 +61,20 @@ def test_intervals_hold(orientation: bool) -> None:
     """
     inside: dict[str, list[bool]] = {}
     for seed in range(0 if orientation else 100, 100 if orientation else 200):
-        setup = Setup(seed, orientation=orientation, shared=not orientation)
+        setup = Setup(seed, orientation=orientation)
         found = registered(*([one] for one in setup.run()))
-        assert found.frame is not None and found.marker is not None and found.position is not None
+        assert found.frame is not None and found.marker is not None
+        assert found.position is not None and found.rotation is not None
         assert abs(found.position.lag.value - setup.lags[0]) < 3e-4
         numbers = {
             "at": (setup.at, found.frame.at_ci95),
             "rotation": (same_branch(setup.frame.as_rotvec(), found.frame.rotation), found.frame.rotation_ci95),
             "marker": (setup.marker, found.marker.at_ci95),
-            "lag": ([setup.lags[0]], [found.position.lag.ci95]),
+            "lag": (setup.lags, [found.position.lag.ci95, found.rotation.lag.ci95]),
         }
         if orientation:
-            assert found.rotation is not None
             turn = same_branch(setup.turn.as_rotvec(), found.marker.rotation)
             numbers["marker's rotation"] = turn, found.marker.rotation_ci95
-            numbers["lag"][0].append(setup.lags[1])
-            numbers["lag"][1].append(found.rotation.lag.ci95)
         for kind, (true, between) in numbers.items():
             inside.setdefault(kind, []).extend(
                 low <= one <= high for one, (low, high) in zip(true, between, strict=True)
@@ -87,15 +85,22 @@ def test_intervals_hold(orientation: bool) -> None:
 
 
 @pytest.mark.long
-def test_runs_of_an_arm_that_errs_with_the_pose_agree() -> None:
-    """Of the differences between two runs of 25 set-ups 90 % or more lie within the joint 95 % intervals."""
-    agree: list[np.ndarray] = []
+def test_intervals_hold_where_an_arm_errs_with_the_pose() -> None:
+    """Of 25 set-ups they hold the truth of 90 % or more of the numbers, not of all.
+
+    Two runs of a set-up err alike, so that 90 % or more of their differences are within the joint intervals, too.
+    """
+    hold, agree = list[np.ndarray](), list[np.ndarray]()
     for seed in range(25):
         setup = Setup(seed, wrong=1.0)
         pair = [registered(*([one] for one in setup.run())) for _ in range(2)]
         numbers, halves = zip(*(placed(one) for one in pair), strict=True)
+        for found, half in zip(numbers, halves, strict=True):
+            true = [*setup.at, *same_branch(setup.frame.as_rotvec(), found[3:6]), *setup.marker]
+            hold.append(np.abs(found - true) < half)
         agree.append(np.abs(numbers[1] - numbers[0]) < np.hypot(*halves))
-    assert 0.90 < np.mean(agree) < 0.99
+    assert 0.90 < np.mean(hold) < 0.99
+    assert np.mean(agree) > 0.90
 
 
 def placed(found: Registration) -> tuple[np.ndarray, np.ndarray]:
@@ -197,7 +202,7 @@ def test_what_a_motion_does_not_tell_is_named(finding: Finding) -> None:
     """Each in all of 8 set-ups, with and without orientations."""
     for seed in range(8):
         of = MOTIONS.get(finding, lambda _: {"seconds": 20.0})(seed)
-        found = made(finding, seed, orientation=seed % 2 == 0, shared=seed % 2 == 1, **of)
+        found = made(finding, seed, orientation=seed % 2 == 0, **of)
         assert finding in [one.finding for one in found.findings], seed
 
 
@@ -300,11 +305,14 @@ def test_positions_that_are_turned_without_the_attitude_are_named() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("orientation", [True, False])
-@pytest.mark.parametrize("share", [0.0, 0.01])
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1])
 def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: bool) -> None:
-    """What is seen goes far and the tool point by 0 or 1 mm: no lengths are of another unit, and all is found."""
+    """What is seen goes far and the tool point by 0, 1 or 12 mm: no lengths are of another unit, and all is found.
+
+    Of the last it is told when the tool moves, too, which is not when it turns.
+    """
     for seed in range(5):
-        setup = Setup(seed, directions=share * np.eye(3), orientation=orientation, shared=True)
+        setup = Setup(seed, directions=share * np.eye(3), orientation=orientation, shared=share < 0.1)
         found = registered(*([one] for one in setup.run()))
         assert found.frame is not None and found.marker is not None and found.position is not None, seed
         assert Finding.SCALE not in [one.finding for one in found.findings]
@@ -318,7 +326,7 @@ def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: boo
 def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None:
     """Of an arm that errs by 0.5 mm and 0.2 degrees; not one that is turned by a degree, or stands 5 mm beside it."""
     for turn, move in ((0.0, 0.0), (1.0, 0.0), (0.0, 5e-3)):
-        setup = Setup(6, seconds=20.0, orientation=orientation, shared=not orientation, wrong=1.0)
+        setup = Setup(6, seconds=20.0, orientation=orientation, wrong=1.0)
         setup.frame = Rotation.from_rotvec([0.0, 0.0, turn], degrees=True)
         setup.marker = np.zeros(3)
         middle = np.array([0.5, -0.2, 0.4])  # of what it sees, about which the sensor is turned: that stays in place

@@ -97,6 +97,21 @@ def test_two_runs_agree_within_their_intervals(each: list[dict[str, RegisteredSe
     assert np.mean(np.abs(numbers[1] - numbers[0]) <= np.hypot(*halves)) >= 0.9
 
 
+@pytest.mark.long
+def test_intervals_hold_what_is_true(each: list[dict[str, RegisteredSensor]]) -> None:
+    """Of the markers and of how frames are turned, of either run, 90 % or more: the arm's own errors are counted."""
+    inside: list[bool] = []
+    for sensors in each:
+        for name, (turned, marker) in TRUE.items():
+            frame, seen = sensors[name].frame, sensors[name].marker
+            assert frame is not None and seen is not None
+            for true, between in zip(np.radians(turned), frame.rotation_ci95, strict=True):
+                inside.append(between[0] < true < between[1])
+            for true, between in zip(1e-3 * np.array(marker), seen.at_ci95, strict=True):
+                inside.append(between[0] < true < between[1])
+    assert np.mean(inside) >= 0.9
+
+
 def placed(sensors: dict[str, RegisteredSensor]) -> tuple[np.ndarray, np.ndarray]:
     """All numbers that are known, and half their intervals."""
     pairs: list[tuple[float, tuple[float, float]]] = []
@@ -128,6 +143,31 @@ def test_another_run_of_the_set_up_is_fused_by_it(registered: Path, sensor: str)
         inside = np.abs(estimate.position - known)[settled] < 1.96 * estimate.position_sd[settled]
         assert inside.mean() > 0.9, axis  # what no motion shows of the arm's kinematics is in the error bars
         assert scatter < (np.radians(0.3) if axis.startswith("r") else 0.6e-3), axis
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("learnt", "fused"), [("inspect1", "wander1"), ("wander1", "inspect1")])
+def test_a_tracker_alone_tells_when_the_tool_turns(learnt: str, fused: str) -> None:
+    """By its marker's lever: on the other run the tool is known to 0.35 mm and 0.25° about the arm's constant error."""
+    run = pf.Run.read(RUNS / learnt)
+    config = pf.register(run, sensor="tracker").config
+    late = msgspec.structs.replace(config.sensors["tracker"], latency=0.005)
+    config = msgspec.structs.replace(config, sensors={"tracker": late})
+    config = pf.register(run, config, sensor="tracker", fix=["latency"]).config
+    assert config.arm.lag_of("rx") == pytest.approx(0.092, abs=0.01)
+    assert max(scatter(fused, config, "tracker")) < 1.0
+
+
+def scatter(name: str, config: pf.FusionConfig, sensor: str) -> list[float]:
+    """By how much the estimate of a run is off about a constant along each axis, over 0.35 mm or 0.25°."""
+    est = pf.fuse(pf.Run.read(RUNS / name), config, sensors=[sensor])
+    assert est.reference is not None
+    settled = est.time > 3.0
+    shares: list[float] = []
+    for axis, estimate in est.axes.items():
+        off = estimate.position - np.interp(est.time, est.reference.time, est.reference.position[axis])
+        shares.append(float(np.std(off[settled])) / (np.radians(0.25) if axis.startswith("r") else 0.35e-3))
+    return shares
 
 
 def test_a_marker_that_is_fixed_stays(tmp_path: Path, registered: Path) -> None:

@@ -87,10 +87,10 @@ def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Regi
         np.concatenate([slope[:, :, _BESIDE], by], axis=2)
         for slope, by in zip(slopes(rows, state, off.poses), by_joint, strict=True)
     ]
-    before = tell(slope, off.blocks, off.noise(), expected=False)
+    before = tell(slope, off.blocks, off.whitening(), expected=False)
     step = before.step()
     left = [block + by @ step for block, by in zip(off.blocks, slope, strict=True)]
-    after = tell(slope, left, off.noise(), expected=True)
+    after = tell(slope, left, off.whitening(), expected=True)
     of_joints = slice(-len(later), None)
     return _Step(step[of_joints], after.half_widths(np.eye(len(step))[of_joints]), off.noise())
 

@@ -26,6 +26,7 @@ _SETTLED = 6.0  # rough lags after the first command: how the arm moved before i
 _AT_LEAST, _FEWEST = 5.0, 60  # s and rows of a sensor beside commands
 _ROWS, _COARSE = 8000, 1000  # that are looked at, evenly, in the end and to begin with
 _DEAD, _SMOOTH = 0.6, 0.02  # of the lag, to begin with; s: a shorter τ is stuck among the steps of held commands
+_SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of the lag, of time constants of turning to begin with
 _MANY_AT_REST = 0.25  # of the rows
 _GAP = 5.0  # usual intervals of the commands, from which one is a gap
 _AROUND_ROW, _RESTS, _AGAIN = 0.25, 0.02, 1.0  # s; of the speed of the motion; s, within which a rest counts once
@@ -36,6 +37,7 @@ _ODD = 0.025  # likewise, where lengths differ by what is no unit
 _ANOTHER = 3.0  # times as far as commanded: another unit
 _UNEXPLAINED = 0.05  # likewise, beyond its noise: arms leave 1 % of a motion, a tool that turns untold 10
 _LOOSELY = 0.2  # likewise, where joints lag apart by as much as a whole lag
+_SURE = 0.03  # s, of half the interval of the lag of turning: a marker's lever tells it, or it is that of positions
 _AS_IT_IS = np.eye(3)
 _AROUND = Rotation.create_group("T").as_matrix()  # all around, 60 degrees apart at most from the next
 _TURNS = np.radians(0.5)  # of the tool, root mean square: arms err by as much in orientation
@@ -310,11 +312,13 @@ def _coarse(
     turn = Rotation.from_rotvec(marker.rotation).as_matrix()
     markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
     begin = State(first @ rotation, path.mean(axis=0), at, turn, scale, plant, plant)
-    held, free = (_free(np.eye(3), markers, turn=False, scale=is_free, own_lag=False) for is_free in (False, moves))
+    told = markers.size > 0
+    held, free = (_free(np.eye(3), markers, turn=False, scale=of, own_lag=of and told) for of in (False, moves))
     nearer = fitted(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
     again = _plant(nearer.position.lag)
     both = (fitted(rows, start, free) for start in (begin, nearer._replace(position=again, angle=again)))
-    return min(both, key=lambda fit: fit.left() / fit.state.scale)
+    best = min(both, key=lambda fit: fit.left() / fit.state.scale)
+    return best._replace(state=best.state._replace(angle=best.state.position))  # few rows may not tell that of turning
 
 
 def _plant(lag: float) -> Plant:
@@ -462,9 +466,13 @@ def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     elif begin.either and not (begin.attitude and told.shape[1]):
         findings.append(Found(finding=Finding.PLANE))
     moves = bool(np.std(poses.position, axis=0).max() > _BESIDE)
-    own_lag = begin.attitude and len(told.T) > 0 and moves  # else nothing tells the lag of positions
-    turn = begin.attitude and not fix_marker
-    fit = fitted(rows, state, _free(held, told, turn=turn, scale=False, own_lag=own_lag))
+    allowed = partial(_free, held, told, turn=begin.attitude and not fix_marker, scale=False)
+    own_lag = rows.answer.turns and len(told.T) > 0 and moves  # else nothing tells the lag of positions
+    if own_lag and not begin.attitude:
+        state = _turning_anew(begin, allowed(own_lag=True))
+    fit = fitted(rows, state, allowed(own_lag=own_lag))
+    if own_lag and not begin.attitude and fit.half_widths(_numbers(fit.state, begin.mean)[1])[15] > _SURE:
+        own_lag, fit = False, fitted(rows, state, allowed(own_lag=False))
     spread = float(np.std(rows.centred))
     odd = any(finding.finding is Finding.SCALE and not finding.unit for finding in findings)
     most = (_LOOSELY if loosely else _ODD if odd else _UNEXPLAINED) * spread
@@ -473,6 +481,19 @@ def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
         unexplained = _unexplained(begin.command, begin.sensor, fit.state.angle.lag, fit.left() / spread)
         return Registration(findings=(*said, unexplained))
     return _told(fit, begin, loose, blind, own_lag)
+
+
+def _turning_anew(begin: _Begin, free: FloatArray) -> State:
+    """Where the plant of turning is near the best of all: a dead time that is off by a step of commands may look alike.
+
+    The marker makes up for it, by a millimetre.
+    """
+    few = rows_of(begin.command, thinned(begin.sensor, _COARSE), begin.mean, attitude=False)
+    lag = begin.state.angle.lag
+    constants = np.maximum(np.array(_SHARES) * lag, _SMOOTH).tolist()
+    fits = [fitted(few, begin.state._replace(angle=Plant(lag - each, each)), free) for each in constants]
+    whitening = fits[0].off.whitening()
+    return min(fits, key=lambda fit: fit.off.cost(whitening)).state
 
 
 def _unexplained(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, share: float) -> Found:

@@ -3,7 +3,8 @@
 A row is off by e = p + R m − c − s S (z − z̄) [m] and, where the sensor tells an orientation, by the rotation that
 takes S R_sensor Qᵀ to R [rad]; p, R are the arm's response, z and R_sensor what is measured, S the frame's rotation,
 m the marker's place, Q its rotation, c where the mean z̄ of what is measured lies, s a scale. A row counts as
-Cauchy's distribution would have it, by how far it is off as a whole: no axes are preferred.
+Cauchy's distribution would have it, by how far it is off for the direction: an arm errs along its path more than across
+it, and what it errs little in tells the more.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray, median
 from ..space.rotations import crossed
-from .intervals import Blocks, blocks
+from .intervals import Blocks, blocks, inverse, of_poses
 from .motion import Answer, Plant, Poses
 
 ROTATION, CENTRE, MARKER, TURN, SCALE, POSITION, ANGLE = (
@@ -26,6 +27,9 @@ SIZE = 17
 CAUCHY = 3.0  # standard deviations from which a row counts half
 MEDIAN = 1.5382  # of the length of three standard normal deviates
 _LEAST = 1e-9  # m or rad: rounding
+_ROUNDS, _EVEN = 5, 0.2  # of a covariance; how much of it is the same in all directions: sensors are noisy in each
+_NORMAL = 1.96  # standard deviations: both sides 95 %
+_RADIAN = 0.3  # m that count as a radian: an arm errs alike at nearer poses; three times as far changes little
 _STEPS = 50  # at most
 _HALVED = 6  # times that a step which leads up is halved
 _ENOUGH = 1e-8  # of the sum per row: a step that gains less is the last
@@ -81,16 +85,20 @@ class Off(NamedTuple):
         """The standard deviation of each block, by the median."""
         return np.array([max(median(_length(block)) / MEDIAN, _LEAST) for block in self.blocks])
 
+    def whitening(self) -> list[FloatArray]:
+        """By what to multiply each block for standard deviations of 1 along all directions, (3, 3)."""
+        return [_whitening(block) for block in self.blocks]
+
     def rms(self) -> list[float]:
         """Of each block, over rows that are within ten medians."""
         lengths = [_length(block) for block in self.blocks]
         kept = [length[length <= 10.0 * median(length) + _LEAST] for length in lengths]
         return [float(np.sqrt(np.mean(length**2))) for length in kept]
 
-    def cost(self, noise: FloatArray) -> float:
+    def cost(self, whitening: Sequence[FloatArray]) -> float:
         """Cauchy's sum."""
-        pairs = zip(self.blocks, noise.tolist(), strict=True)
-        return float(sum(np.log1p((_length(lengths) / (CAUCHY * sd)) ** 2).sum() for lengths, sd in pairs))
+        white = [block @ by for block, by in zip(self.blocks, whitening, strict=True)]
+        return float(sum(np.log1p((_length(block) / CAUCHY) ** 2).sum() for block in white))
 
 
 class Fit(NamedTuple):
@@ -100,6 +108,7 @@ class Fit(NamedTuple):
     off: Off  # how far each row is off
     free: FloatArray  # the steps that are allowed, as columns, (17, k)
     told: Blocks  # what blocks of rows tell of them
+    of_poses: FloatArray  # the covariance of their score by what the arm errs with the pose, (k, k)
 
     def left(self) -> float:
         """The standard deviation of positions [m]."""
@@ -107,23 +116,26 @@ class Fit(NamedTuple):
 
     def half_widths(self, numbers: FloatArray) -> FloatArray:
         """Half the 95 % interval of numbers that change so with a step, (q, 17) → (q,)."""
-        return self.told.half_widths(numbers @ self.free)
+        numbers = numbers @ self.free
+        by = numbers @ inverse(self.told.information.sum(axis=0))
+        return np.hypot(self.told.half_widths(numbers), _NORMAL * np.sqrt(np.sum(by @ self.of_poses * by, axis=1)))
 
 
 def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
     """The robust least squares from a start; the steps that are allowed are columns, (17, k)."""
     off = residual(rows, state)
     for _ in range(_STEPS):
-        noise = off.noise()
-        told = _normal(rows, state, off, noise, free, expected=False)
+        whitening = off.whitening()
+        told = _normal(rows, state, off, whitening, free, expected=False)
         step = told.step()
         if -(told.score.sum(axis=0) @ step) < _ENOUGH * len(rows.centred):
             break
-        better = _better(rows, state, free @ step, off.cost(noise), noise)
+        better = _better(rows, state, free @ step, off.cost(whitening), whitening)
         if better is None:
             break
         state, off = better
-    return Fit(state, off, free, _normal(rows, state, off, off.noise(), free, expected=True))
+    told = _normal(rows, state, off, off.whitening(), free, expected=True)
+    return Fit(state, off, free, told, _of_poses(rows, state, off, free))
 
 
 def residual(rows: Rows, state: State) -> Off:
@@ -137,33 +149,49 @@ def residual(rows: Rows, state: State) -> Off:
     return Off(blocks, poses)
 
 
-def _better(rows: Rows, state: State, step: FloatArray, cost: float, noise: FloatArray) -> tuple[State, Off] | None:
+def _better(
+    rows: Rows, state: State, step: FloatArray, cost: float, whitening: Sequence[FloatArray]
+) -> tuple[State, Off] | None:
     """After a step, halved until it leads down; None where it does not."""
     for _ in range(_HALVED):
         moved = state.moved(step)
         off = residual(rows, moved)
-        if off.cost(noise) < cost:
+        if off.cost(whitening) < cost:
             return moved, off
         step = 0.5 * step
     return None
 
 
-def _normal(rows: Rows, state: State, off: Off, noise: FloatArray, free: FloatArray, *, expected: bool) -> Blocks:
+def _normal(
+    rows: Rows, state: State, off: Off, whitening: Sequence[FloatArray], free: FloatArray, *, expected: bool
+) -> Blocks:
     """The information of the free steps and the slope of half the sum, of each block of rows."""
-    return tell([slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, noise, expected=expected)
+    return tell([slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, whitening, expected=expected)
 
 
-def tell(slope: Sequence[FloatArray], off: Sequence[FloatArray], noise: FloatArray, *, expected: bool) -> Blocks:
+def _of_poses(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArray:
+    """The covariance of the score of the free steps by what the arm errs with the pose."""
+    turned, covariance = Rotation.from_matrix(off.poses.rotation), np.zeros((free.shape[1], free.shape[1]))
+    pose = np.hstack([off.poses.position / _RADIAN, (turned * turned.mean().inv()).as_rotvec()])
+    for slope, residual, by in zip(slopes(rows, state, off.poses), off.blocks, off.whitening(), strict=True):
+        white = residual @ by
+        covariance += of_poses(by @ slope @ free, white, weights(_length(white), 1.0), pose)
+    return covariance
+
+
+def tell(
+    slope: Sequence[FloatArray], off: Sequence[FloatArray], whitening: Sequence[FloatArray], *, expected: bool
+) -> Blocks:
     """What rows tell of a step that are so far off and change so with it, positions and orientations together.
 
     The information is that of Cauchy's curvature where it is the ``expected`` one, of which intervals are made; else
     the larger one of Gauss and Newton, which leads down more safely.
     """
     parts = list[Blocks]()
-    for inner, residual, sd in zip(slope, off, noise.tolist(), strict=True):
-        weight = weights(_length(residual), sd)
-        told = curvature(weight) if expected else weight
-        parts.append(blocks(inner, residual, told / sd**2, weight / sd**2))
+    for inner, residual, by in zip(slope, off, whitening, strict=True):
+        white = residual @ by
+        weight = weights(_length(white), 1.0)
+        parts.append(blocks(by @ inner, white, curvature(weight) if expected else weight, weight))
     return Blocks(*(np.sum(blocks, axis=0) for blocks in zip(*parts, strict=True)))
 
 
@@ -196,6 +224,21 @@ def slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
     angle[:, :, TURN] = state.rotation @ rows.turned @ state.turn.T
     angle[:, :, ANGLE] = np.stack(turned, axis=-1)
     return [jacobian, angle]
+
+
+def _whitening(block: FloatArray) -> FloatArray:
+    """The inverse root of the covariance of a block, by Tyler's estimator with shrinkage (Chen, Wiesel and Hero 2011).
+
+    It heeds directions alone, so that outliers count as other rows do; the size is that of the median.
+    """
+    root = np.eye(3)
+    for _ in range(_ROUNDS):
+        direction = block / (_length(block @ root) + _LEAST)[:, None]
+        shape = direction.T @ direction
+        shape *= (1.0 - _EVEN) / max(float(np.trace(shape)), 1e-300)
+        square, axes = np.linalg.eigh(shape + _EVEN / 3.0 * np.eye(3))
+        root = axes / np.sqrt(square) @ axes.T
+    return root / max(median(_length(block @ root)) / MEDIAN, _LEAST)
 
 
 def _length(vectors: FloatArray) -> FloatArray:
