@@ -100,6 +100,15 @@ def test_what_reading_notices_is_said_once(tmp_path: Path) -> None:
     assert len(set(lines)) == len(lines)
 
 
+def test_who_has_no_run_toml_is_told_what_writes_one(log: Path) -> None:
+    """Two columns that are exchanged are mended there; what `fuse LOG` found is in no file."""
+    edit(log / "camera.csv", ("x_mm,z_mm", "z_mm,x_mm"))
+    for described in log.glob("*.toml"):
+        described.unlink()
+    *_, line = pumafuse("fuse", log, "-o", log / "result", code=1).stderr.splitlines()
+    assert "are its columns exchanged in run.toml?" in line and line.endswith(f"(`pumafuse init {log}` writes one)")
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("early", [0.05, later(0.31)])
 def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path: Path) -> None:
@@ -109,7 +118,7 @@ def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path
     columns = {"t_s": time, "goal_j_deg": swings(time), "encoder_j_deg": measured}
     pacsv.write_csv(pa.table(columns), tmp_path / "wrist.csv")
     line = refused("fuse", tmp_path / "wrist.csv", "-o", tmp_path / "fused")
-    assert "moves before its commands" in line and "shift_s" in line and line.endswith("writes one")
+    assert "moves before its commands" in line and "shift_s" in line and line.endswith("writes one)")
     folder = tmp_path / "folder"
     pumafuse("init", tmp_path / "wrist.csv", "-o", folder)
     assert "no lag can be told" in refused("latency", folder)

@@ -66,8 +66,7 @@ def run(
         raise RunError(f"{error}; `pumafuse init {shlex.quote(str(log))}` writes one to sort") from None
     for name in surveyed.run.sensors:
         if by := early(surveyed, name):
-            advice = f"; `pumafuse init {log}` writes one" if surveyed.roles else ""
-            raise RunError(f"{log}: {too_early(name, max(by.values()))}{advice}")
+            raise RunError(f"{log}: {too_early(name, max(by.values()))}{_its_run_toml(surveyed, log)}")
     surveyed = replace(surveyed, run=surveyed.run.between(*part))  # so that latencies are those of the part
     arm, begins = guess(surveyed)
     init.show(surveyed, begins)
@@ -82,7 +81,10 @@ def run(
                 fitted = tune(recorded, begun, fit=_FITTED, intervals=_FITTED_ARM, progress=progress)
             break
         except LostError as error:
-            surveyed = _without(surveyed, error)
+            if (others := _without(surveyed, error)) is None:
+                advice = _its_run_toml(surveyed, log) if "run.toml" in str(error) else ""
+                raise RunError(f"{error}{advice}") from None
+            surveyed = others
             say(f"left out: {error}")
             arm, begins = guess(surveyed)
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)
@@ -109,15 +111,20 @@ def run(
         raise typer.Exit(WORSE)
 
 
-def _without(survey: Survey, lost: LostError) -> Survey:
-    """What was found, without axes on which a sensor follows nothing; raises the error if nothing else follows."""
+def _its_run_toml(survey: Survey, log: Path) -> str:
+    """Where the run.toml is that an error names; "" where the log has one."""
+    return f" (`pumafuse init {shlex.quote(str(log))}` writes one)" if survey.roles else ""
+
+
+def _without(survey: Survey, lost: LostError) -> Survey | None:
+    """What was found, without axes on which a sensor follows nothing; None if nothing else follows."""
     bad = {(name, axis) for name in lost.fault.sensors for axis in lost.fault.axes}
     measured = {name: sensor.values for name, sensor in survey.run.sensors.items()}
     kept = {name: {axis: of[axis] for axis in of if (name, axis) not in bad} for name, of in measured.items()}
     related = {key: relation for key, relation in survey.relations.items() if key not in bad}
     follows = any(abs(relation.correlation) >= FOLLOWS for (name, _), relation in related.items() if name in kept)
     if lost.fault.cause != "nothing" or not follows or all(len(kept[name]) == len(measured[name]) for name in measured):
-        raise lost
+        return None
     sensors = {name: replace(survey.run.sensors[name], values=values) for name, values in kept.items() if values}
     return replace(survey, run=replace(survey.run, sensors=sensors), relations=related)
 

@@ -85,9 +85,8 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
         for axis, relation in by_axis.items():
             size = abs(relation.slope)
             if abs(relation.correlation) < SAME:
-                ask = (
-                    ": are axes exchanged, or its clock another one?" if follow else ", nor anything else its commands"
-                )
+                ask = ": are axes exchanged, or its clock another one?"
+                ask = ask if follow else ", and nothing else follows these."
                 missing = [axis for axis in CARTESIAN if axis not in source.values]
                 if axis in CARTESIAN and missing:
                     ask += f" It gives no {' and no '.join(missing)}, without which no frame of its own is found"
