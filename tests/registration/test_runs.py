@@ -198,7 +198,9 @@ def test_latencies_that_are_known_leave_the_delay_of_the_arm(tmp_path: Path, reg
     assert [after.sensors[name].latency for name in ("mocap", "tracker")] == [0.012, 0.005]
     told = json.loads((tmp_path / "out" / "registration.json").read_text())["sensors"]
     lags = [told["mocap"]["lag_ms"] - 12.0, told["tracker"]["lag_ms"] - 5.0]
-    assert np.mean([after.arm.lag_of(axis) for axis in "xyz"]) * 1e3 == pytest.approx(np.mean(lags), abs=0.01)
+    half = np.array([np.diff(told[name]["lag_ms_ci95"]) for name in ("mocap", "tracker")]).ravel() / 2.0
+    expected = np.average(lags, weights=np.maximum(half, 0.01) ** -2.0)  # each counts as its lag is sure
+    assert np.mean([after.arm.lag_of(axis) for axis in "xyz"]) * 1e3 == pytest.approx(expected, abs=0.01)
     assert after.arm.delay < before.arm.delay
 
 
