@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
+from pumafuse.filter.response import response
 from pumafuse.live.sources import replayed
 from streams import TRACKED, Both, line, lines
 
@@ -221,6 +222,20 @@ def test_a_replay_brings_rows_when_they_came() -> None:
     position = (offline["radial"].position * 1e3).tolist()
     assert [found["radial"]["position_mm"] for found in both.estimates] == position
     assert position != (at_once["radial"].position * 1e3).tolist()
+
+
+def test_values_that_repeat_by_chance_are_no_notice() -> None:
+    """Steps of 0.1 mm on noise of 0.1 mm: what waits as it may be held is news after all, and nothing is said of it."""
+    rng, stamp, seen = np.random.default_rng(5), np.arange(900) * 0.028, np.arange(0.0, 25.0, 0.004)
+    level = 0.57 + 4e-3 * rng.choice([-1.0, 1.0], 900)
+    arm = TRACKED.arm.axes["radial"]
+    led = level[0] + response(arm, 0.028, TRACKED.arm.delay, np.rint(stamp * 1e9).astype(np.int64), level, level[0],
+                              np.rint(seen * 1e9).astype(np.int64))  # fmt: skip
+    coarse = np.round((led + 1e-4 * rng.standard_normal(len(seen))) / 1e-4) * 1e-4
+    both = Both()
+    both.replay(pf.Run.from_arrays(stamp, {"radial": level}, {"tracker": (seen, {"radial": coarse})}))
+    both.end()
+    assert not [line for line in both.said if "digit" in line]
 
 
 @pytest.mark.parametrize("pause", [1.5, 20.0])

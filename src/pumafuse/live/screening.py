@@ -128,34 +128,34 @@ class HoldWatch:
         self, key: tuple[int, int], stamp: int, value: float, spreads: Array[c_double], commands: Commands, lag: int
     ) -> Judged:
         """Judge a value of a sensor and an axis, late by up to a lag [ns]; out of order nothing is held."""
-        if (Repeated := self._seen.get(key)) is None:
-            Repeated = self._seen[key] = _Repeated()
-        axis, waited = key[1], Repeated.waiting
-        if stamp <= Repeated.stamp:
-            Repeated.forget()
+        if (repeated := self._seen.get(key)) is None:
+            repeated = self._seen[key] = _Repeated()
+        axis, waited = key[1], repeated.waiting
+        if stamp <= repeated.stamp:
+            repeated.forget()
             return Judged(False, False, waited) if waited else NEWS
-        if Repeated.is_new(stamp, value):
+        if repeated.is_new(stamp, value):
             return Judged(False, False, waited) if waited else NEWS
-        if (habit := Repeated.habit) is None:
+        if (habit := repeated.habit) is None:
             return NEWS
-        if Repeated.count == 2:
-            Repeated.low = Repeated.high = commands.at(axis, Repeated.since) or 0.0
-        if stamp - lag >= Repeated.since and (led := commands.at(axis, stamp - lag)) is not None:
-            Repeated.low, Repeated.high = min(Repeated.low, led), max(Repeated.high, led)
-        moved = Repeated.high - Repeated.low
-        if habit.is_again(Repeated.count - 1) or habit.froze(
-            Repeated.count, moved, commands.travel(axis), Repeated.leapt, Repeated.repeats
+        if repeated.count == 2:
+            repeated.low = repeated.high = commands.at(axis, repeated.since) or 0.0
+        if stamp - lag >= repeated.since and (led := commands.at(axis, stamp - lag)) is not None:
+            repeated.low, repeated.high = min(repeated.low, led), max(repeated.high, led)
+        moved = repeated.high - repeated.low
+        if habit.is_again(repeated.count - 1) or habit.froze(
+            repeated.count, moved, commands.travel(axis), repeated.leapt, repeated.repeats
         ):
-            Repeated.waiting = []
+            repeated.waiting = []
             return Judged(True, True)
-        led, before = (commands.at(axis, instant) or 0.0 for instant in (stamp, Repeated.since - lag))
-        odd = led != before and (Repeated.leapt or Repeated.repeats ** (Repeated.count - 1) < _ODD)
-        if Repeated.believed or not (odd or habit.is_clear(max(led - Repeated.low, Repeated.high - led))):
+        led, before = (commands.at(axis, instant) or 0.0 for instant in (stamp, repeated.since - lag))
+        odd = led != before and (repeated.leapt or repeated.repeats ** (repeated.count - 1) < _ODD)
+        if repeated.believed or not (odd or habit.is_clear(max(led - repeated.low, repeated.high - led))):
             return NEWS
         waited.append((stamp, value, spreads[axis]))
         if stamp - waited[0][0] <= self._patience:
             return Judged(True, False)
-        Repeated.waiting, Repeated.believed = [], True
+        repeated.waiting, repeated.believed = [], True
         return Judged(True, False, waited)
 
 

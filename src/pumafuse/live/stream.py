@@ -17,6 +17,7 @@ from .wire import BadLine, Event, LineDecoder, encode
 _SHOWN = 60  # characters of a bad line in the log
 _MOST_AT_ONCE = 50_000  # estimates on the grid between two events
 _FASTEST = 1e4  # Hz
+_USUAL = COMPARED | {Outcome.STRAY, Outcome.HELD}  # what may be stray or held waits, and is said once it surely is
 
 
 class Watcher(Protocol):
@@ -90,8 +91,8 @@ class Stream:
             event = event._replace(values=live.of_tool(t, sensor, values))
         for watcher in self._watchers:
             watcher.event(event, result)
-        waits = result.outcome is Outcome.STRAY  # whether it is stray is said once the next has come
-        if not waits and not COMPARED.issuperset((result.outcome, *result.axes.values())):
+        waits = result.outcome is Outcome.STRAY
+        if not _USUAL.issuperset((result.outcome, *result.axes.values())):
             who = sensor if sensor in live.config.sensors else "unknown sensor" if sensor else "command"
             became = f"{result.reason} ({result.outcome.word})"
             self._log.write(f"{who} {result.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")
