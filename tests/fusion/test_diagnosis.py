@@ -14,6 +14,7 @@ import pytest
 import pumafuse as pf
 from pumafuse.arrays import FloatArray
 from pumafuse.filter.response import response
+from pumafuse.fusion.consistency import Finding, consistency
 from pumafuse.fusion.faults import not_following, sensor_faults
 from pumafuse.fusion.segments import build
 from pumafuse.fusion.summary import summarise
@@ -152,6 +153,17 @@ def test_a_verdict_names_the_fault_and_no_noise(change: Change, shown: str) -> N
     of_axis = summarise(est).axes[faulty].sensors["tracker"]
     assert of_axis.finding == "faulty" and of_axis.causes == []
     assert shown in of_axis.verdict and "noise" not in of_axis.verdict
+
+
+def test_a_fault_that_does_no_harm_is_no_verdict() -> None:
+    """A constant of 30 mm is named, and taken up by the offset. What is as expected stays consistent."""
+    est = pf.fuse(of_sensor("scan1", "tracker", moved_by(0.03, "radial")), logged("scan1")[1])
+    assert any("sensor 'tracker' is off from where the commands lead" in note for note in est.notes) and not est.faults
+    for axis in est.axes:
+        checked = consistency(est, "tracker", axis)
+        assert checked is not None and checked.finding is not Finding.FAULTY
+        usual = replace(checked, nis=1.0, correlation=np.zeros(20), rejected=0.0, fault="clock")
+        assert usual.finding is Finding.CONSISTENT and replace(usual, nis=9.0).finding is Finding.FAULTY
 
 
 @of_every_log
