@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from pumafuse.registration.intervals import blocks, inverse
+from pumafuse.registration.intervals import blocks, inverse, of_poses
 
 
 def test_intervals_are_those_of_the_numbers_worked_out_without_each_block() -> None:
@@ -36,3 +36,26 @@ def test_what_rows_do_not_tell_does_not_move() -> None:
     """Of a direction without information the inverse is zero; the others are inverted, whatever their units."""
     told = np.diag([4.0e-12, 0.0, 9.0e12])
     np.testing.assert_allclose(inverse(told), np.diag([0.25e12, 0.0, 1.0 / 9.0e12]), rtol=1e-12)
+
+
+def test_what_goes_with_the_pose_is_told_as_by_dense_matrices() -> None:
+    """Rao's MINQUE with V₀ = I and V₁ = exp(−distance) for all rows at once; of which each stands for four alike."""
+    random = np.random.default_rng(4)
+    pose, slope = random.uniform(-0.2, 0.2, (500, 6)), random.normal(size=(500, 3, 2))
+    alike = np.exp(-np.linalg.norm(pose[:, None] - pose, axis=2))
+    field = np.linalg.cholesky(alike) @ random.normal(size=(500, 3))
+    seen = field + 0.2 * random.normal(size=(500, 3))
+    table, dense = slope.reshape(-1, 2), np.kron(alike, np.eye(3))
+    apart = np.eye(1500) - table @ np.linalg.inv(table.T @ table) @ table.T
+    left = apart @ seen.ravel()
+    both = [apart, apart @ dense]
+    system = np.array([[np.sum(one * other.T) for other in both] for one in both])
+    squares = [left @ left, left @ dense @ left]
+    variances = np.linalg.inv(system)
+    white, of_pose = variances @ squares
+    assert of_pose == pytest.approx(1.0, abs=0.3)
+    beyond = of_pose - 2.0 * white * np.sqrt(2.0 * variances[1, 1])
+    rows = [np.repeat(part, 4, axis=0) for part in (slope, left.reshape(-1, 3), np.ones(500), pose)]
+    told = of_poses(*rows)
+    assert told == pytest.approx(16.0 * beyond * (table.T @ dense @ table), rel=1e-9)
+    assert not of_poses(*rows[:1], np.repeat(random.normal(size=(500, 3)), 4, axis=0), *rows[2:]).any()
