@@ -34,21 +34,39 @@ Real clip(const Real& a, const Real& low, const Real& high) {
 
 inline bool changes(double first, double last) { return (first > 0.0) != (last > 0.0); }  // the sign
 
-// Just behind the only instant in (0, end) at which f changes its sign (Illinois; Dowell & Jarratt, BIT 11, 1971).
-// Every fourth step halves the bracket, whatever f is.
-double behind_change(auto f, double end, double last) {
+struct Course { double value, slope; };  // of something over time, and per s
+
+// Where the cubic with these values and slopes at 0 and 1 is 0 between them. The values' signs differ.
+inline double zero_of_cubic(const Course& first, const Course& last) {
+    const double rise = last.value - first.value, third = first.slope + last.slope - 2.0 * rise;
+    const double second = rise - first.slope - third;
+    double low = 0.0, high = 1.0, x = -first.value / rise;
+    for (int k = 0; k < 8; ++k) {  // Newton's method, which halves the bracket where it would leave it
+        const double y = first.value + x * (first.slope + x * (second + x * third));
+        (changes(y, last.value) ? low : high) = x;
+        const double by = y / (first.slope + x * (2.0 * second + x * 3.0 * third)), next = x - by;
+        x = next > low && next < high ? next : 0.5 * (low + high);
+        if (std::fabs(by) < 1e-5) break;  // its square is what is left
+    }
+    return x;
+}
+
+// Just behind the only instant in (0, end) at which `course` changes its sign: there it is computed last. Between two
+// instants it is close to a cubic; every fourth step halves the bracket, whatever it is.
+double behind_change(double end, Course first, Course last, auto course) {
     constexpr double WIDTH = 1e-7;  // of the interval: its square is what x can be wrong by, of what it moves
     const double width = WIDTH * end;
-    double begin = 0.0, first = f(begin);
-    for (int k = 1, before = 0; end - begin > 2.0 * width; ++k) {  // before: which end was last moved
-        const double secant = end - last * (end - begin) / (last - first);
-        const bool halve = k % 4 == 0 || last == first;  // both may be 0 where f has faded away
-        const double t = halve ? 0.5 * (begin + end) : clip(secant, begin + width, end - width), now = f(t);
-        const int moved = changes(now, last) ? -1 : 1;
-        (moved < 0 ? begin : end) = t, (moved < 0 ? first : last) = now;
-        if (moved == std::exchange(before, moved)) (moved < 0 ? last : first) *= 0.5;
+    double begin = 0.0;
+    for (int k = 1;; ++k) {
+        const double span = end - begin;
+        if (span <= 2.0 * width) return course(end), end;
+        const double part = k % 4 == 0 ? 0.5 : zero_of_cubic({first.value, span * first.slope}, {last.value, span * last.slope});
+        const double t = clip(begin + span * part + 0.5 * width, begin + width, end - width);
+        const Course now = course(t);
+        const bool behind = !changes(now.value, last.value);
+        if (behind && std::fabs(now.value) <= width * std::fabs(now.slope)) return t;
+        (behind ? end : begin) = t, (behind ? last : first) = now;
     }
-    return end;
 }
 
 template <class Real>
@@ -75,7 +93,8 @@ struct Arm {
         fast = value_of(plant.order == 1 ? plant.rate : plant.omega);
         const double turning = square(value_of(plant.omega)) - square(value_of(plant.sigma));
         half_swing = turning > 0.0 ? 3.0 / std::sqrt(turning) : std::numeric_limits<double>::infinity();  // 3 < pi
-        const bool may_turn = plant.order == 2 || value_of(plant.decay) > 0.0;  // between two commands
+        const bool decays = value_of(plant.decay) > 0.0, may_turn = plant.order == 2 || decays;  // between two commands
+        may_return = plant.order == 2 && decays;
         cut_by_play = may_turn && value_of(half_play) > 0.0, cut_by_limit = may_turn && value_of(max_speed) > 0.0;
         drawn = value_of(plant.drawn());
         overshoot = turning > 0.0 ? 1.0 / std::tanh(0.5 * std::numbers::pi * value_of(plant.sigma) / std::sqrt(turning))
@@ -100,22 +119,8 @@ struct Arm {
 
     // The drive over dt, and what is left of the tool's slack (tool less drive) behind it.
     void move(Drive<Real>& d, Real& slack, const Real& dt) const {
-        if (linear) return free(d, plant.over(dt), dt);
-        const Drive<Real> before = d;
-        const int side = this->side(d);
-        if (side != 0) at_limit(d, side, dt);
-        else free(d, plant.over(dt), dt);
-        const auto turning = [&] {
-            if (value_of(plant.decay) == 0.0) return changes(value_of(before.rate), value_of(d.rate));
-            const Motion m = motion(before, side), n = motion(d, side);
-            const auto slope_then = [&] { return later_slope(side, m, d, plant.over(dt)); };
-            return (cut_by_play && turns(m, m.rate, n.rate, slope_then)) ||
-                   (cut_by_limit && turns(m, m.closing, n.closing, slope_then));
-        };
-        if ((side == 0 && value_of(dt) > half_swing) || this->side(d) != side ||
-            ((cut_by_play || cut_by_limit) && turning()))
-            d = before, in_pieces(d, slack, dt);
-        else slack = pushed(slack, before, d);
+        if (linear) free(d, plant.over(dt), dt);
+        else in_pieces(d, slack, dt);
     }
 
   private:
@@ -126,6 +131,7 @@ struct Arm {
     double farthest;    // L V [m]: a gap that asks for more than the limit is larger
     double fast;        // 1/tau or omega [1/s]
     bool cut_by_play, cut_by_limit;  // where the drive turns, or its gap no longer closes
+    bool may_return;                 // it may turn twice within half a swing
     double drawn;       // c: times an input that decays it follows; 0: not for ever, its decay is close to a pole
     double overshoot;   // times an input it goes at most: the integral of |g| omega^2
     double half_swing;  // s; within it a free plant turns once at most, and a drive at its limit whenever
@@ -150,7 +156,7 @@ struct Arm {
     bool undisturbed(const Drive<Real>& d, const Real& slack) const {
         const double e = value_of(d.error), along = drawn * e, forced = drawn == 0.0 ? overshoot * std::fabs(e) : 0.0;
         const double x = value_of(d.x) - d.u, rate = value_of(d.rate) + value_of(plant.decay) * along;
-        const double swing = std::hypot(x - along, plant.order == 1 ? 0.0 : rate / fast) + forced;
+        const double swing = std::sqrt(square(x - along) + (plant.order == 1 ? 0.0 : square(rate / fast))) + forced;
         const double gap = swing + std::fabs(e - along), tool = x + value_of(slack);
         if (gap < STILL) return true;
         // Where it has just turned it swings up to the tool, but for rounding.
@@ -182,82 +188,115 @@ struct Arm {
     }
 
     // How fast the drive goes and the gap closes. With a factor of exp(bt) both have the slope x" + b x', which is free
-    // of the gain error and moves as the free plant does: it changes its sign once at most within half a swing, and on
-    // either side of that each of the two does (Rolle).
-    struct Motion { double rate, closing, slope; };
+    // of the gain error and moves, with its own rate, as the free plant does: it changes its sign once at most within half
+    // a swing, and on either side of that each of the two does (Rolle).
+    struct Motion { double rate, closing, slope, slope_rate; };
 
     Motion motion(const Drive<Real>& d, int side) const {
         const double s = value_of(asked(d, side)), rate = plant.order == 1 ? s : value_of(d.rate);
         const double decay = value_of(plant.decay), closing = decay * value_of(d.error) + rate;
-        if (plant.order == 2) return {rate, closing, 2.0 * value_of(plant.sigma) * (s - rate) + decay * rate};
-        return {rate, closing, decay * rate - (side == 0 ? fast * closing : 0.0)};
+        if (plant.order == 1) return {rate, closing, decay * rate - (side == 0 ? fast * closing : 0.0), 0.0};
+        const double sigma = value_of(plant.sigma), speeding = 2.0 * sigma * (s - rate);
+        const double restoring = side == 0 ? square(fast) * closing : 0.0;
+        return {rate, closing, speeding + decay * rate, (decay - 2.0 * sigma) * speeding - restoring};
     }
 
-    // The slope `then`, by the transition f to there; by the gain error it would be rounding, once it is small.
-    double later_slope(int side, const Motion& m, const Drive<Real>& then, const Transition<Real>& f) const {
-        if (side != 0) return motion(then, side).slope;
-        if (plant.order == 1) return m.slope;  // of one sign
-        const double decay = value_of(plant.decay), speeding = m.slope - decay * m.rate;
-        const double change = (decay - 2.0 * value_of(plant.sigma)) * speeding - square(fast) * m.closing;
-        return value_of(f.f11) * m.slope + value_of(f.f12) * change;
+    // That of a drive that sets out, to go dt: a moment later, where it is at rest, so that its rates have signs.
+    Motion at_first(const Drive<Real>& d, int side, double dt) const {
+        Motion m = motion(d, side);
+        for (double Motion::*of : {&Motion::rate, &Motion::closing})
+            if (m.*of == 0.0) m.*of = 1e-9 * dt * m.slope;
+        return m;
     }
 
-    // Whether a rate changes its sign on the way, or may do so and back. `slope_then` says the slope at the end.
-    static bool turns(const Motion& m, double first, double last, auto slope_then) {
-        return changes(first, last) || (m.closing != m.rate && first * m.slope < 0.0 && last * slope_then() > 0.0);
+    // That of `then`, dt behind `m` by the transition f of the free plant. By the gap, as at first, it would be rounding
+    // once little is left of it; so is what f leaves of a plant of first order, in the end.
+    Motion later(const Motion& m, const Drive<Real>& then, const Transition<Real>& f, double dt) const {
+        const double slope = value_of(f.f11) * m.slope + value_of(f.f12) * m.slope_rate;
+        const double decay = value_of(plant.decay), e = value_of(then.error);
+        double rate = value_of(then.rate);
+        if (plant.order == 1 && value_of(f.f11) > 1e-6 && std::fabs(decay - fast) > 1e-6 * fast)
+            rate = (slope + fast * decay * e) / (decay - fast);
+        else if (plant.order == 1)
+            rate = m.rate * std::exp(-decay * dt) + m.slope * divided_difference(fast, decay, dt);
+        return {rate, decay * e + rate, slope, value_of(f.f21) * m.slope + value_of(f.f22) * m.slope_rate};
+    }
+
+    // One of the two over time.
+    Course course(const Motion& m, double Motion::*of) const { return {m.*of, m.slope - value_of(plant.decay) * m.*of}; }
+
+    // Whether one of the two changes its sign on the way, or may do so and back.
+    bool turns(const Motion& m, const Motion& n, double Motion::*of) const {
+        return changes(m.*of, n.*of) || (may_return && m.*of * m.slope < 0.0 && n.*of * n.slope > 0.0);
+    }
+
+    // Whether the drive has to be cut where it turns against its tool, or where its gap turns near the limit: a gap that
+    // turns once, and slows down from the start, gets no farther than at the speed that it has.
+    bool play_cuts(const Motion& m, const Motion& n) const { return cut_by_play && turns(m, n, &Motion::rate); }
+    bool limit_cuts(const Drive<Real>& d, const Motion& m, const Motion& n, double dt) const {
+        if (!cut_by_limit || !turns(m, n, &Motion::closing)) return false;
+        const double apart = std::fabs(std::fabs(value_of(d.gap())) - farthest);
+        return !changes(m.closing, n.closing) || m.closing * m.slope > 0.0 || std::fabs(m.closing) * dt > apart;
+    }
+    bool cuts(const Drive<Real>& d, const Drive<Real>& then, int side, const Real& dt) const {
+        if (!(cut_by_play || cut_by_limit)) return false;
+        const double rate = value_of(d.rate);
+        if (value_of(plant.decay) == 0.0 && rate != 0.0 && !changes(rate, value_of(then.rate))) return false;
+        const Motion m = at_first(d, side, value_of(dt));
+        const Motion n = side == 0 ? later(m, then, plant.over(dt), value_of(dt)) : motion(then, side);
+        return play_cuts(m, n) || limit_cuts(d, m, n, value_of(dt));
     }
 
     // The path, cut where the drive turns, and where it meets or leaves its limit.
     void in_pieces(Drive<Real>& d, Real& slack, const Real& dt) const {
         Real left = dt;
         for (int pieces = 1; !is_zero(left); ++pieces) {
-            const Drive<Real> before = d;
-            left = left - piece(d, left, undisturbed(d, slack) || pieces == MOST_PIECES);
-            slack = pushed(slack, before, d);
+            const int side = this->side(d);
+            const bool may_cut = pieces < MOST_PIECES;
+            const bool swings = side == 0 && value_of(left) > half_swing && may_cut && !undisturbed(d, slack);
+            Real taken = swings ? Real(half_swing) : left;
+            Drive<Real> then = d;
+            if (side != 0) at_limit(then, side, taken);
+            else free(then, plant.over(taken), taken);
+            if ((this->side(then) != side || cuts(d, then, side, taken)) && may_cut && !undisturbed(d, slack))
+                cut(d, then, side, taken);
+            slack = pushed(slack, d, then), d = then, left = left - taken;
         }
     }
 
-    // The drive over `left`, or up to the first cut. Returns how long that took.
-    Real piece(Drive<Real>& d, const Real& left, bool whole) const {
-        const int side = this->side(d);
-        const auto moved = [&](const Real& t) {
-            Drive<Real> then = d;
-            if (value_of(t) == 0.0) return then;
-            if (side != 0) at_limit(then, side, t);
-            else free(then, plant.computed(t), t);
-            return then;
+    // The first cut on the way to `then` becomes `then`, and its time `taken`.
+    void cut(const Drive<Real>& d, Drive<Real>& then, int side, Real& taken) const {
+        const Motion m = at_first(d, side, value_of(taken));
+        Motion n = side == 0 ? later(m, then, plant.over(taken), value_of(taken)) : motion(then, side);
+        const auto move_to = [&](const Real& t) {
+            then = d, taken = t;
+            if (side == 0) {
+                const Transition<Real> f = plant.computed(t);
+                free(then, f, t), n = later(m, then, f, value_of(t));
+            } else at_limit(then, side, t), n = motion(then, side);
         };
-        Real taken = whole || side != 0 || value_of(left) <= half_swing ? left : Real(half_swing);
-        Drive<Real> then = moved(taken);
-        if (whole) {
-            d = then;
-            return taken;
-        }
-        const auto up_to_change_of = [&](auto f, double last) {
-            if (!changes(f(0.0), last)) return;
-            taken = behind_change(f, value_of(taken), last);
-            then = moved(taken);
+        const auto up_to_change = [&](const Course& first, auto course) {
+            const Course last = course();
+            if (changes(first.value, last.value))
+                behind_change(value_of(taken), first, last, [&](double t) { return move_to(t), course(); });
         };
         const auto up_to_turn = [&](double Motion::*of) {
-            const Motion m = motion(d, side);
-            const auto rate = [&](double t) { return motion(moved(t), side).*of; };
-            const auto slope_at = [&](double t) { return later_slope(side, m, moved(t), plant.computed(t)); };
-            const double last = motion(then, side).*of, end = value_of(taken);
-            if (!changes(m.*of, last) && turns(m, m.*of, last, [&] { return slope_at(end); }))
-                up_to_change_of(slope_at, slope_at(end));
-            up_to_change_of(rate, motion(then, side).*of);
+            if (!changes(m.*of, n.*of)) {
+                const auto uncut = std::tuple(then, n, taken);
+                up_to_change({m.slope, m.slope_rate}, [&] { return Course{n.slope, n.slope_rate}; });
+                if (!changes(m.*of, n.*of)) return std::tie(then, n, taken) = uncut, void();
+            }
+            up_to_change(course(m, of), [&] { return course(n, of); });
         };
-        if (cut_by_play) up_to_turn(&Motion::rate);
-        if (cut_by_limit) up_to_turn(&Motion::closing);
+        if (play_cuts(m, n)) up_to_turn(&Motion::rate);
+        if (limit_cuts(d, m, n, value_of(taken))) up_to_turn(&Motion::closing);
         if (value_of(max_speed) > 0.0) {
-            const auto beyond = [&](const Drive<Real>& at) {
-                const double gap = value_of(at.gap());
-                return (side == 0 ? std::fabs(gap) : side * gap) - farthest;
+            const auto beyond = [&](const Drive<Real>& at, const Motion& now) -> Course {
+                const double gap = value_of(at.gap()), sign = side != 0 ? side : gap < 0.0 ? -1.0 : 1.0;
+                return {sign * gap - farthest, -sign * now.closing};
             };
-            up_to_change_of([&](double t) { return beyond(moved(t)); }, beyond(then));
+            up_to_change(beyond(d, m), [&] { return beyond(then, n); });
         }
-        d = then;
-        return taken;
     }
 };
 

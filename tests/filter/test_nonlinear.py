@@ -115,6 +115,24 @@ def test_what_is_never_reached_changes_no_bit(plant: PLANTS, recovery: float | N
     np.testing.assert_array_equal(found, moved(linear, given, command, time))
 
 
+@pytest.mark.parametrize(
+    ("plant", "recovery", "play", "step", "ms"),
+    [
+        (SecondOrder(natural_frequency=26.8, damping=0.96), 0.3, 2.5e-5, 0.118, 285),
+        (SecondOrder(natural_frequency=45.5, damping=0.97), 0.3, 2.37e-4, 0.046, 183),
+        (FirstOrder(time_constant=0.0041), 0.0038, 3.8e-5, -0.096, 505),
+        (FirstOrder(time_constant=0.0051), 0.0051, 3.23e-4, -0.069, 444),
+        (FirstOrder(time_constant=0.0022), 0.0053, 2.78e-4, -0.04, 377),
+    ],
+)
+def test_a_command_again_changes_nothing(plant: PLANTS, recovery: float, play: float, step: float, ms: int) -> None:
+    """Steps from rest that turn, and fade until little but rounding is left: in one move as in hundreds."""
+    axis = AxisModel(plant=plant, gain=PAPER, gain_recovery=recovery, play=play)
+    time, again = np.array([ms]) * MS + round(DELAY * 1e9), np.arange(ms) * MS
+    at_once = moved(axis, again[:1], np.array([START + step]), time)
+    np.testing.assert_allclose(at_once, moved(axis, again, np.full(ms, START + step), time), rtol=0.0, atol=1e-12)
+
+
 @settings(max_examples=40)
 @given(PLANT, RECOVERY, SPEED, PLAY, st.integers(0, 10**6))
 def test_no_limit_is_exceeded(plant: PLANTS, recovery: float | None, fastest: float, play: float, seed: int) -> None:
