@@ -107,6 +107,28 @@ def likelihood(repeats: int) -> list[Row]:
     return [row("likelihood", "pumafuse, innovations", "ns", [1e9 * s / values_of(run) for s in seconds], note)]
 
 
+def bends(repeats: int) -> list[Row]:
+    """The response r of an arm that swings, to a minute of sines which ask for more than its fastest speed."""
+    from pumafuse.filter.response import response  # version 0.2 has none
+
+    told_at = 28 * MS * np.arange(2143)
+    time = np.rint(1e9 * np.arange(0.01, 59.5, 1.0 / 30.0)).astype(np.int64)
+    command = 0.1 * np.sin(1e-9 * np.pi * told_at) + 0.03 * np.sin(2.6e-9 * np.pi * told_at)  # m
+    arm = partial(pf.AxisModel, plant=pf.SecondOrder(natural_frequency=30.0, damping=0.8))
+    kinds = {"linear": {}, "play": {"play": 0.004}, "limit": {"max_speed": 0.25}}
+    kinds["play and limit"] = kinds["play"] | kinds["limit"]
+    rows: list[Row] = []
+    for name, bend in kinds.items():
+        axis = arm(**bend)
+        spent = timed(
+            lambda axis=axis: [response(axis, 0.028, 0.06, told_at, command, 0.0, time) for _ in range(100)], repeats
+        )
+        values = [1e9 * s / (100 * (len(told_at) + len(time))) for s in spent]
+        note = f"{min(values) / min(rows[0]['values']):.2f} of a linear one" if rows else ""
+        rows.append(row("response", f"response, {name}", "ns", values, note))
+    return rows
+
+
 def live(repeats: int) -> list[Row]:
     """One call with three axes, rows at 1 kHz, a command and an estimate every 28 ms: medians, so often.
 
@@ -321,6 +343,7 @@ CASES: dict[str, Callable[[int], list[Row]]] = {
     "pumafuse.fuse, as-live": partial(fuse, "as live", "as-live"),
     "pumafuse.fuse, smoothed": partial(fuse, "smooth", "smoothed"),
     "pumafuse, likelihood": likelihood,
+    "response": bends,
     "LiveEstimator.measurement": live,
     "pumafuse live stdin": stdin,
     "processes": processes,

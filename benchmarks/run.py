@@ -35,6 +35,7 @@ HERE = Path(__file__).parent
 VERSION_0_2 = "a513260"  # its last commit; the next one moves the filter from numba to C++
 CASES = [*((HERE / "peers.py", name) for name in peers.PEERS), *((HERE / "project.py", name) for name in project.CASES)]
 ONCE = ("tune", "first use", "memory")  # what takes long is measured in one round
+ALONE = ("response",)  # what version 0.2 has not
 PACKAGES = ("numpy", "scipy", "numba", "filterpy", "statsmodels", "dynamax", "jax", "fast-kalman")
 SCAN = "the scan, three axes, ns a measured value (a million rows are 2.56 million values)"
 TITLES = {
@@ -42,6 +43,7 @@ TITLES = {
     "as live": f"As live: {SCAN}",
     "smooth": f"Smoothing {SCAN}",
     "likelihood": "The likelihood of a run, ns a measured value",
+    "response": "The response of a bent arm, ns a command or an instant",
     "live": "Live, three axes, µs a call or row",
     "process": "Whole processes on the scan, s",
     "tune": "`pumafuse tune --fit noise,delay,plant`, s",
@@ -85,7 +87,8 @@ def in_own_process(script: Path, name: str, repeats: int, sources: Path) -> list
 def measured(script: Path, name: str, given: argparse.Namespace) -> list[Row]:
     """The rows of a case over all rounds, with ``against`` where the other checkout was measured."""
     rows: dict[str, Row] = {}
-    checkouts = {"values": REPOSITORY} | ({"against": given.against} if name in project.CASES and given.against else {})
+    compared = given.against and name in project.CASES and name not in ALONE
+    checkouts = {"values": REPOSITORY} | ({"against": given.against} if compared else {})
     for _ in range(1 if name in ONCE else given.rounds):
         for key, sources in checkouts.items():
             for row in in_own_process(script, name, given.repeats, sources):
