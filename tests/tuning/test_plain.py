@@ -18,7 +18,7 @@ from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.arms import Arm, Measured, Recording
 from pumafuse.tuning.latency import AxisLag, _doubted
 from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.plain import Doubt, PlainArm, doubts, off, plain_arm, with_plain_arm
+from pumafuse.tuning.plain import Doubt, PlainArm, doubts, lag_steps, off, plain_arm, with_plain_arm
 from pumafuse.tuning.stage import Plan
 from pumafuse.tuning.summary import fitted_lags
 from pumafuse.tuning.tune import Pipeline
@@ -273,6 +273,23 @@ def test_a_stop_is_no_lag_that_steps() -> None:
     edge = one.time[int(0.6 * len(one.time))]
     found = found_in(one._replace(value=np.where(one.time < edge, one.value, held.value)))
     assert found is not None and found.step is None
+
+
+def test_a_fastest_speed_is_no_lag_that_steps() -> None:
+    """Slow at first, then faster than it goes: said of a straight arm, and not of the arm that it is."""
+    config = pf.simulate(scenario("saturating-servo"), 2).config
+    axis, rng = config.arm.axes["joint"], np.random.default_rng(3)
+    given = np.arange(3000) * 10_000_000
+    phase = np.cumsum(np.where(np.arange(3000) < 2000, 0.5, 3.0)) * 0.02 * np.pi
+    command, time = np.deg2rad(45.0) * np.sin(phase), np.sort(rng.integers(0, given[-1], 600))
+    path = response(axis, 0.01, config.arm.delay_of("joint"), given, command, float(command[0]), time)
+    value = command[0] + path + rng.normal(0.0, 5e-3, len(time))
+    one = Recording(given, command, command[0], time, value, np.zeros(len(time), dtype=np.int64), np.ones(len(time)))
+    found = plain_arm(Measured((one,), 0.01, ["camera"]))
+    assert found is not None and found.step is not None and found.step.after > found.step.before + 0.01
+    arm = replaced(config.arm, axes={"joint": replaced(axis, max_speed=None)})
+    assert lag_steps({"joint": found}, config) == []
+    assert lag_steps({"joint": found}, replaced(config, arm=arm)) == [f"joint: {found.step}"]
 
 
 def test_nothing_is_said_of_what_is_off_by_next_to_nothing() -> None:

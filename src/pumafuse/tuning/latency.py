@@ -42,7 +42,7 @@ from .parameters import (
     with_own_delays,
     with_shared_delay,
 )
-from .plain import LONGEST, Doubt, doubts, with_plain_arm
+from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
 from .posterior import Model, Quantity
 
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
@@ -296,7 +296,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
     notes = [*turned, *likelihood.notes, *said, *likelihood.overruns(config.arm)]
     notes += [f"{axis}: does not move, or {trusted} does not measure it" for axis in still]
-    notes += [f"{axis}: {plain.step}" for axis in lags if (plain := searches[axis].plain) and plain.step]
+    notes += lag_steps({axis: searches[axis].plain for axis in lags}, config)
     notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
     notes += [f"{axis}: {too_early(trusted, by)}" for axis, by in sooner.items()]
     notes += [_SAMPLED.format(survey.run.name, step * MS) for survey in surveys if (step := interpolation(survey))]

@@ -235,6 +235,18 @@ def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[s
     return doubts_by_axis
 
 
+def lag_steps(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> list[str]:
+    """Sentences on lags that step, of axes whose configured arm, with all that bends it, explains no more of it."""
+    notes: list[str] = []
+    for axis, plain_here in plain.items():
+        if plain_here is not None and plain_here.step is not None:
+            measured = plain_here.measured
+            configured = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
+            if measured.squares(configured) > _HALVED * measured.squares(plain_here.arm):
+                notes.append(f"{axis}: {plain_here.step}")
+    return notes
+
+
 def with_plain_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     """The configuration with an axis's arm by least squares: of first order, with a gain that stays."""
     return with_arm(config, axis, Arm(*(rounded(number) for number in arm)))

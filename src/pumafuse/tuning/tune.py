@@ -24,7 +24,7 @@ from .identifiability import FEWEST, TuneError, correlations, excited_axes, leas
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
-from .plain import LONGEST, Doubt, doubts, with_plain_arm
+from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, refitted, run_stage
 from .summary import (
     AxisLikelihood,
@@ -179,7 +179,7 @@ def tune(
     untold = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]  # nobody measures these
     lags = fitted_lags(free, config, result, around, doubted_axes, untold)
     tuned = _with_provenance(result, free, by_key, {} if interrupted else lags, names)
-    doubted += [f"{axis}: {search.plain.step}" for axis, search in arms.items() if search.plain and search.plain.step]
+    doubted += lag_steps({axis: search.plain for axis, search in arms.items()}, tuned)
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
