@@ -1127,6 +1127,19 @@ def test_columns_without_names_are_called_as_nothing(log: Path) -> None:
     assert not any("ticks" in one for one in asked(found))
 
 
+def test_what_columns_without_names_are_is_in_the_name_of_their_file(tmp_path: Path) -> None:
+    """A controller that writes a file for each quantity: neither speeds nor forces are commands, and joints turn."""
+    _, u, z = recorded_at_once()
+    speeds = np.gradient(u, 0.02, axis=0)
+    files = {"wantedJointAngles": u, "jointAngles": z, "wantedJointSpeeds": speeds, "force": 9.0 * z}
+    for name, values in files.items():
+        np.savetxt(tmp_path / f"{name}.csv", values, "%.6f", delimiter=",")
+    found = survey(tmp_path, rate=50.0)
+    assert found.roles is not None and [one.name for one in found.roles.sensors] == ["jointAngles"]
+    assert [part.stem for part in found.parts if part.signals] == ["jointAngles", "wantedJointAngles"]
+    assert found.run.kinds == dict.fromkeys(("joint_1", "joint_2", "joint_3"), "angle")
+
+
 @pytest.mark.parametrize("nested", [[["hip", "Knee", "lArmYaw"]], {"axes": {"hip": 0, "Knee": 1, "lArmYaw": 2}}])
 def test_names_of_lerobot_are_found_where_converters_write_them(nested: Any, tmp_path: Path) -> None:
     """A list in a list, or a table of places; in radians, as they are joints."""

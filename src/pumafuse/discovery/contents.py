@@ -288,7 +288,8 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
         elif signal_or_why:
             left_out[name] = signal_or_why
     signals = [_placed(signal, told) for signal in _without_quaternions(signals, left_out)]
-    if signals and (why := names.no_position_by_place(source.stem, [signal.column for signal in signals])):
+    called = [signal.column for signal in signals if not _is_nameless(signal.column)]
+    if signals and (why := names.no_position_by_place(source.stem, called)):
         left_out |= {signal.name: f"{why}, as {source.label} is called" for signal in signals}
         signals = []
     notes = list[str]()
@@ -329,9 +330,11 @@ def is_nameless(signals: Iterable[Signal], clock: Clock) -> bool:
     """Whether no column has a name: those of a table without a header, or of an array that has its clock in it."""
     array, bracket, _ = clock.time.column.partition("[")
     columns = [signal.column for signal in signals]
-    return all(
-        names.words(column)[:1] == NAMELESS or (bracket and column.startswith(f"{array}[")) for column in columns
-    )
+    return all(_is_nameless(column) or (bracket and column.startswith(f"{array}[")) for column in columns)
+
+
+def _is_nameless(column: str) -> bool:
+    return names.words(column)[:1] == NAMELESS
 
 
 def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
@@ -472,7 +475,10 @@ def _signal(
     of_type = "m" if metres else "rad" if kind in _RADIANS or path.startswith(f"{PATH}.") else ""
     unit = names.unit_of(path) or names.unit_of(source.topic or source.entity)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
-    axis = joint or names.axis_of(_called(_ECHO.sub("", path), where), labels)
+    called = _ECHO.sub("", path)
+    if _is_nameless(path) and names.has_word(source.stem, names.JOINTS):
+        called = called.replace(NAMELESS[0], "joint")
+    axis = joint or names.axis_of(_called(called, where), labels)
     if kind == _PX4:
         place_of = _PX4_PLACE.fullmatch(path)
         axis = "xyz"[int(place_of[1])] if place_of else axis

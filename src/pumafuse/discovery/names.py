@@ -92,7 +92,7 @@ _BRACKETED = re.compile(rf"[\[(] *(mm|m|um|deg|rad|mrad) *[\])]|{_DEGREES.patter
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 # Joints in metres, where others turn.
 SLIDING = words_in("slide slider prismatic linear rail gantry insertion telescope telescopic elevator")
-_JOINTS = words_in("joint joints jnt dof")
+JOINTS = words_in("joint joints jnt dof")
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
     **dict.fromkeys(words_in("m meter meters metre metres"), "m"),
@@ -256,7 +256,7 @@ def is_turning(axis: str) -> bool:
 def turns(column: str, axis: str) -> bool:
     """Whether a column is of a joint that turns, by its axis or, as ``joint_pos_FL``, by a word before that."""
     stems = {word.rstrip(_DIGITS) for word in words(leaf(column))}
-    return is_turning(axis) or (not _JOINTS.isdisjoint(stems) and SLIDING.isdisjoint(stems))
+    return is_turning(axis) or (not JOINTS.isdisjoint(stems) and SLIDING.isdisjoint(stems))
 
 
 def axis_of(column: str, labels: list[str]) -> str:
