@@ -206,3 +206,13 @@ def test_a_row_that_is_measured_late_and_stamped_so_is_no_outlier() -> None:
     assert not isolated(t, value).any()
     value[[75, 305]] += 0.01
     assert np.flatnonzero(isolated(t, value)).tolist() == [75, 305]
+
+
+def test_a_row_that_is_stamped_late_is_no_outlier() -> None:
+    """Read every 6 ms, and stamped when a busy logger comes to it: 5 mm off by its time, by its place not at all."""
+    rng, t = np.random.default_rng(6), np.arange(600) * 0.006
+    value = np.cos(t) + rng.normal(0.0, 1e-5, len(t))
+    t[25::40] += 5e-3
+    assert not isolated(t, value).any()
+    value[[90, 410]] -= 0.01
+    assert np.flatnonzero(isolated(t, value)).tolist() == [90, 410]

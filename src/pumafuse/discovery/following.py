@@ -209,23 +209,32 @@ def resolution(value: FloatArray) -> float:
 
 
 def isolated(time: FloatArray, value: FloatArray) -> BoolArray:
-    """Which values leave their neighbours, two on each side that lie on a line over time, and are back at once, (n,).
+    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,).
 
+    The line is one over time, and one from row to row: of an even motion rows may be measured late, or stamped late.
     Of an encoder that rests in most rows the least third differences are those of one count, by which it flickers.
     """
     is_isolated = np.zeros(len(value), dtype=np.bool_)
     if len(value) < _FEWEST:
         return is_isolated
-    at, neighbours = (np.stack([part[:-4], part[1:-3], part[3:-1], part[4:]]) for part in (time, value))
-    mean, level = at.mean(axis=0), neighbours.mean(axis=0)
-    slope = ((at - mean) * neighbours).sum(axis=0) / np.maximum(((at - mean) ** 2).sum(axis=0), 1e-30)
-    off = np.abs(neighbours - level - slope * (at - mean)).max(axis=0)
     third = np.abs(np.diff(value, 3))
     third = third[third > _ROUNDING * np.abs(value).max()]
     flicker = SD_OF_MEDIAN * float(np.quantile(third, _FLICKERING)) if len(third) else 0.0
-    least = np.maximum(_OUTLYING * max(scatter(value) or flicker / math.sqrt(20.0), _resolution(value)), _APART * off)
-    is_isolated[2:-2] = np.abs(value[2:-2] - level - slope * (time[2:-2] - mean)) > least
+    least = _OUTLYING * max(scatter(value) or flicker / math.sqrt(20.0), _resolution(value))
+    is_isolated[2:-2] = True
+    for at in (time, np.arange(len(value), dtype=np.float64)):
+        apart, off = _off_line(at, value)
+        is_isolated[2:-2] &= apart > np.maximum(least, _APART * off)
     return is_isolated
+
+
+def _off_line(at: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How far each value is from the line through its neighbours, two on each side, and these at most, (n - 4,)."""
+    places, neighbours = (np.stack([part[:-4], part[1:-3], part[3:-1], part[4:]]) for part in (at, value))
+    mean, level = places.mean(axis=0), neighbours.mean(axis=0)
+    slope = ((places - mean) * neighbours).sum(axis=0) / np.maximum(((places - mean) ** 2).sum(axis=0), 1e-30)
+    off = np.abs(neighbours - level - slope * (places - mean)).max(axis=0)
+    return np.abs(value[2:-2] - level - slope * (at[2:-2] - mean)), off
 
 
 def robust_sd(residual: FloatArray) -> float:
