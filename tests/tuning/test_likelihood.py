@@ -184,6 +184,23 @@ def with_axis(config: pf.FusionConfig, axis: str, **changes: object) -> pf.Fusio
     return replaced(config, arm=replaced(arm, axes={**arm.axes, axis: replaced(arm.axes[axis], **changes)}))
 
 
+def test_of_more_measurements_than_a_fit_needs_those_count_during_which_an_axis_is_told_to_move() -> None:
+    """Two axes for 50 s at 1000 Hz; each moves a fifth of the time, at times of its own."""
+    t = np.arange(0.0, 50.0, 1e-3)
+    beginning = {"radial": 0.4, "vertical": 2.9}
+    moves = {axis: (t - begin) % 6.25 < 1.2 for axis, begin in beginning.items()}
+    command = {axis: np.cumsum(moving * np.sin(9.0 * t)) * 1e-3 for axis, moving in moves.items()}
+    run = pf.Run.from_arrays(t, command, {"resolver": (t, command)})
+    arm = pf.ArmModel.load("puma560-internal")
+    config = pf.FusionConfig(arm=arm, sensors={"resolver": pf.Sensor(sd=1e-4)})
+    likelihood = Likelihood([run], config)
+    assert likelihood.count.sum() == pytest.approx(80_000, rel=0.01)
+    assert any("80% of 100,000 measurements" in note for note in likelihood.notes)
+    for axis, moving in moves.items():
+        (recording,) = likelihood.measured(axis, config).recordings
+        assert np.isin(np.round(1e9 * t[moving]), recording.time).mean() > 0.99
+
+
 def test_how_well_the_arm_is_known_is_no_part_of_it() -> None:
     """Intervals of lag and gain change neither the likelihood nor its derivatives, but what a fusion says."""
     sim = two_sensors()

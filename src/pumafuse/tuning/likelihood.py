@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from ..arrays import SD_OF_MEDIAN, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import SD_OF_MEDIAN, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..discovery.following import resolution, scatter
 from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
@@ -45,6 +45,7 @@ _PIECES = 20  # of a run, that a model which is right has independent scores in
 _SHIFT = 1e-4  # s, by which a lag is varied
 _SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
 _COUNTED = 0.98  # of the innovations
+_MOST, _STRETCHES = 80_000, 8  # components of all axes that are enough for a fit; of longer runs, in so many stretches
 _SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
 
 T = TypeVar("T")
@@ -164,6 +165,11 @@ class Likelihood:
             [_decided(segment, until, latest) for segment in built],
             [name for name, _ in named],
         )
+        every = sum(int(np.count_nonzero(part.measurement_rows.codes == Outcome.FUSED)) for part in self._segments)
+        if every > _MOST:
+            self._segments = [_liveliest(segment, _MOST / every) for segment in self._segments]
+            share = f"{_MOST / every:.0%} of {every:,} measurements"
+            self.notes.append(f"fitted to {share}: of each axis where it moves most, in {_STRETCHES} parts of a run")
         self._parts = [
             _Part(number, self.axes.index(axis), segment.of_axis(axis, rows), rows, column)
             for number, segment in enumerate(self._segments)
@@ -408,6 +414,32 @@ def _decided(segment: Segment, until: float | None, latest: float | None) -> Seg
         chosen &= rows.time <= segment.origin + round(until * 1e9)
     if latest is not None:
         chosen &= rows.stamp - round(latest * 1e9) >= segment.origin
-    decisions = np.where((rows.codes == Outcome.FUSED) & chosen[:, None], rows.codes, ABSENT).astype(np.uint8)
-    kept = np.flatnonzero((decisions != ABSENT).any(axis=1))
-    return replace(segment, measurement_rows=rows._replace(codes=decisions).rows(kept))
+    return _of_rows(segment, (rows.codes == Outcome.FUSED) & chosen[:, None])
+
+
+def _of_rows(segment: Segment, chosen: BoolArray) -> Segment:
+    """A segment with some of its measurements, (m, A)."""
+    rows = segment.measurement_rows
+    codes = np.where(chosen, rows.codes, ABSENT).astype(np.uint8)
+    return replace(segment, measurement_rows=rows._replace(codes=codes).rows(np.flatnonzero(chosen.any(axis=1))))
+
+
+def _liveliest(segment: Segment, share: float) -> Segment:
+    """A segment with a share of each axis's measurements: in each part of it those during which most is commanded.
+
+    Where a sensor measures within a turn all stay: in between nobody knows how often it goes round.
+    """
+    rows = segment.measurement_rows
+    fused = rows.codes == Outcome.FUSED
+    chosen = fused & segment.turn.any()
+    for column, axis in enumerate(segment.axes):
+        told, command = segment.commands_of(axis)
+        way = np.append(0.0, np.cumsum(np.abs(np.diff(command))))
+        by_stamp = np.flatnonzero(fused[:, column])
+        by_stamp = by_stamp[np.argsort(rows.stamp[by_stamp], kind="stable")]
+        for part in np.array_split(by_stamp, _STRETCHES):
+            length = math.ceil(share * len(part))
+            until = np.interp(rows.stamp[part], told, way)
+            first = int(np.argmax(until[length - 1 :] - until[: len(part) - length + 1])) if length else 0
+            chosen[part[first : first + length], column] = True
+    return _of_rows(segment, chosen)
