@@ -453,6 +453,17 @@ def test_signals_that_nothing_tells_apart_are_described_and_no_column_is_both(tm
     assert "run.toml" in one_line(ConfigError, lambda: survey(tmp_path))
 
 
+def test_set_points_are_what_is_measured_and_the_error_of_a_controller(tmp_path: Path) -> None:
+    """A log without them: a measured column may be part of a sum that is commanded, and the sum is followed."""
+    t, u, z = recorded_at_once()
+    write(tmp_path / "log.csv", {"t_s": t, "level_mm": 1e3 * z[:, 0], "error_mm": 1e3 * (u - z)[:, 0], "duty": z[:, 1]})
+    columns = 'file = "log.csv"\ntime = "t_s"\nboom = '
+    told = f'[command]\n{columns}["level_mm", "error_mm"]\n'
+    (tmp_path / "run.toml").write_text(f'{told}[sensors.gauge]\n{columns}"level_mm"\n')
+    relation = survey(tmp_path).relations["gauge", "boom"]
+    assert relation.lag == pytest.approx(LAG, abs=0.01) and relation.slope == pytest.approx(1.0, abs=0.02)
+
+
 def test_a_status_that_changes_all_the_time_tells_nothing_apart(tmp_path: Path) -> None:
     t, u, z = recorded_at_once()
     words = np.where(np.random.default_rng(1).random(len(t)) < 0.5, "good", "poor")
