@@ -48,6 +48,7 @@ inline auto sized(const pf_model& model, auto make) {
     if (most <= 4) return make(Size<4>{});
     if (most <= 5) return make(Size<5>{});
     if (most <= 6) return make(Size<6>{});
+    if (most <= 7) return make(Size<7>{});
     if (most <= 9) return make(Size<9>{});
     if (most <= 16) return make(Size<16>{});
     return make(Size<64>{});

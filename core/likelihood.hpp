@@ -87,34 +87,31 @@ struct Dual {
 
 // At its best K the covariance does not change with K:
 //     d(P+) = (I - K H) dP (I - K H)' + K dR K' - K dH P+ - (K dH P+)'
+// with (I - K H) dP (I - K H)' = dP - K H dP - (K H dP)' + K H dP H' K'. `along` has H dP + dH P and what S changes by.
 template <int N, int L>
 Vector<N, Dual<L>> joseph_tangent(auto& M, const auto& H, const Along<N, Dual<L>>& along, const Dual<L>& R) {
     constexpr int PAIRS = Dual<L>::PAIRS;
     Vector<N, Dual<L>> K;
     Vector<N, double> h;
     Matrix<N, double> P;
-    bool sees_otherwise = false;  // whether H changes with a parameter
+    std::array<Pair, PAIRS> moved{};  // dH K
     for (int i = 0; i < N; ++i) {
         K[i] = along.MH[i] / along.S, h[i] = H[i].value;
-        sees_otherwise |= !is_zero(H[i] - h[i]);
         for (int j = 0; j < N; ++j) P[i][j] = M[i][j].value;
+        for (int k = 0; k < PAIRS; ++k) moved[k] += H[i].d[k] * K[i].value;
     }
     joseph<N, double>(P, h, {P, h, R.value}, R.value);
-    std::array<std::array<Pair, PAIRS>, N> across{};  // H dP + dH P+
-    std::array<Pair, PAIRS> along_h = R.d;            // H dP H' + dR
-    for (int j = 0; j < N; ++j) {
-        for (int i = 0; i < N; ++i)
-            for (int k = 0; k < PAIRS; ++k) across[j][k] += h[i] * M[i][j].d[k];
-        for (int k = 0; k < PAIRS; ++k) along_h[k] += h[j] * across[j][k];
-        for (int i = 0; sees_otherwise && i < N; ++i)
-            for (int k = 0; k < PAIRS; ++k) across[j][k] += H[i].d[k] * P[i][j];
-    }
+    std::array<Pair, PAIRS> along_h;               // H dP H' + dR
+    std::array<std::array<Pair, PAIRS>, N> across; // H dP + dH P+, less half of K along_h
+    for (int k = 0; k < PAIRS; ++k) along_h[k] = along.S.d[k] - 2.0 * along.S.value * moved[k];
+    for (int i = 0; i < N; ++i)
+        for (int k = 0; k < PAIRS; ++k)
+            across[i][k] = along.MH[i].d[k] - along.MH[i].value * moved[k] - 0.5 * K[i].value * along_h[k];
     for (int i = 0; i < N; ++i)
         for (int j = 0; j <= i; ++j) {
-            const double a = K[i].value, b = K[j].value, ab = a * b;
             Dual<L>& there = M[i][j];
             there.value = P[i][j];
-            for (int k = 0; k < PAIRS; ++k) there.d[k] += ab * along_h[k] - a * across[j][k] - b * across[i][k];
+            for (int k = 0; k < PAIRS; ++k) there.d[k] -= K[i].value * across[j][k] + K[j].value * across[i][k];
             M[j][i] = there;
         }
     return K;

@@ -40,8 +40,10 @@ struct Along {
     Along(const Matrix<N, Real>& M, const Vector<N, Real>& H, Real R) : S(R) {
         constexpr double ROUNDING = 1e-15;
         Real own = 0.0;
-        for (int j = 0; j < N; ++j)
+        for (int j = 0; j < N; ++j) {
+            if (is_zero(H[j])) continue;
             for (int i = 0; i < N; ++i) MH[i] = MH[i] + M[j][i] * H[j];
+        }
         for (int i = 0; i < N; ++i) own = own + H[i] * H[i] * M[i][i], S = S + H[i] * MH[i];
         if (value_of(S) < value_of(R)) S = R;
         if (value_of(S) < ROUNDING * value_of(own)) S = ROUNDING * own;
