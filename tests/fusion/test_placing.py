@@ -198,6 +198,26 @@ def test_noise_along_the_axes_of_a_sensor_becomes_noise_along_those_of_the_base(
     assert [along.sd_of(axis) for axis in "xyz"] == (sds * 1e-3).tolist()
 
 
+def test_noise_along_one_axis_of_the_base_is_none_along_the_others() -> None:
+    """What a sensor in a frame of its own has of noise by name of an axis is along that axis of the arm, and no other.
+
+    So `tune` finds it axis by axis: a camera that sees depth less well has along each what its three axes make of it.
+    """
+    sds = {"x": 0.1, "y": 0.2, "z": 0.4}
+    sensor = config(camera=CAMERA | PLACE | {"sd_mm": sds}).sensors["camera"]
+    assert [sensor.sd_of(axis) for axis in "xyz"] == pytest.approx([1e-4, 2e-4, 4e-4])
+    run, _, _ = pose_run()
+    camera = run.sensors["camera"]
+    blur = np.random.default_rng(5).normal(0.0, [1e-4, 1e-4, 8e-4], (len(camera.stamp), 3))
+    values = {axis: value + noise for (axis, value), noise in zip(camera.values.items(), blur.T, strict=True)}
+    blurred = replace(run, sensors={"camera": replace(camera, values=values)})
+    given = config(camera=CAMERA | PLACE | {"sd_deg": 1e-3})  # else the tool point counts what its orientation errs
+    given = msgspec.structs.replace(given, tool=pf.Tool(reference=tuple(LEVEL.as_rotvec().tolist())))
+    found = pf.tune(blurred, given, fit=("noise",), fix=("process",)).config.sensors["camera"]
+    wanted = np.sqrt(4e-8 + FRAME.as_matrix() ** 2 @ np.square([1e-4, 1e-4, 8e-4]))
+    assert [found.sd_of(axis) for axis in "xyz"] == pytest.approx(wanted, rel=0.15)  # of some 590 rows: 3 %
+
+
 def test_the_noise_of_a_marker_far_from_the_tool_point_counts_how_it_is_turned() -> None:
     """Tool points that a camera tells scatter as its positions and as its orientations times the lever, in sum."""
     rng = np.random.default_rng(3)

@@ -104,6 +104,10 @@ class Placement(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     at: Vector = msgspec.field(name="at_mm", default=(0.0, 0.0, 0.0))
     rotation: Vector = msgspec.field(name="rotation_vector_deg", default=(0.0, 0.0, 0.0))
 
+    def turned_sd(self, sds: Sequence[float]) -> list[float]:
+        """The noise along the other frame's axes of what is independent along its own; the correlation is lost."""
+        return np.hypot.reduce(rotations.matrix(np.array(self.rotation)) * np.array(sds), axis=1).tolist()
+
 
 class Tool(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A tool that turns.
@@ -119,7 +123,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """z = scale · p(stamp − latency) + bias + noise.
 
     Attributes:
-        sd: Noise [m or rad], one number or one for each axis.
+        sd: Noise [m or rad], one number or one for each axis of the arm.
         latency: From the instant at which the measurement is valid to its stamp [s].
         latency_sd: Standard deviation of the latency from measurement to measurement [s].
         scale: Factor on the position; −1 for a distance to a panel in front.
@@ -131,8 +135,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         gate: A measurement beyond this many standard deviations is rejected; 0: never.
         gate_rows: Whether one rejected axis rejects the whole row; None: unless all its axes are angles, as of an
             encoder each.
-        frame: Where it stands, base_from_sensor; None: it measures along the base's axes. The noise of each axis is
-            then along the sensor's axes.
+        frame: Where it stands, base_from_sensor; None: it measures along the base's axes.
         marker: What it sees, on the tool, tool_from_marker; None: the tool point.
     """
 
@@ -156,13 +159,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def sd_of(self, axis: str) -> float | None:
         """The noise on one axis of the arm [m or rad]; None where the sensor has none and so is not used."""
-        if not isinstance(self.sd, dict):
-            return self.sd
-        space = next((axes for axes in (CARTESIAN, TURNING) if axis in axes), None)
-        if self.frame is None or space is None or not self.sd.keys() >= set(space):
-            return self.sd.get(axis)
-        along = rotations.matrix(np.array(self.frame.rotation))[space.index(axis)]
-        return float(np.hypot.reduce(along * [self.sd[axis_in_space] for axis_in_space in space]))
+        return self.sd.get(axis) if isinstance(self.sd, dict) else self.sd
 
     def bias_sd_of(self, axis: str) -> float:
         """The uncertainty of its constant bias on one axis [m or rad]; 0 where none is estimated."""
@@ -363,8 +360,7 @@ def with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str, pa
     if isinstance(sensors := lengths.get("sensors"), dict):
         named = cast(dict[str, Any], sensors)
         lengths["sensors"] = {
-            name: of_all_axes(table, Sensor, arm, where, f"{path}sensors.{name}", _PER_AXIS)
-            for name, table in named.items()
+            name: _sensor(table, arm, where, f"{path}sensors.{name}") for name, table in named.items()
         }
     return lengths
 
@@ -414,7 +410,7 @@ def of_all_axes(
             name = of_kind(key, of)
             if name not in of_all_axes:
                 continue
-            value = _by_axis_of_sensor(of_all_axes.pop(name), of, arm)
+            value = _by_axis(of_all_axes.pop(name), of, arm)
             if of not in arm.kinds:
                 right = of_kind(key, arm.kinds[0])
                 raise ConfigError(f"{where}: {path}.{name}: no axis of the arm is {AN[of]}; give {right}")
@@ -432,8 +428,23 @@ def of_all_axes(
     return of_all_axes
 
 
-def _by_axis_of_sensor(value: Any, kind: Kind, arm: ArmModel) -> Any:
-    """Three numbers, as of a sensor that sees depth less well, by the axes of its frame; anything else as it is."""
+def _sensor(table: Any, arm: ArmModel, where: str, path: str) -> Any:
+    """A sensor's table as one of lengths.
+
+    The noise of three axes of its frame, as of one that sees depth less well, becomes that along the base's.
+    """
+    if isinstance(table, dict) and "frame" in table:
+        table = cast(dict[str, Any], table).copy()
+        frame = toml.struct(table["frame"], Placement, where, f"{path}.frame")
+        for key in (of_kind("sd_mm", of) for of in KINDS):
+            if isinstance(sds := table.get(key), list):
+                toml.check(sds, tuple[Positive, Positive, Positive], where, f"{path}.{key}")
+                table[key] = frame.turned_sd(cast(list[float], sds))
+    return of_all_axes(table, Sensor, arm, where, path, _PER_AXIS)
+
+
+def _by_axis(value: Any, kind: Kind, arm: ArmModel) -> Any:
+    """Three numbers by axis; anything else as it is."""
     axes = CARTESIAN if kind == "length" else TURNING
     if not isinstance(value, list) or len(cast(list[Any], value)) != len(axes) or not set(axes) <= set(arm.axes):
         return cast(Any, value)

@@ -98,6 +98,7 @@ def placed_by(
     sensors = {
         name: msgspec.structs.replace(
             config.sensors[name],
+            sd=_noise(config.sensors[name], _placement(registration.frame)),
             frame=_placement(registration.frame),
             marker=_placement(registration.marker),
             latency=round(latencies[name].value, DIGITS) if name in latencies else config.sensors[name].latency,
@@ -116,6 +117,17 @@ def _placement(placed: Registered | None) -> Placement | None:
         return None
     at, rotation = (_rounded(vector) for vector in (placed.at, placed.rotation))
     return Placement(at=at, rotation=rotation) if any(at) or any(rotation) else None
+
+
+def _noise(sensor: Sensor, frame: Placement | None) -> float | dict[str, float]:
+    """The noise of a sensor along the base's axes, where it was along its own until its frame was found."""
+    if frame is None or sensor.frame is not None or not isinstance(sensor.sd, dict):
+        return sensor.sd
+    sd = sensor.sd.copy()
+    for space in (CARTESIAN, TURNING):
+        if sd.keys() >= set(space):
+            sd |= zip(space, frame.turned_sd([sd[axis] for axis in space]), strict=True)
+    return sd
 
 
 def _rounded(vector: Vector) -> Vector:
