@@ -73,6 +73,7 @@ _SLOWLY, _LONGER = 0.5, 1.5  # log-likelihood that a step loses: with less the n
 _PIECES = 20  # of all recordings, that a model which is right has independent scores in
 _ENOUGH = 20_000  # commands or measurements of a recording that an arm is known by: more make none better
 _SLOPE = 1e-5  # of a coordinate, by which quantities are varied
+_NONE = Fit(Arm(0.0, 1.0), -math.inf, np.zeros((0, 0)))  # is worse than any
 
 
 class Freedom(NamedTuple):
@@ -212,7 +213,8 @@ class ArmSearch:
         highest = max(peak[0] for peak in every)
         for evidence, model, fit in list(every) if "delay" in self.freedom.free else ():
             for ticks in (-1.0, 1.0) if evidence > highest - _FORLORN else ():
-                beside = self._fit(model, self._delayed(fit.arm, fit.arm.delay + ticks * self._measured.period))
+                shifted = self._delayed(fit.arm, fit.arm.delay + ticks * self._measured.period)
+                beside = self._fit(model, shifted, fit.log_posterior - 2.0 * _FORLORN)
                 delays = [peak.arm.delay for _, other, peak in every if other == model]
                 if min(abs(beside.arm.delay - delay) for delay in delays) > _SAME:
                     every.append((self._evidence(model, beside), model, beside))
@@ -251,14 +253,13 @@ class ArmSearch:
         fits = dict[Model, Fit]()
         for model in earlier or self.freedom.models:
             arms = starts if not fits else [self._best(fits).arm]
-            tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, 1 if earlier else 2)]
-            if earlier:
-                tries.append(self._fit(model, earlier[model].arm))
-            fits[model] = max(tries, key=lambda fit: fit.log_posterior)
+            begun = [earlier[model].arm] if earlier else []
+            fits[model] = self._highest(model, [*begun, *self._likeliest(model, arms, 1 if earlier else 2)])
         best = max(fits, key=lambda model: fits[model].log_posterior)
-        for ticks in _TICKS if "delay" in self.freedom.free else ():
-            shifted = self._delayed(fits[best].arm, fits[best].arm.delay + ticks * self._measured.period)
-            fits[best] = max(fits[best], self._fit(best, shifted), key=lambda fit: fit.log_posterior)
+        ticks = _TICKS if "delay" in self.freedom.free else ()
+        for later in (tick * self._measured.period for tick in ticks):
+            arm = fits[best].arm
+            fits[best] = self._highest(best, [self._delayed(arm, arm.delay + later)], fits[best])
         return fits
 
     def _likeliest(self, model: Model, arms: Iterable[Arm], count: int) -> list[Arm]:
@@ -304,9 +305,15 @@ class ArmSearch:
         later = arm._replace(delay=delay)
         return self._as_late(later, arm.total)
 
-    def _fit(self, model: Model, start: Arm) -> Fit:
+    def _highest(self, model: Model, starts: Iterable[Arm], best: Fit = _NONE) -> Fit:
+        """The highest of the maxima next to some arms, and of the best so far."""
+        for start in starts:
+            best = max(best, self._fit(model, start, best.log_posterior), key=lambda fit: fit.log_posterior)
+        return best
+
+    def _fit(self, model: Model, start: Arm, worth: float) -> Fit:
         names = self.freedom.names(model)
-        return self._measured.fitted(start, names, self.noise, self.limits)
+        return self._measured.fitted(start, names, self.noise, self.limits, worth)
 
     def _best(self, fits: Mapping[Model, Fit]) -> Fit:
         return max(fits.values(), key=lambda fit: fit.log_posterior)

@@ -44,6 +44,7 @@ _QUARTERS, _FEW_COMMANDS = 4, 200  # of a long recording; of which parts are no 
 _SETTLED = 2.6  # s, after which an arm has forgotten earlier commands
 _CLOSE = 0.01  # log-likelihood: what is expected to gain less is no step
 _STEPS = 12  # of Gauss and Newton, at most
+PROMISE = 5.0  # times the gain expected of the last step, beyond which no further steps are hoped to lead
 _SHIFT, _LOG_SHIFT = 1e-4, 1e-3  # s, 1: by which responses are varied; delays are coarser than a nanosecond's rounding
 # longest step of each coordinate; a slope is linear, and its unit is of any size
 _REACH = {
@@ -389,8 +390,13 @@ class Measured:
         log = -0.5 * (np.maximum(squares, 0.0) + log_determinant + self.count * _LOG_2PI)
         return np.asarray(log, dtype=np.float64), np.asarray(gain, dtype=np.float64)
 
-    def fitted(self, start: Arm, names: Coordinates, noise: NoiseModel, limits: Limits) -> Fit:
-        """The arm of the highest posterior near another one, by Gauss and Newton."""
+    def fitted(
+        self, start: Arm, names: Coordinates, noise: NoiseModel, limits: Limits, worth: float = -math.inf
+    ) -> Fit:
+        """The arm of the highest posterior near another one, by Gauss and Newton.
+
+        One below ``worth`` is not wanted: where that is out of reach, the search ends early.
+        """
         low, high = limits.range(names)
         reach = np.array([_REACH[name] for name in names])
         arm = start.moved(names, np.clip([start.coordinate(name) for name in names], low, high).tolist())
@@ -400,7 +406,8 @@ class Measured:
             for damping in _DAMPINGS:
                 ends = np.maximum(low - here, -reach), np.minimum(high - here, reach)
                 step = bounded_step(best.score, best.information, *ends, np.full(len(names), damping))
-                if float(best.score @ step) - 0.5 * float(step @ best.information @ step) < _CLOSE:
+                expected = float(best.score @ step) - 0.5 * float(step @ best.information @ step)
+                if expected < _CLOSE or best.log_posterior + PROMISE * expected < worth:
                     return Fit(best.arm, best.log_posterior, best.information)
                 trial = self._linear(best.arm.moved(names, (here + step).tolist()), names, noise, limits)
                 if trial.log_posterior > best.log_posterior:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
+from .arms import PROMISE
 from .likelihood import Derivatives, Likelihood, Point, in_threads
 from .parameters import Parameter, coordinates, moved, with_axis_of
 from .steps import bounded_step
@@ -27,7 +28,6 @@ _DOUBLES = (2.0, 4.0, 8.0)
 _NOTHING, _CREEPING = 2e-4, 3  # log-likelihood; steps in a row that gain less: at a cusp, the score promises too much
 _POOR = 0.1  # of the expected gain, from which a step was too long
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
-_PROMISE = 5.0  # times the gain expected of the last step, beyond which no further steps are hoped to lead
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
 _SHARES = (1.0, 0.5, 0.2)
@@ -89,7 +89,7 @@ def maximise(
         best = ascent.farther(best, trial, step, gained / expected)
         notify(best)
         small = small + 1 if gained < _NOTHING else 0
-        if small == _CREEPING or max(gained, expected) < tolerance or best.log_posterior + _PROMISE * expected < worth:
+        if small == _CREEPING or max(gained, expected) < tolerance or best.log_posterior + PROMISE * expected < worth:
             return best
     return best
 
