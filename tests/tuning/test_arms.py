@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -147,6 +148,19 @@ def test_a_fit_is_a_maximum_and_its_information_the_curvature() -> None:
             lower.append(found.log_posterior - measured.fitted(beside, [], rest, FREE).log_posterior)
         expected = 0.5 * found.information[place, place] * sd[place] ** 2
         assert np.mean(lower) == pytest.approx(expected, rel=0.05), name
+
+
+def test_a_fit_that_cannot_get_as_high_as_is_worth_it_ends_at_once() -> None:
+    """Far below what is worth it an arm stays where it begins; a worth within reach changes no maximum."""
+    one, rest, true = recording(5, 400), NoiseModel(np.array([1e-3])), Arm(0.05, 0.1, gain=0.95)
+    moved = response(true.model, T, true.delay, one.told, one.command, one.start, one.time)
+    value = moved + np.random.default_rng(7).normal(0.0, 1e-3, 400)
+    measured, begin = Measured([one._replace(value=value)], T, ["a"]), Arm(0.06, 0.09)
+    names = ["delay", "lag", "gain"]
+    highest = measured.fitted(begin, names, rest, FREE)
+    assert measured.fitted(begin, names, rest, FREE, math.inf).arm == pytest.approx(begin)
+    within = measured.fitted(begin, names, rest, FREE, highest.log_posterior)
+    assert within.arm == highest.arm
 
 
 @pytest.mark.parametrize(
