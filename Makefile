@@ -40,10 +40,12 @@ $(READY): .venv/.locked pyproject.toml $(CORE)
 demo: $(READY)
 	$(BIN)/pumafuse demo --output demo --force
 
+# Tests of one file go to one worker, which sets up once what they share.
 test: $(READY)
-	$(BIN)/python -m pytest -m "not long" -n 2
+	$(BIN)/python -m pytest -m "not long" -n 2 --dist loadfile
 
-# Tests of one group go to one worker: they listen on a port that a page names. Some wait more than they compute, so there is a worker more than cores.
+# Tests of one group go to one worker: they share what takes long to set up, or listen on a port that a page names.
+# Some wait more than they compute, so there is a worker more than cores.
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long -n 3 --dist loadgroup
 

@@ -15,6 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+pytestmark = pytest.mark.xdist_group("packaging")  # built once
 ROOT = Path(__file__).parent.parent
 BUILDS_NOTHING = """
 import os, backend

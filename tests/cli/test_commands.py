@@ -15,6 +15,7 @@ import pumafuse as pf
 from executable import DATA, EXECUTABLE, FUSION, SCAN, names, pumafuse, refused
 from pumafuse.cli.fuse import folders_of
 
+pytestmark = pytest.mark.xdist_group("demo")  # one result serves many
 AXES = ("tangential", "radial", "vertical")
 FUSE_SCAN = ("fuse", SCAN, "-c", FUSION, "--rate", 200)
 
@@ -225,6 +226,7 @@ def test_an_interrupt_of_a_command_is_a_line() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 def test_a_pipe_is_a_configuration_if_somebody_writes_into_it(tmp_path: Path) -> None:
     """A line where nobody does, not a wait for ever; what a shell's `<(...)` runs may take its time."""
