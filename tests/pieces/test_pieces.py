@@ -135,9 +135,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reading, "WAIT_NS", 2000 * MS)
 
 
-@pytest.fixture(scope="module", params=["one table", "a table for each source"])
-def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return written(tmp_path_factory.mktemp("logs") / "log", single=request.param == "one table")
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Path]:
+    """The run as one table, and not."""
+    return {single: written(tmp_path_factory.mktemp("logs") / "log", single=single) for single in (True, False)}
 
 
 TABLES = results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE
@@ -164,15 +165,19 @@ def close(found: Any, expected: Any, relative: float) -> bool:
 
 
 @pytest.mark.parametrize(
-    "how", [{}, {"rate": 100.0}, {"sensors": ["camera"]}, {"part": (5.0, 50.0), "rate": 90.0}, {"part": (30.0, None)}]
+    ("single", "how"),
+    [
+        *((True, {}), (True, {"part": (5.0, 50.0), "rate": 90.0}), (True, {"part": (30.0, None)})),
+        *((False, {"rate": 100.0}), (False, {"sensors": ["camera"]}), (False, {"part": (5.0, 50.0), "rate": 90.0})),
+    ],
 )
-def test_pieces_are_the_whole(log: Path, tmp_path: Path, how: dict[str, Any]) -> None:
+def test_pieces_are_the_whole(logs: dict[bool, Path], tmp_path: Path, single: bool, how: dict[str, Any]) -> None:
     """Estimates, outcomes and the reference to the last bit; counts equal; scores and NIS to rounding.
 
     There are many pieces, in some of which no command is.
     """
     shares = list[float]()
-    expected, found = both_ways(log, tmp_path, progress=shares.append, **how)
+    expected, found = both_ways(logs[single], tmp_path, progress=shares.append, **how)
     assert len(shares) > 5 and shares == sorted(shares) and shares[-1] == 1.0
     assert any(f"fused in {len(shares)} pieces" in note for note in found.notes)
     overruns = [[note for note in summary.notes if "ask for more" in note] for summary in (found, expected)]
@@ -182,7 +187,6 @@ def test_pieces_are_the_whole(log: Path, tmp_path: Path, how: dict[str, Any]) ->
         assert (found.commands, found.rows) == (expected.commands, expected.rows)
     for axis, one in expected.axes.items():
         mine = found.axes[axis]
-        assert mine.score is not None and one.score is not None
         assert (mine.score.rows, mine.score.left_out) == (one.score.rows, one.score.left_out)
         for name in ("rmse", "bias", "coverage", "nees_mean"):
             assert close(getattr(mine.score, name), getattr(one.score, name), 1e-9), name
@@ -196,7 +200,6 @@ def test_pieces_are_the_whole(log: Path, tmp_path: Path, how: dict[str, Any]) ->
             assert close(other.innovation_rms, its.innovation_rms, 0.02)
             assert np.allclose(other.correlation[:3], its.correlation[:3], atol=0.15)
             assert other.verdict.split(":")[0] == its.verdict.split(":")[0]
-            assert other.skill is not None and its.skill is not None
             assert close(other.skill.filter.rms, its.skill.filter.rms, 0.05)
             assert close(other.skill.command_alone.rms, its.skill.command_alone.rms, 0.5)
 
@@ -231,8 +234,7 @@ def test_a_fault_is_the_verdict_of_pieces_and_whole(tmp_path: Path) -> None:
         assert of_camera["x"].finding != "faulty"
 
 
-@pytest.mark.parametrize("single", [True, False])
-def test_what_stands_for_none_in_a_piece_may_be_a_position_in_the_file(tmp_path: Path, single: bool) -> None:
+def test_what_stands_for_none_in_a_piece_may_be_a_position_in_the_file(tmp_path: Path) -> None:
     """999 m is ten times as far as all else of its piece; but much later once there are 150 m."""
 
     def is_far(given: dict[str, tuple[Rows, np.ndarray]]) -> None:
@@ -240,7 +242,7 @@ def test_what_stands_for_none_in_a_piece_may_be_a_position_in_the_file(tmp_path:
         camera["y"] = np.where((camera["t"] > 18.0) & (camera["t"] < 24.0), 999.0, camera["y"])
         camera["y"][1600] = 150.0
 
-    path = written(tmp_path / "log", single=single, damage=is_far)
+    path = written(tmp_path / "log", single=False, damage=is_far)
     expected, found = both_ways(path, tmp_path)
     assert found.rows["camera"] == expected.rows["camera"]
     assert not [note for note in found.notes if "ten times as far" in note]
@@ -288,7 +290,9 @@ def test_stray_and_missing_stamps(tmp_path: Path) -> None:
     assert found.rows["tracker"]["no_stamp"] == 10 and found.rows["tracker"]["stray"] == 1
 
 
-def test_what_cannot_be_written_leaves_nothing(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_written_leaves_nothing(
+    logs: dict[bool, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A full disk, Ctrl-C in the middle, a run of which nothing is fused, and a part without any estimate."""
     digest = fusing.digest
     for error in (OSError(28, "No space left on device"), KeyboardInterrupt()):
@@ -302,12 +306,12 @@ def test_what_cannot_be_written_leaves_nothing(log: Path, tmp_path: Path, monkey
         with monkeypatch.context() as context:
             context.setattr(fusing, "digest", interrupted)
             with pytest.raises((FolderError, KeyboardInterrupt)):
-                fusing.fuse_to(log, tmp_path / "out", CONFIG)
+                fusing.fuse_to(logs[True], tmp_path / "out", CONFIG)
         assert not list(tmp_path.iterdir())
     with pytest.raises(RunError, match="nothing was fused"):
-        fusing.fuse_to(log, tmp_path / "out", msgspec.structs.replace(CONFIG, sensors={}))
+        fusing.fuse_to(logs[True], tmp_path / "out", msgspec.structs.replace(CONFIG, sensors={}))
     with pytest.raises(RunError, match=r"there is no tick of 0\.01 Hz in the part of the run"):
-        fusing.fuse_to(log, tmp_path / "out", CONFIG, part=(5.0, 50.0), rate=0.01)
+        fusing.fuse_to(logs[True], tmp_path / "out", CONFIG, part=(5.0, 50.0), rate=0.01)
     assert not list(tmp_path.iterdir())
 
 
