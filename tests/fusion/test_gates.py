@@ -198,7 +198,7 @@ def logs(draw: st.DrawFn) -> tuple[list[Row], dict[str, Sensor]]:
     return found, sensors
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(logs())
 def test_any_log_is_decided_as_by_the_reference(log: tuple[list[Row], dict[str, Sensor]]) -> None:
     """Outcomes, innovations, contradictions, estimates; and as live, the reference's of what had arrived."""

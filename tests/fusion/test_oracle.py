@@ -401,7 +401,7 @@ def tame(case: Case) -> Case:
     return replace(case, seen=seen, process=process, offset_sd=min(case.offset_sd, 5e-3))
 
 
-@settings(max_examples=80)
+@settings(max_examples=50)
 @given(cases(), st.sampled_from(list(MODES)))
 def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
     """Random plants, delays, gains, gaps, noise and sensors: nothing deviates from the joint Gaussian."""
