@@ -88,15 +88,15 @@ def estimates_of(found: pf.Identification) -> dict[str, tuple[float, tuple[float
 
 @pytest.mark.long
 @pytest.mark.parametrize("order", [1, 2])
-def test_intervals_hold_over_150_campaigns(order: int) -> None:
-    """Each true value is in its 95 % interval in 89.5 % of 150 campaigns of 12 trials, together in 93 to 97 %.
+def test_intervals_hold_over_100_campaigns(order: int) -> None:
+    """Each true value is in its 95 % interval in 88.5 % of 100 campaigns of 12 trials, together in 92.5 to 97.5 %.
 
-    One standard deviation of a share of 95 % in 150 is 1.8 %. The bias of each is below 1 %. The right order is chosen
+    One standard deviation of a share of 95 % in 100 is 2.2 %. The bias of each is below 1 %. The right order is chosen
     in at least 90 %; with a first-order arm 1/ω² may be 0 in as many, and the curve is within 0.1 % of K in as many.
     """
     inside, values, right, open_ends = defaultdict[str, list[bool]](list), defaultdict[str, list[float]](list), 0, 0
     off: list[float] = []
-    for seed in range(150):
+    for seed in range(100):
         found = identified(Arm(order, noise=0.03e-3).campaign(seed))
         choice = found.axes["radial"].choice
         open_ends += choice.inverse_square.ci95[0] <= 0.0
@@ -108,14 +108,14 @@ def test_intervals_hold_over_150_campaigns(order: int) -> None:
             values[name].append(value)
         plant = found.axes["radial"].model.plant
         off.append(float(np.abs(plant.step_response(TIMES) - Arm(order, 0.0).response(TIMES)).max()))
-    assert right >= 135
+    assert right >= 90
     shares = {name: float(np.mean(hits)) for name, hits in inside.items()}
-    assert all(share >= 0.895 for share in shares.values()), shares
-    assert 0.93 <= np.mean(list(shares.values())) <= 0.97, shares
+    assert all(share >= 0.885 for share in shares.values()), shares
+    assert 0.925 <= np.mean(list(shares.values())) <= 0.975, shares
     for name, truth in truths_of(order).items():
         assert abs(np.mean(values[name]) / truth - 1.0) < 0.01, name
     if order == 1:
-        assert open_ends >= 135
+        assert open_ends >= 90
         assert np.mean(np.array(off) < 1e-3) >= 0.9
     else:
         assert open_ends == 0

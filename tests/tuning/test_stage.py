@@ -64,7 +64,7 @@ def test_intervals_of_latencies_over_80_runs() -> None:
     """
     inside, off = [], []
     for seed in range(80):
-        found, interval = wrong_latency(seed, 0.009)
+        found, interval = wrong_latency(seed, 0.009, 0.3, 0.02)
         inside.append(interval.ci95[0] < 0.045 < interval.ci95[1])
         off.append(found.best.config.sensors["vision"].latency - 0.045)
     assert np.mean(inside) >= 0.90
