@@ -125,7 +125,6 @@ def test_of_what_moves_before_its_commands_no_lag_is_told(early: float, tmp_path
     assert "writes one" not in refused("fuse", folder, "-o", tmp_path / "fused")  # it is there
     head, _, tail = (folder / "run.toml").read_text(encoding="utf-8").partition("[sensors.")
     shift = re.search(r"shift_s = ([\d.]+)", line)
-    assert shift is not None
     tail = tail.replace('time = "t_s"', f'time = {{ column = "t_s", {shift[0]} }}')
     (folder / "run.toml").write_text(f"{head}[sensors.{tail}", encoding="utf-8")
     told = json.loads(pumafuse("latency", folder, "--json").stdout)["axes"]["j"]
@@ -138,7 +137,7 @@ def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(descr
 
     Neither has it the lag of the delay that the others share.
     """
-    time, rng = np.arange(0.0, 15.0, 0.02), np.random.default_rng(6)
+    time, rng = np.arange(0.0, 10.0, 0.02), np.random.default_rng(6)
     columns = {"t_s": time}
     for axis, late, slower in (("a", 0.09, 1.0), ("b", -0.12, 0.83), ("c", 0.09, 1.21)):
         columns |= {f"goal_{axis}_deg": swings(slower * time)}
@@ -165,7 +164,7 @@ def test_an_axis_that_moves_before_its_commands_does_not_refuse_the_others(descr
 @pytest.mark.parametrize("others", [True, False])
 def test_an_axis_that_follows_nothing_does_not_refuse_the_others(others: bool, tmp_path: Path) -> None:
     """Described, it is left out, and why is said; alone, it is refused with the same sentence."""
-    time, rng = np.arange(0.0, 15.0, 0.02), np.random.default_rng(9)
+    time, rng = np.arange(0.0, 10.0, 0.02), np.random.default_rng(9)
     columns, lines = {"t_s": time}, dict[str, str]()
     for axis, slower in (("tilt", 0.9), ("lift", 1.1))[: 1 + others]:
         late = swings(slower * (time - 0.07))
@@ -211,7 +210,7 @@ def test_an_exception_that_nobody_foresaw_is_a_line_for_a_report(
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
-@pytest.mark.parametrize(("name", "command"), [("log.csv", "fuse"), ("log.mcap", "latency"), ("log.parquet", "fuse")])
+@pytest.mark.parametrize(("name", "command"), [("log.csv", "fuse"), ("log.mcap", "latency")])
 def test_a_pipe_that_nobody_writes_into_is_refused_at_once(name: str, command: str, tmp_path: Path) -> None:
     """Reading it would wait for ever."""
     os.mkfifo(pipe := tmp_path / name)

@@ -116,6 +116,7 @@ def test_poses_are_those_of_the_bag_fused_as_live(tmp_path: Path, start: Callabl
     assert first["pumafuse: estimates"][:2] == [3, "no command yet"]  # STALE
 
 
+@pytest.mark.long
 def test_publishers_come_late_leave_and_return(tmp_path: Path, start: Callable[..., Live]) -> None:
     """Each is said, as two of commands and a wrong type are; --ros-args move topics and the node, and give a frame."""
     cell(tmp_path, STAMPED.replace('topic = "/command"', 'topic = "/orders"').replace("/joints", "/level"))
@@ -222,6 +223,7 @@ def states(begin: int, count: int) -> list[bag_files.Sent]:
     return [("/joint_states", kind, begin + t, {"header": bag_files.header(0), **one}) for t, one in every]
 
 
+@pytest.mark.long
 def test_joints_by_a_trajectory(tmp_path: Path, start: Callable[..., Live]) -> None:
     """A path is commanded as time goes by from when it comes; the joint is published at each command."""
     lever(tmp_path, time="path.time_ns", column="path.position[elbow]", stamps="log_time")
@@ -244,6 +246,7 @@ def test_joints_by_a_trajectory(tmp_path: Path, start: Callable[..., Live]) -> N
     assert all(abs(one["position"][0] - 0.2) < 0.2 for one in joints[20:])
 
 
+@pytest.mark.long
 def test_the_time_of_a_simulation(tmp_path: Path, start: Callable[..., Live]) -> None:
     """What has no stamp is stamped by /clock, which runs at half the pace of the day."""
     lever(tmp_path, time="log_time", column="data[0]", stamps="log_time")

@@ -145,7 +145,6 @@ def test_a_drift_of_the_lag_is_named() -> None:
     """20 ms over the run of steps: later, and by several ms; plant and noise explain some of it (docs/symptoms.md)."""
     axis = pf.latency(recorded("steps", drift=0.02)).details.axes["x"]
     assert axis.drifts
-    assert axis.drift is not None
     assert 0.005 < axis.drift < 0.03
 
 
@@ -205,7 +204,7 @@ def test_an_arm_that_is_sooner_than_one_can_be_is_reported(ahead: float, said: s
     assert 0.0 <= one.delay_ci95[0] <= one.delay <= one.delay_ci95[1]
 
 
-@pytest.mark.parametrize("step", [1e-4, 5e-4])
+@pytest.mark.parametrize("step", [pytest.param(1e-4, marks=pytest.mark.long), 5e-4])
 def test_an_encoder_that_rests_most_of_the_time_is_not_taken_for_exact(step: float) -> None:
     """At rest all its values are one: its noise is that of its steps, and the arm is found in the motions between."""
     time, stamp = np.arange(0.0, LENGTH, PERIOD), np.arange(0.3, LENGTH - 0.3, 0.02) + 0.003

@@ -22,7 +22,7 @@ from pumafuse.tuning.plain import Doubt, PlainArm, doubts, lag_steps, off, plain
 from pumafuse.tuning.stage import Plan
 from pumafuse.tuning.summary import fitted_lags
 from pumafuse.tuning.tune import Pipeline
-from tuning_runs import free_of, quietly, replaced, scenario
+from tuning_runs import free_of, later, quietly, replaced, scenario
 
 DEAD_BAND = Path(__file__).parent / "data" / "dead-band.csv"
 T = 0.02
@@ -47,12 +47,11 @@ def found_in(*recordings: Recording) -> PlainArm | None:
     return plain_arm(Measured(recordings, T, ["camera"]))
 
 
-@settings(max_examples=15, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=8, phases=[Phase.explicit, Phase.generate])
 @given(st.floats(0.0, 0.5), st.floats(0.002, 0.5), st.floats(0.7, 1.3), st.integers(0, 1000))
 def test_any_arm_is_found(delay: float, time_constant: float, gain: float, seed: int) -> None:
     """Lag to 3 ms and a hundredth, gain to a hundredth, and no more than its noise is left: from no guess at all."""
     found = found_in(motion(delay, time_constant, gain, seed))
-    assert found is not None
     lag = delay + time_constant
     assert found.arm.total == pytest.approx(lag, abs=3e-3, rel=0.01)
     assert found.lag_ci95[0] - 3e-3 - 0.01 * lag <= lag <= found.lag_ci95[1] + 3e-3 + 0.01 * lag
@@ -70,8 +69,6 @@ def test_outliers_and_the_length_of_a_recording_do_not_matter() -> None:
     given = np.append(np.arange(rest) * step, rest * step + one.told)
     long = one._replace(told=given, command=np.append(np.full(rest, 0.5), one.command), time=rest * step + one.time)
     late = found_in(long)
-    assert wild is not None
-    assert late is not None
     assert wild.arm.total == pytest.approx(0.14, abs=2e-3)
     assert late.arm.total == pytest.approx(0.14, abs=2e-3)
 
@@ -86,7 +83,6 @@ def test_nothing_is_said_of_an_axis_at_rest_or_hardly_measured() -> None:
 def test_an_arm_that_goes_less_far_is_doubted_beside_the_commands_times_its_gain() -> None:
     """Of one that goes 0.7 times as far: 120 ms for 80 are far worse than those, and no worse than all of them."""
     plain = found_in(motion(0.05, 0.03, 0.7))
-    assert plain is not None
     assert plain.delayed.gain == pytest.approx(0.7, abs=0.02)
     assert plain.delayed.total == pytest.approx(0.08, abs=0.01)
     wrong = Doubt(plain, off(plain.measured, Arm(0.09, 0.03, gain=0.7)), 0.12)
@@ -169,7 +165,6 @@ def steps(rest: float, lag: float) -> Recording:
 def test_an_axis_that_mostly_rests_is_judged_where_it_moves() -> None:
     """Of steps every 20 s the rows in motion are no outliers, and an arm that is hardly late is far off there."""
     found = found_in(steps(20.0, 0.3))
-    assert found is not None
     assert found.arm.total == pytest.approx(0.3, abs=1e-3)
     assert found.measured.count == sum(len(one.time) for one in found.measured.recordings)
     sooner = off(found.measured, Arm(0.02, 0.02))
@@ -185,7 +180,6 @@ def test_a_lag_that_least_squares_exclude_is_said_and_its_interval_covers_both()
     config = replaced(config, arm=replaced(config.arm, axes={**config.arm.axes, axis: steady}))
     lag = config.arm.lag_of(axis)
     plain = found_in(motion(0.5 * lag, 0.5 * lag, 1.0))
-    assert plain is not None
     for share, said in ((1.05, False), (1.5, True)):
         low, high = share * lag, share * lag + 0.01
         one = plain._replace(arm=Arm(low, 0.005), lag_ci95=(low, high), delayed=Arm(high, 0.0), delayed_off=np.inf)
@@ -248,7 +242,7 @@ def test_an_arm_that_takes_the_place_of_another_is_kept_and_others_are_not_searc
     assert replaced_arm.lag_of("vertical") == pytest.approx(first.result().arm.lag_of("vertical"), abs=2e-3)
 
 
-@pytest.mark.parametrize("commands", [1500, 30_000])
+@pytest.mark.parametrize("commands", [1500, later(30_000)])
 def test_a_lag_that_steps_is_said_of_one_sensor_alone(commands: int) -> None:
     """60 ms more from 0.7 of the run on, of which a plant of second order and a gain might make up: both, and when.
 
@@ -258,7 +252,6 @@ def test_a_lag_that_steps_is_said_of_one_sensor_alone(commands: int) -> None:
     one = one._replace(told=one.told + EPOCH, time=one.time + EPOCH)
     edge = one.time[int(0.7 * len(one.time))]
     found = found_in(one._replace(value=np.where(one.time < edge, one.value, later.value)))
-    assert found is not None and found.step is not None
     assert found.step.time == pytest.approx((edge - one.told[0]) / 1e9, abs=0.05 * (one.time[-1] - one.time[0]) / 1e9)
     assert (found.step.before, found.step.after) == pytest.approx((0.14, 0.20), abs=0.01)
     assert f"{1e3 * found.step.before:.0f} ms until about {found.step.time:.0f} s" in str(found.step)
@@ -296,7 +289,6 @@ def test_nothing_is_said_of_what_is_off_by_next_to_nothing() -> None:
     """Twice as far off as the delayed command: of a thousandth of the range it is said, of half as much it is not."""
     config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config
     plain = found_in(motion(0.05, 0.05, 1.0))
-    assert plain is not None
     for share, said in ((5e-4, False), (2e-3, True)):
         off_by = share * plain.measured.range
         doubt = Doubt(plain._replace(delayed_off=0.5 * off_by), off_by, plain.arm.total)

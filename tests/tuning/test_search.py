@@ -45,7 +45,7 @@ def test_where_it_starts_does_not_matter() -> None:
     assert max(totals) - min(totals) < 0.1
 
 
-@pytest.mark.parametrize("gain", [0.35, 1.8])
+@pytest.mark.parametrize("gain", [later(0.35), 1.8])
 def test_a_gain_far_from_1_is_fitted_with_everything_else(gain: float) -> None:
     """As of a servo under a load: no step of noise or arm is lost at a bound of the gain."""
     t, s = np.arange(0.0, 20.0, 0.028), np.arange(0.0, 19.9, 0.01)
@@ -143,7 +143,7 @@ def best_of_all(
 
 @pytest.mark.long
 @pytest.mark.parametrize("gate_rows", [True, False], ids=["rows", "components"])
-@pytest.mark.parametrize(("seed", "generations"), [(4, 25), later(5, 200), later(6, 200), later(7, 200)])
+@pytest.mark.parametrize(("seed", "generations"), [(4, 25), (5, 200), (6, 200)])
 def test_nothing_higher_is_found_by_differential_evolution(seed: int, generations: int, gate_rows: bool) -> None:
     """Noise of two axes with 6 % of outliers, from a poor start: within 0.1 of a global search's best."""
     sim = with_outliers(seed, 0.06)
@@ -155,7 +155,7 @@ def test_nothing_higher_is_found_by_differential_evolution(seed: int, generation
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_no_arm_is_likelier_to_differential_evolution(seed: int) -> None:
     """Noise, delay and plant of one axis, by a tracker and a camera; the plant of the order that was chosen."""
     sim = outage(seed)

@@ -242,6 +242,7 @@ def test_the_prior_of_a_noise_can_be_turned_off() -> None:
     assert sds[0] is not None and sds[1] is not None and 0.9 * 3e-4 < sds[0] < sds[1] == pytest.approx(3e-4, rel=0.1)
 
 
+@pytest.mark.long
 def test_the_configured_noise_changes_nothing() -> None:
     """All noise a tenth of what it is and ten times as much: the same numbers, to a thousandth of themselves."""
     config, command, path = moving()
