@@ -205,7 +205,7 @@ def lasting(z: np.ndarray, s: np.ndarray) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("fault", [None, smoothed, lasting])
+@pytest.mark.parametrize("fault", [None, pytest.param(smoothed, marks=pytest.mark.long), lasting])
 def test_one_command_says_what_one_sensor_alone_does_not_show(
     tmp_path: Path, fault: Callable[[np.ndarray, np.ndarray], np.ndarray] | None
 ) -> None:

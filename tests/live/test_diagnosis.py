@@ -363,11 +363,11 @@ def test_error_bars_that_are_too_wide_are_no_fault_of_a_stream() -> None:
 
 @pytest.mark.long
 def test_hours_of_a_good_stream_say_nothing() -> None:
-    """Eight hours of stamps: a tracker of 10 Hz, a camera of 4, a lag that the model has, noise as configured.
+    """Four hours of stamps: a tracker of 10 Hz, a camera of 4, a lag that the model has, noise as configured.
 
-    The arm has gone by 17 mm from where it began, as the process noise has it.
+    The arm goes by some 12 mm from where it began, as the process noise has it.
     """
-    period, hours, rng = 0.112, 8.0, np.random.default_rng(3)
+    period, hours, rng = 0.112, 4.0, np.random.default_rng(3)
     axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))
     arm = pf.ArmModel(name="an arm", update_period=period, delay=0.06, axes={"x": axis})
     config = pf.FusionConfig(
