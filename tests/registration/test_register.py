@@ -36,16 +36,14 @@ def test_a_set_up_is_found(orientation: bool) -> None:
     From a short time constant on the search of seed 51 would be stuck among the steps of held commands, and that of
     5037 from a long one, if a marker alone tells when the tool turns.
     """
-    for seed in (0, 1, 2, 51, 5037):
+    for seed in (0, 51) if orientation else (1, 5037):
         setup = Setup(seed, orientation=orientation, seconds=20.0)
         found = registered(*([one] for one in setup.run()))
         assert found.findings == ()
-        assert found.frame is not None and found.marker is not None and found.position is not None
         assert degrees(found.frame, setup.frame) < 0.05
         np.testing.assert_allclose(found.frame.at, setup.at, atol=3e-3)
         np.testing.assert_allclose(found.marker.at, setup.marker, atol=3e-4)
         assert found.position.lag.value == pytest.approx(setup.lags[0], abs=3e-4)
-        assert found.rotation is not None
         assert found.rotation.lag.value == pytest.approx(setup.lags[1], abs=5e-4)
         if orientation:
             assert degrees(found.marker, setup.turn) < 0.05
@@ -54,17 +52,15 @@ def test_a_set_up_is_found(orientation: bool) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("orientation", [True, False])
 def test_intervals_hold(orientation: bool) -> None:
-    """The 95 % intervals of each kind of number hold as often in 200 set-ups, half of them with orientations.
+    """The 95 % intervals of each kind of number hold as often in 160 set-ups, half of them with orientations.
 
-    The band is three standard deviations of the share by chance, of 100 to 300 numbers of one kind. The lag's error is
+    The band is three standard deviations of the share by chance, of 160 to 240 numbers of one kind. The lag's error is
     below 0.3 ms.
     """
     inside: dict[str, list[bool]] = {}
-    for seed in range(0 if orientation else 100, 100 if orientation else 200):
-        setup = Setup(seed, orientation=orientation)
+    for seed in range(0 if orientation else 80, 80 if orientation else 160):
+        setup = Setup(seed, orientation=orientation, seconds=20.0)
         found = registered(*([one] for one in setup.run()))
-        assert found.frame is not None and found.marker is not None
-        assert found.position is not None and found.rotation is not None
         assert abs(found.position.lag.value - setup.lags[0]) < 3e-4
         numbers = {
             "at": (setup.at, found.frame.at_ci95),
@@ -92,7 +88,7 @@ def test_intervals_hold_where_an_arm_errs_with_the_pose() -> None:
     """
     hold, agree = list[np.ndarray](), list[np.ndarray]()
     for seed in range(25):
-        setup = Setup(seed, wrong=1.0)
+        setup = Setup(seed, wrong=1.0, seconds=20.0)
         pair = [registered(*([one] for one in setup.run())) for _ in range(2)]
         numbers, halves = zip(*(placed(one) for one in pair), strict=True)
         for found, half in zip(numbers, halves, strict=True):
@@ -105,7 +101,6 @@ def test_intervals_hold_where_an_arm_errs_with_the_pose() -> None:
 
 def placed(found: Registration) -> tuple[np.ndarray, np.ndarray]:
     """Where the frame is, how it is turned, where the marker is, and half the intervals."""
-    assert found.frame is not None and found.marker is not None
     pairs = [(found.frame.at, found.frame.at_ci95), (found.frame.rotation, found.frame.rotation_ci95),
              (found.marker.at, found.marker.at_ci95)]  # fmt: skip
     numbers, intervals = (np.array([row for pair in pairs for row in pair[place]]) for place in range(2))
@@ -114,7 +109,7 @@ def placed(found: Registration) -> tuple[np.ndarray, np.ndarray]:
 
 def test_several_runs_are_registered_together() -> None:
     """Two runs in different parts of the clock are one set-up: each alone is as right, both together surer."""
-    setup = Setup(5, seconds=20.0)
+    setup = Setup(5, seconds=12.0)
     runs = [setup.run(), setup.run()]
     later = [one._replace(time=one.time + 1000.0) for one in runs[1]]
     both = registered([runs[0][0], later[0]], [runs[0][1], later[1]])
@@ -127,7 +122,7 @@ def test_several_runs_are_registered_together() -> None:
 
 def test_the_base_may_stand_anywhere() -> None:
     """A world that is turned and moved as a whole turns and moves the frame, and nothing else."""
-    setup = Setup(7, seconds=15.0)
+    setup = Setup(7, seconds=10.0)
     command, sensor = setup.run()
     turn, move = Rotation.from_rotvec([0.3, -1.1, 0.8]), np.array([1.0, -2.0, 0.5])
     assert command.quaternion is not None
@@ -135,7 +130,6 @@ def test_the_base_may_stand_anywhere() -> None:
         command.time, turn.apply(command.position) + move, (turn * Rotation.from_quat(command.quaternion)).as_quat()
     )
     here, there = registered([command], [sensor]), registered([elsewhere], [sensor])
-    assert here.frame is not None and there.frame is not None and here.marker is not None and there.marker is not None
     np.testing.assert_allclose(there.frame.at, turn.apply(here.frame.at) + move, atol=1e-9)
     assert degrees(there.frame, turn * Rotation.from_rotvec(here.frame.rotation)) < 1e-7
     np.testing.assert_allclose(there.marker.at, here.marker.at, atol=1e-9)
@@ -166,7 +160,6 @@ def test_still_poses_are_those_of_a_closed_form() -> None:
     closed = np.linalg.lstsq(table, (points[rest] - where[rest] @ frame.T).ravel(), rcond=None)[0]
     command = Motion(told, places, Rotation.from_rotvec(angles).as_quat())
     found = registered([command], [Motion(time, where, seen.as_quat())])
-    assert found.frame is not None and found.marker is not None
     assert degrees(found.frame, Rotation.from_matrix(frame)) < 1e-3
     np.testing.assert_allclose([*found.frame.at, *found.marker.at], closed, atol=2e-5)
 
@@ -199,10 +192,10 @@ NAMED = [Finding.LINE, Finding.PLANE, Finding.STILL, Finding.ONE_AXIS, Finding.M
 @pytest.mark.long
 @pytest.mark.parametrize("finding", NAMED)
 def test_what_a_motion_does_not_tell_is_named(finding: Finding) -> None:
-    """Each in all of 8 set-ups, with and without orientations."""
-    for seed in range(8):
-        of = MOTIONS.get(finding, lambda _: {"seconds": 20.0})(seed)
-        found = made(finding, seed, orientation=seed % 2 == 0, **of)
+    """Each in all of 4 set-ups, with and without orientations."""
+    for seed in range(4):
+        of = MOTIONS.get(finding, lambda _: {})(seed)
+        found = made(finding, seed, seconds=20.0, orientation=seed % 2 == 0, **of)
         assert finding in [one.finding for one in found.findings], seed
 
 
@@ -210,9 +203,9 @@ def test_what_a_motion_does_not_tell_is_named(finding: Finding) -> None:
 @pytest.mark.parametrize("kind", ["other", "stands"])
 def test_a_sensor_that_does_not_move_with_the_tool_is_named(kind: str) -> None:
     """Whether it sees something else or stands still; there is no frame then."""
-    for seed in range(8):
-        command, sensor = Setup(seed).run()
-        other = Setup(seed + 500).run()[1]
+    for seed in range(4):
+        command, sensor = Setup(seed, seconds=20.0).run()
+        other = Setup(seed + 500, seconds=20.0).run()[1]
         if kind == "stands":
             other = sensor._replace(position=np.random.default_rng(seed).normal(0.0, 3e-4, sensor.position.shape))
             other = other._replace(quaternion=None)
@@ -228,8 +221,8 @@ SCALES = {"in mm, read as m": 1e-3, "in inches, read as m": 0.0254, "in m, read 
 @pytest.mark.parametrize("unit", SCALES)
 def test_a_unit_is_named(unit: str | None) -> None:
     """With the units that it looks like; what is registered is right once they are mended."""
-    for seed in range(8):
-        setup = Setup(seed)
+    for seed in range(3):
+        setup = Setup(seed, seconds=20.0)
         command, sensor = setup.run()
         found = registered([command], [sensor._replace(position=sensor.position / SCALES[unit])])
         assert [(one.finding, one.unit) for one in found.findings] == [(Finding.SCALE, unit)]
@@ -280,8 +273,8 @@ READINGS = {
 @pytest.mark.parametrize("source", ["sensor", "command"])
 @pytest.mark.parametrize("reading", READINGS)
 def test_a_wrong_reading_of_orientations_is_named(source: str, reading: Reading) -> None:
-    """Whose it is, and how they are to be read, in all of 24 set-ups; what is registered is right."""
-    for seed in range(4):
+    """Whose it is, and how they are to be read, in all set-ups; what is registered is right."""
+    for seed in range(2):
         setup = Setup(seed, seconds=20.0)
         motions = dict(zip(("command", "sensor"), setup.run(), strict=True))
         wrong = motions[source]
@@ -297,8 +290,8 @@ def test_a_wrong_reading_of_orientations_is_named(source: str, reading: Reading)
 @pytest.mark.long
 def test_positions_that_are_turned_without_the_attitude_are_named() -> None:
     """Y up of positions alone is a quarter turn; the frame is that of positions."""
-    for seed in range(8):
-        found = made(Finding.ATTITUDE, seed)
+    for seed in range(4):
+        found = made(Finding.ATTITUDE, seed, seconds=20.0)
         assert [one.finding for one in found.findings] == [Finding.ATTITUDE]
         assert np.degrees(found.findings[0].size or 0.0) == pytest.approx(90.0, abs=3.0)
 
@@ -311,8 +304,8 @@ def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: boo
 
     Of the last it is told when the tool moves, too, which is not when it turns.
     """
-    for seed in range(5):
-        setup = Setup(seed, directions=share * np.eye(3), orientation=orientation, shared=share < 0.1)
+    for seed in range(3):
+        setup = Setup(seed, seconds=20.0, directions=share * np.eye(3), orientation=orientation, shared=share < 0.1)
         found = registered(*([one] for one in setup.run()))
         assert found.frame is not None and found.marker is not None and found.position is not None, seed
         assert Finding.SCALE not in [one.finding for one in found.findings]
@@ -337,12 +330,11 @@ def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None
 
 def test_a_marker_that_is_known_stays() -> None:
     """Fixed it is as given; beside a tool that does not turn as well, and the frame's place is right then."""
-    setup = Setup(2, axes=STILL, seconds=20.0)
+    setup = Setup(2, axes=STILL, seconds=10.0)
     command, sensor = setup.run()
     place = Placement(at=tuple(setup.marker.tolist()))
     for fix in (True, False):
         found = registered([command], [sensor], marker=place, fix_marker=fix)
-        assert found.marker is not None and found.frame is not None
         assert found.marker.at == place.at
         np.testing.assert_allclose(found.frame.at, setup.at, atol=3e-3)
 
@@ -355,7 +347,6 @@ def test_along_the_one_axis_of_a_tool_the_frame_makes_up_for_the_marker() -> Non
     setup = Setup(3, seconds=20.0, axes=np.array([[0.0, 0.0, 1.0]]))
     found = registered(*([one] for one in setup.run()))
     assert [one.finding for one in found.findings] == [Finding.ONE_AXIS]
-    assert found.frame is not None and found.marker is not None
     assert np.isfinite([*found.frame.at_ci95, *found.marker.at_ci95]).all(axis=1).tolist() == [True, True] + 4 * [False]
     np.testing.assert_allclose(found.frame.at[:2], setup.at[:2], atol=1e-3)
     along = setup.start.inv().apply([0.0, 0.0, 1.0])
@@ -378,7 +369,6 @@ def test_a_tracker_in_a_frame_of_its_own() -> None:
     found = registered([motions[0]], [motions[1]])
     assert [one.finding for one in found.findings] == [Finding.ATTITUDE, Finding.ONE_AXIS]
     assert "turned by 12.0°" in found.findings[0].sentence("tracker")
-    assert found.frame is not None and found.marker is not None and found.position is not None
     turned = Rotation.from_rotvec(found.frame.rotation).inv().as_euler("ZXY", degrees=True)
     np.testing.assert_allclose(turned, [37.0, 12.0, 0.0], atol=0.02)
     np.testing.assert_allclose(found.marker.at, [0.0, -0.064, 0.0], atol=1e-4)
@@ -410,16 +400,13 @@ def rests_and_moves(period: float, late: float) -> tuple[Motion, Motion]:
 def test_rests_do_not_decide_the_lag() -> None:
     """Of a motion that mostly rests the lag holds to 2 ms; a sensor as early as samples of a path allow is named."""
     late = registered(*([one] for one in rests_and_moves(0.02, 0.06)))
-    assert late.position is not None
     assert late.position.lag.value == pytest.approx(0.05, abs=2e-3)  # commands that are held are half a period late
     assert late.findings == ()
     early = registered(*([one] for one in rests_and_moves(0.02, 0.0)))
-    assert early.position is not None
     assert early.position.lag.value == pytest.approx(-0.01, abs=2e-3)
     (found,) = early.findings
     assert found.finding is Finding.AHEAD and "interpolation_ms" in found.sentence("sensor")
     finely = registered(*([one] for one in rests_and_moves(0.002, 0.0)))
-    assert finely.position is not None
     assert finely.position.lag.value == pytest.approx(-0.001, abs=2e-3)
 
 
