@@ -99,7 +99,6 @@ def test_nothing_is_left_by_a_signal(number: signal.Signals, tmp_path: Path) -> 
 
     words = [sys.executable, "-c", code]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=tmp_path)
-    assert process.stdout is not None
     assert process.stdout.readline() == "writing\n"
     assert list(tmp_path.iterdir())
     process.send_signal(number)

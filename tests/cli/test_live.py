@@ -89,7 +89,6 @@ def test_signals_end_with_a_summary(number: int) -> None:
     """Ctrl-C and SIGTERM: whole lines only, a summary, exit code 0."""
     command = (*LIVE, f"replay:{SCAN}?speed=1", "-c", str(FUSION))
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         first = process.stdout.readline()
         process.send_signal(number)
         rest, log = process.communicate(timeout=30)

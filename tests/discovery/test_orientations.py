@@ -293,9 +293,7 @@ def test_poses_without_a_header_are_poses(tmp_path: Path) -> None:
         np.savetxt(tmp_path / f"{name}.csv", table, "%.7f", ",")
     found = survey(tmp_path)
     assert list(found.own_frames) == ["camera"]
-    assert found.roles is not None
     for stream in (found.roles.command, *found.roles.sensors):
-        assert stream.attitude is not None
         assert stream.attitude.columns.quaternion == ("column 5", "column 6", "column 7", "column 8")
         assert stream.attitude.columns.order == "xyzw"
         assert {axis: signals[0].column for axis, signals in stream.axes.items()} == {

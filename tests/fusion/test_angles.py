@@ -339,7 +339,6 @@ def test_columns_within_a_turn_go_on_beside_the_commands(turn: str, tmp_path: Pa
         (made.command, *made.sensors.values(), made.reference),
         strict=True,
     ):
-        assert one is not None and other is not None
         np.testing.assert_allclose(other.values["yaw"], one.values["yaw"], atol=1e-9)
     config = turning()
     first, second = (pf.fuse(run, config) for run in (whole, made))

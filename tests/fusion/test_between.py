@@ -79,7 +79,6 @@ def test_an_arm_in_motion_is_in_motion_where_a_part_begins() -> None:
 
 def true(run: pf.Run, est: Estimates) -> np.ndarray:
     reference = run.reference
-    assert reference is not None
     return np.interp(est.time, (reference.stamp - est.origin) / 1e9, reference.values["tangential"])
 
 

@@ -47,7 +47,6 @@ def saved(est: pf.Estimates, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def turned(est: pf.Estimates) -> Rotation:
     """Exp(θ) R₀ of the estimates."""
-    assert est.config.tool is not None
     theta = np.column_stack([est[axis].position for axis in TURNING])
     return Rotation.from_rotvec(theta) * Rotation.from_rotvec(est.config.tool.reference)
 
@@ -148,7 +147,6 @@ def test_the_angle_of_the_score_is_that_of_the_orientations(est: pf.Estimates, s
     wanted = np.sqrt(np.mean(apart(turned(est)[shared], truth[2][known]) ** 2))
     read = results.read(saved)
     for found in (pf.summarise(est).orientation, read.summary.orientation, read.orientation_score(est.reference)):
-        assert found is not None
         assert found.rows == known.sum()
         assert found.left_out == len(est.time) - found.rows
         assert found.rms == pytest.approx(wanted, rel=1e-9)
@@ -160,7 +158,6 @@ def test_results_about_other_reference_orientations_are_compared_as_one(
     config: pf.FusionConfig, est: pf.Estimates, saved: Path, tmp_path: Path
 ) -> None:
     """With R₀ turned by 5° the same tool is the same to a hundredth of a degree, and so is its score."""
-    assert est.config.tool is not None
     other = Rotation.from_rotvec([5.0, 0.0, 0.0], degrees=True) * Rotation.from_rotvec(est.config.tool.reference)
     tool = Tool(reference=tuple(other.as_rotvec().tolist()))
     pf.fuse(turning.recorded(), msgspec.structs.replace(config, tool=tool)).save(tmp_path / "second")

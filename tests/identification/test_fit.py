@@ -165,7 +165,6 @@ def test_the_search_for_arms_finds_the_same_arm(order: int, shape: tuple[float, 
     )
     measured = Measured([run], 0.028, ["camera"])
     plain = plain_arm(measured)
-    assert plain is not None
     names = ["delay", "lag", "gain"] if order == 1 else ["delay", "lag", "damping", "gain"]
     limits = Limits({"delay": (0.0, 0.6), "lag": (1e-3, 2.0), "damping": (0.2, 8.0), "gain": (-np.inf, np.inf)}, {})
     start, least = (

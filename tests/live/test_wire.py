@@ -104,7 +104,6 @@ def test_an_estimate_is_one_line() -> None:
     for axis, now in estimate.axes.items():
         expected = [1e3 * now.position, 1e3 * now.position_sd, 1e3 * now.velocity]
         assert [line[axis][name] for name in ("position_mm", "sd_mm", "velocity_mm_s")] == expected
-    assert estimate.cartesian is not None
     assert {name: line[f"{name}_mm"] / 1e3 for name in "xyz"} == pytest.approx(estimate.cartesian)
     assert 0.11 < estimate.cartesian["x"] < 0.14  # not where z or y is
     moving = json.loads(encode(live.estimate(1.0), config.arm.kind_of, with_ns=False))

@@ -41,7 +41,6 @@ def recorded(
 
 
 def rows(piece: Source | None) -> list[int]:
-    assert piece is not None
     assert len(piece.stamp) == len(piece.values["radial"])
     return piece.values["radial"].astype(int).tolist()
 

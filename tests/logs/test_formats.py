@@ -276,7 +276,6 @@ def test_rows_that_are_signals_are_columns(kind: str, tmp_path: Path) -> None:
     found = survey(file, 50.0 if kind == "no clock" else 0.0)
     assert (said in found.parts[0].notes) == (kind != "mat, not turned")
     run, _ = written(found, tmp_path / "out")
-    assert found.roles is not None
     for stream, values in zip(found.roles.streams, (told, seen), strict=True):
         read = np.column_stack([columns[0].plain for columns in stream.axes.values()])
         np.testing.assert_allclose(read, values, atol=1e-8)

@@ -184,7 +184,6 @@ def test_of_all_rows_of_ticks_the_cheapest_is_found(places: list[float]) -> None
     """No other strictly ascending row of ticks costs less: all of them are tried."""
     place = np.sort(np.array(places))
     ticks = assigned_ticks(place)
-    assert ticks is not None
     assert np.all(np.diff(ticks) > 0)
     rows = np.array(list(combinations(range(-5, 9), len(place))))
     least = cost(place - rows).sum(axis=1).min()

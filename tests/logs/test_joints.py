@@ -63,9 +63,7 @@ def test_a_joint_that_is_told_later_has_the_values_of_rows_before(tmp_path: Path
     """By whole intervals of the commands exactly; half-way between them by the mean; at rest before the first."""
     command = read(tmp_path, ROBOT + HEAD + JOINTS).command
     told, period = command.joints, 1.0 / 36.0
-    assert told is not None
     late = command.delayed({"j2": 2.0 * period, "j5": 0.5 * period}).joints
-    assert late is not None
     np.testing.assert_allclose(late.values[2:, 1], told.values[:-2, 1], atol=1e-7)
     np.testing.assert_allclose(late.values[1:, 4], 0.5 * (told.values[1:, 4] + told.values[:-1, 4]), atol=1e-7)
     np.testing.assert_array_equal(late.values[:, [0, 2, 3, 5]], told.values[:, [0, 2, 3, 5]])
@@ -100,7 +98,6 @@ def test_a_clock_that_is_set_back_begins_anew(tmp_path: Path) -> None:
     stamp = command.stamp - np.where(np.arange(len(command.stamp)) < half, 0, 100_000_000_000)
     whole = replace(command, stamp=stamp).delayed({"j2": 0.05}).joints
     parts = [command.rows(rows).delayed({"j2": 0.05}).joints for rows in (slice(None, half), slice(half, None))]
-    assert whole is not None
     np.testing.assert_allclose(whole.values, np.concatenate([part.values for part in parts if part]), atol=1e-12)
 
 
@@ -110,7 +107,6 @@ def test_rows_in_any_order_and_rows_without_a_value_are_told_later_all_the_same(
     rows = np.arange(len(command.stamp))
     exchanged, others, late = rows.copy(), np.delete(rows, 60), {"j2": 0.05, "j5": 0.01}
     exchanged[[40, 41]] = 41, 40
-    assert command.joints is not None
     values = command.joints.values.copy()
     values[60, 3] = np.nan
     whole, mixed, lacking, without = (
@@ -122,7 +118,6 @@ def test_rows_in_any_order_and_rows_without_a_value_are_told_later_all_the_same(
             command.rows(others),
         )
     )
-    assert whole is not None and mixed is not None and lacking is not None and without is not None
     np.testing.assert_array_equal(mixed.values, whole.values[exchanged])
     np.testing.assert_array_equal(lacking.values[others], without.values)
     assert np.isnan(lacking.values[60, 3])
@@ -132,12 +127,10 @@ def test_commands_between_commands_are_on_the_line_of_joints(tmp_path: Path) -> 
     """Half-way the joints are at their mean, and the tool is where these put it: on an arc, not on the chord."""
     command = read(tmp_path, ROBOT + HEAD + JOINTS).command
     finer = command.interpolated(0.5 / 36.0)
-    assert command.joints is not None and finer.joints is not None
     between = 0.5 * (command.joints.values[1:] + command.joints.values[:-1])
     np.testing.assert_allclose(finer.joints.values[1::2], between, atol=1e-12)
     position, orientation = command.joints.chain.pose(between)
     np.testing.assert_allclose(np.column_stack([finer.values[axis] for axis in "xyz"])[1::2], position, atol=1e-9)
-    assert finer.orientation is not None
     np.testing.assert_allclose(finer.orientation[1::2], orientation, atol=1e-9)
     chord = 0.5 * (command.values["x"][1:] + command.values["x"][:-1])
     assert np.abs(chord - position[:, 0]).max() > 1e-6

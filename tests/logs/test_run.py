@@ -87,7 +87,6 @@ def test_a_manifest_says_where_everything_stands(folder: Path) -> None:
     stamp = [0, 28_000_000, 56_000_000]
     check_source(run.command, stamp, radial=[0.5605, 0.5605, np.nan], vertical=[0.1, 0.2, 0.2])
     check_source(run.sensors["tracker"], [5_000_000, 15_000_000], radial=[0.5695, np.nan], vertical=[np.nan, -0.093])
-    assert run.reference is not None
     check_source(run.reference, [0, 100_000_000], radial=[0.56025, 0.56125])
     assert run.reference.sd == 2e-5
     assert (run.start, run.clock, run.notes) == ({"radial": 0.5605}, "stamps", ())

@@ -74,7 +74,6 @@ def test_a_scenario_of_both_kinds_is_what_it_says(tmp_path: Path) -> None:
     command = made.run.command.values["yaw"] / DEG
     assert command[0] == pytest.approx(30.0) and np.ptp(command) == pytest.approx(40.0, rel=0.02)
     seen, true = made.run.sensors["eye"], made.run.reference
-    assert true is not None
     off = (seen.values["yaw"] - np.interp(seen.stamp, true.stamp, true.values["yaw"])) / DEG
     assert np.median(off) == pytest.approx(1.0, abs=0.1)
     far = np.abs(off - 1.0) > 5.0

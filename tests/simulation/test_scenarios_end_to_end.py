@@ -183,7 +183,6 @@ def test_an_arm_that_is_not_linear(name: str, tmp_path: Path) -> None:
     assert rmse[0] < score["rmse_deg"] < rmse[1]
     assert coverage[0] < score["coverage"] < coverage[1]
     score = pf.summarise(pf.fuse(run, msgspec.structs.replace(config, arm=arm))).axes[axis].score
-    assert score is not None
     assert linear_rmse[0] < score.rmse_deg < linear_rmse[1]
     assert linear_coverage[0] < score.coverage < linear_coverage[1]
 

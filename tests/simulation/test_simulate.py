@@ -210,7 +210,6 @@ def test_a_written_folder_is_the_run_and_makes_it_again(name: str, tmp_path: Pat
     assert list(run.sensors) == list(again.sensors)
     for sensor in run.sensors:
         same_source(run.sensors[sensor], again.sensors[sensor])
-    assert run.reference is not None and again.reference is not None
     same_source(run.reference, again.reference)
     assert again.reference.sd == run.reference.sd
     assert (again.name, again.start, again.clock, again.frame) == (run.name, run.start, run.clock, run.frame)

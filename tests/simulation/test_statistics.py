@@ -103,7 +103,6 @@ def fused(scenario: pf.Scenario, runs: int = RUNS, engine: Engine = "compiled", 
             warnings.simplefilter("ignore", pf.PumafuseWarning)
             est = pf.fuse(simulated.run, simulated.config, engine=engine, mode=mode)
         reference = est.reference
-        assert reference is not None
         there = np.searchsorted(reference.time, est.time - 1e-9)
         assert np.abs(reference.time[there] - est.time).max() < 1e-9
         errors.append([(est[a].position - reference.position[a][there]) / est[a].position_sd for a in AXES])

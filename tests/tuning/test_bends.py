@@ -126,7 +126,6 @@ def test_a_fastest_speed_is_found(seed: int) -> None:
 def test_both_are_found() -> None:
     """Where an axis has both."""
     bent = found(1, arm_of(1, play=0.15 * RANGE, max_speed=0.6 * RANGE * 2.0 * math.pi))
-    assert bent is not None
     assert bent.arm.play == pytest.approx(0.15 * RANGE, rel=0.15)
     assert bent.arm.max_speed == pytest.approx(0.6 * RANGE * 2.0 * math.pi, rel=0.03)
 
@@ -169,7 +168,6 @@ def test_what_holds_for_many_rows_is_looked_at() -> None:
     assert plain is not None and plain.measured.count < plain.whole.count == recorded.count
     plain = plain._replace(measured=recorded.of([one._replace(weight=np.where(held | off, 0.0, 1.0))]))
     bent = bent_arm(plain, Arm(0.0, 0.1), FREE)
-    assert bent is not None
     assert bent.arm.knee == pytest.approx(0.6 * RANGE, abs=0.02 * 2.0 * RANGE)
     assert bent.arm.beyond == pytest.approx(-0.95, abs=0.05)
 
@@ -209,7 +207,6 @@ def test_a_bend_that_shows_late_in_a_run_is_found() -> None:
     """A run in which only the last fifth is beyond the limit: every second part of it is held out, not its end."""
     fastest = 0.85 * RANGE * 2.0 * math.pi
     bent = found(3, arm_of(3, max_speed=fastest))
-    assert bent is not None
     assert bent.arm.max_speed == pytest.approx(fastest, rel=0.03)
 
 
@@ -231,7 +228,6 @@ def test_latency_says_play_with_its_interval() -> None:
     run = pf.simulate(pf.Scenario.load(SCENARIOS / "tool-with-play.toml")).run
     told = quietly(lambda: pf.latency(run, sensor="camera"))
     axis = told.details.axes["wrist"]
-    assert axis.play is not None and axis.play_ci95 is not None
     assert axis.play == pytest.approx(3.4 * math.pi / 180.0, rel=0.1)
     assert axis.play_ci95[0] < axis.play < axis.play_ci95[1]
     assert axis.lag - 0.04 == pytest.approx(0.042, abs=0.006)  # the camera's latency counts as the arm's

@@ -62,7 +62,6 @@ def test_a_sag_is_found(knee: float | None) -> None:
     found = tuned("sagging-lever", ("noise", "delay", "plant", "gain"), sag=sag)
     (at, beyond) = (found.params[f"axes.lever.sag.{key}"] for key in ("knee_deg", "slope_beyond"))
     made = found.config.arm.axes["lever"].sag
-    assert made is not None and made.knee_ci95 is not None and made.slope_beyond_ci95 is not None
     assert math.degrees(made.knee_ci95[0]) < 0.98 * 40.0 < at < math.degrees(made.knee_ci95[1]) < 45.0
     assert made.slope_beyond_ci95[0] < 0.88 / 0.98 - 1.0 < made.slope_beyond_ci95[1] < 0.8 * beyond
     assert ("sag: above about" in found.details.orders["lever"]) == (knee is None)

@@ -162,7 +162,6 @@ def sds_alone(runs: Sequence[pf.Run], config: pf.FusionConfig, **more: object) -
 def test_the_reference_plays_no_part() -> None:
     """Without it, or with nonsense in its place, the configuration is the same to the last bit."""
     run, config = outage(1).run, spoiled(outage(1).config)
-    assert run.reference is not None
     nonsense = replace(run.reference, values={axis: 1.0 + value[::-1] for axis, value in run.reference.values.items()})
     found = [sds_alone([replace(run, reference=one)], config) for one in (run.reference, None, nonsense)]
     assert found[0].config == found[1].config == found[2].config

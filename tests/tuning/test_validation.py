@@ -76,7 +76,6 @@ def test_numbers_are_those_of_a_fusion(since: float) -> None:
     found = checks(config, spoiled(config), since)
     est = pf.fuse(run().run, config)
     reference = est.reference
-    assert reference is not None
     late = replace(est, measurements=est.measurements.where(est.measurements.stamp >= since))
     for number, axis in enumerate(AXES):
         state, mine = found[axis].before, late.measurements.where(late.measurements.axis == number)
@@ -84,7 +83,6 @@ def test_numbers_are_those_of_a_fusion(since: float) -> None:
         assert state.rejected == np.sum(mine.outcome == pf.Outcome.REJECTED)
         assert (found[axis].components, found[axis].since_s) == (len(mine.value), since)
         tests = consistency(late, "vision", axis)
-        assert tests is not None
         sensor = state.sensors["vision"]
         assert (sensor.nis, sensor.whiteness_p, sensor.correlation) == (
             tests.nis,
@@ -124,7 +122,6 @@ def test_a_better_likelihood_with_larger_errors_is_worse() -> None:
     late = with_sensors(replaced(truth, arm=replaced(truth.arm, delay=truth.arm.delay + 0.1)), sd=5e-3)
     late = with_process(late, input_noise=0.0, drift=0.0, maneuver_drift=0.0)
     one = checks(with_sensors(truth, sd=0.05e-3, gate=0.0), late)["tangential"]
-    assert one.before.rmse_mm is not None and one.after.rmse_mm is not None
     assert one.after.log_likelihood > one.before.log_likelihood
     assert one.after.rmse_mm > 3.0 * one.before.rmse_mm
     assert one.worse and one.verdict.startswith("worse:")
@@ -148,7 +145,6 @@ def test_larger_errors_are_worse_only_beyond_chance() -> None:
     once[49:56] = 1.0
     for nearer, worse in ((along, True), (once, False)):
         one = against(before, after, nearer)
-        assert one.before.rmse_mm is not None and one.after.rmse_mm is not None
         assert 1.03 < one.after.rmse_mm / one.before.rmse_mm < 1.15
         assert one.worse == worse
 

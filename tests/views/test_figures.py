@@ -98,7 +98,6 @@ def test_a_path_is_drawn_where_there_are_x_y_and_z() -> None:
     for what in ({"frame": True, "axes": 2}, {}):
         assert path_figure(*case(**what)) is None
     drawn = path_figure(*case(frame=True))
-    assert drawn is not None
     command, estimate = (np.array(line.get_data_3d()) for line in drawn.axes[0].lines)
     assert np.abs(estimate[:, -1] - command[:, -1]).max() < 3.0  # mm
 
@@ -117,7 +116,6 @@ def test_the_fused_figure_shows_command_estimate_measurements_and_reference() ->
         for axes in every[4 * number : 4 * number + 2]:
             seen = run.sensors["camera"]
             good = np.arange(len(seen.stamp)) != len(seen.stamp) // 2  # the whole row of an outlier is rejected
-            assert est.reference is not None
             for label, wanted_time, wanted in (
                 ("command", 0.028 * np.arange(60), run.command.values[name]),
                 ("estimate", est.time, est[name].position),
@@ -161,7 +159,6 @@ def test_the_error_figure_draws_and_names_the_error() -> None:
     """Its line is estimate − reference, its title the root mean square and the coverage that `score` finds."""
     est, _ = case()
     figure = error_figure(est)
-    assert figure is not None
     for axes, name in zip(figure.axes, NAMES, strict=True):
         found = pf.score(est.time, est.segment, est[name].position, est[name].position_sd, est.reference, name)
         assert axes.get_title(loc="left") == (
@@ -179,7 +176,6 @@ def test_the_validation_figure_draws_what_it_judges() -> None:
     """Each row: the fused components' ν/√S, their autocorrelation as bars, and the verdict above."""
     est, run = case(axes=2, outlier=True)
     figure = validation_figure(est)
-    assert figure is not None
     for number, name in enumerate(NAMES[:2]):
         series, _, correlation = figure.axes[3 * number : 3 * number + 3]
         found = consistency(est, "camera", name)
