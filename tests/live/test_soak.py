@@ -13,7 +13,7 @@ import pumafuse as pf
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")]
 HOUR_NS = 3_600_000_000_000
-HOURS = 4
+HOURS = 3
 PERIOD_NS = 112_000_000
 CONFIG = pf.FusionConfig(
     arm=msgspec.structs.replace(pf.ArmModel.load("puma560-internal"), update_period=PERIOD_NS / 1e9),
@@ -55,7 +55,7 @@ def arrivals(number: int) -> Iterator[tuple[int, int, float]]:
 
 
 def test_a_shift_of_stamps() -> None:
-    """4 h of stream, 5 % of it late: memory flat to 5 %, and each hour the offline bits."""
+    """3 h of stream, 5 % of it late: memory flat to 5 %, and each hour the offline bits."""
     live = pf.LiveEstimator(CONFIG)
     found: list[pf.LiveEstimate] = []
     peak: list[int] = []
