@@ -105,14 +105,22 @@ def record_says_what_live_said(
 
 
 @pytest.mark.parametrize(
-    ("late", "rate"), [("vision", None), ("tracker", 100.0), ("commands", 100.0), ("all", None), ("all", 100.0)]
+    ("late", "rate", "seconds"),
+    [
+        ("vision", None, 10.0),
+        ("tracker", 100.0, 10.0),
+        ("tracker", 100.0, 8.0),  # its last row is valid before the last tick, and stamped behind it
+        ("commands", 100.0, 10.0),
+        ("all", None, 10.0),
+        ("all", 100.0, 10.0),
+    ],
 )
-def test_a_record_of_late_rows_is_as_live(tmp_path: Path, late: str, rate: float | None) -> None:
+def test_a_record_of_late_rows_is_as_live(tmp_path: Path, late: str, rate: float | None, seconds: float) -> None:
     """A camera or a tracker is 50 ms late, commands are by 0 to 20 ms, all by 0 to 0.9 s; each command, and a grid."""
     source = files("pumafuse") / "data" / "scan"
     run, config = pf.Run.read(str(source)), pf.FusionConfig.load(str(source / "fusion.toml"))
     first, rng = int(run.command.stamp[0]), np.random.default_rng(1)
-    events = [event for event in events_of(replace(run, reference=None)) if event.stamp <= first + 10_000_000_000]
+    events = [event for event in events_of(replace(run, reference=None)) if event.stamp <= first + seconds * 1e9]
 
     def arrival(event: Event) -> float:
         if late == "all":

@@ -92,7 +92,7 @@ def fuse(
         segment = build(part, config, chosen)
         faults.extend(sensor_faults(segment, config))
         moving.extend(starts_in_motion(segment, config))
-        times = output_times(segment, config, rate)
+        times = output_times(segment, config, rate, mode == "as-live")
         share = None if progress is None else _share(progress, number, len(logged))
         asked = segment.asked(times, rate is not None)
         segment_result = filter_segment(segment, config, times, mode, engine, share, asked)

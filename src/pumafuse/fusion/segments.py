@@ -193,14 +193,16 @@ class Segment:
         """Highest commanded speed on an axis [m/s or rad/s]."""
         return float(np.abs(np.diff(self.commands_of(axis)[1], prepend=self.start[axis])).max(initial=0.0)) / period
 
-    def end(self, config: FusionConfig) -> int:
+    def end(self, config: FusionConfig, as_live: bool) -> int:
         """Where an even grid of estimates ends, int ns: with the last command or measurement.
 
-        Measurements an hour after the last command are on another clock.
+        That is when it is valid, and for a stream, which knows no more of now, how it is stamped. Measurements an hour
+        after the last command are on another clock.
         """
         rows = self.measurement_rows
-        valid = _valid(rows.stamp, self._latency(config)[rows.source])[on_any_axis(rows.codes, Outcome.FUSED)]
-        return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
+        time = rows.stamp if as_live else _valid(rows.stamp, self._latency(config)[rows.source])
+        time = time[on_any_axis(rows.codes, Outcome.FUSED)]
+        return int(time[time <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
     def asked(self, times: TimeArray, on_grid: bool) -> TimeArray | None:
         """When a stream gives the estimates at ``times``, by the clock of arrivals [int ns], (n,); None without one.
@@ -285,14 +287,14 @@ def build(
 
 
 def output_times(
-    segment: Segment, config: FusionConfig, rate: float | None, span: tuple[int, int] = WHOLE
+    segment: Segment, config: FusionConfig, rate: float | None, as_live: bool = False, span: tuple[int, int] = WHOLE
 ) -> TimeArray:
     """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on."""
     since, until = max(segment.ends[0], span[0] + 1), min(segment.ends[1], span[1])
     if rate is None:
         times = segment.commands[(segment.commands >= since) & (segment.commands <= until)]
     else:
-        last = min(until, segment.end(config)) if span[1] >= segment.ends[1] else until
+        last = min(until, segment.end(config, as_live)) if span[1] >= segment.ends[1] else until
         times = _grid(segment.origin, max(since, segment.origin), last, rate)
     if not len(times) and span == WHOLE:
         raise no_estimates(rate)

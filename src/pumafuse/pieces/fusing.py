@@ -150,7 +150,7 @@ def _piece(
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
         raise RunError(f"{label}: the clock is set back by {lag.max():.3f} s; {_IN_ORDER}")
     segment = build(in_place, config, chosen, begun, span)
-    times = output_times(segment, config, rate, span)
+    times = output_times(segment, config, rate, span=span)
     filtered = filter_piece(segment, core, config, times, span)
     first = span[0] == ALWAYS
     if not first:  # for those who ask where the commands lead: the arm rests at what was commanded before
