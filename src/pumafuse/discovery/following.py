@@ -225,6 +225,9 @@ def isolated(time: FloatArray, value: FloatArray) -> BoolArray:
     for at in (time, np.arange(len(value), dtype=np.float64)):
         apart, off = _off_line(at, value)
         is_isolated[2:-2] &= apart > np.maximum(least, _APART * off)
+    neighbours = is_isolated[:-2] & is_isolated[2:]  # every second value: they go there and back together
+    is_isolated[:-2] &= ~neighbours
+    is_isolated[2:] &= ~neighbours
     return is_isolated
 
 
