@@ -54,7 +54,8 @@ def test_a_part_is_the_conditional_gaussian_given_its_measurements(case: Case, h
         est = pf.fuse(run.between(0.15, 0.36), config, rate=case.rate, **more)
     times, oracle = nanoseconds(est), AxisOracle(with_all_commands(run, 0.15, 0.36), config, "radial")
     grid = GRID if case.rate is None else np.rint(np.arange(99) * 1e9 / case.rate).astype(np.int64)
-    last = max(oracle.commands.given[-1], oracle.measurements[-1].valid)
+    ends = [one.stamp if how == "as_live" else one.valid for one in oracle.measurements]
+    last = max(oracle.commands.given[-1], *ends)
     assert times.tolist() == grid[(grid >= 150 * MS) & (grid <= last)].tolist()
     assert 0 < len(oracle.measurements) < sum(len(source.stamp) for source in run.sensors.values())
     check_innovations(est.measurements, oracle)

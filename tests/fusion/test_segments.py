@@ -347,18 +347,19 @@ def test_the_speed_of_an_axis_is_its_fastest_step() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rows", "end"),
+    ("rows", "end", "stamped"),
     [
-        ([(5, 1.0)], TICK),  # the last command
-        ([(905, 1.0), (5, 1.0)], 900 * MS),  # the last measurement, when it was true
-        ([(905, 1.0), (2000, nan)], 900 * MS),  # not one that is left out
+        ([(5, 1.0)], TICK, TICK),  # the last command
+        ([(905, 1.0), (5, 1.0)], 900 * MS, 905 * MS),  # the last measurement, when it was true
+        ([(905, 1.0), (2000, nan)], 900 * MS, 905 * MS),  # not one that is left out
     ],
 )
-def test_the_end_is_the_last_event_of_the_filter(rows: list[tuple[float, float]], end: int) -> None:
-    """The grid of estimates ends with the last command or the last measurement that can be fused."""
+def test_the_end_is_the_last_event_of_the_filter(rows: list[tuple[float, float]], end: int, stamped: int) -> None:
+    """The grid of estimates ends with the last command or the last measurement that can be fused; live by its stamp."""
     segment = build(recorded({"a": measurements(*rows)}), config(a=A))
-    assert segment.end(config(a=A)) == ORIGIN + end
-    assert output_times(segment, config(a=A), 1000.0)[-1] == ORIGIN + end
+    for as_live, last in ((False, end), (True, stamped)):
+        assert segment.end(config(a=A), as_live) == ORIGIN + last
+        assert output_times(segment, config(a=A), 1000.0, as_live)[-1] == ORIGIN + last
 
 
 @properties
