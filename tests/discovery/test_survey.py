@@ -444,8 +444,15 @@ def test_signals_that_nothing_tells_apart_are_described_and_no_column_is_both(tm
     for name, (first, second) in {"log": ("command_x", "measured_x"), "other": ("soll_x", "ist_x")}.items():
         write(tmp_path / f"{name}_2.csv", {**stacked, "signal": np.repeat([first, second], len(t))})
         check_fuses(tmp_path / f"{name}_2.csv", tmp_path / name, ("x_reading",))
-    both = 'file = "log.csv"\ntime = "stamp_ms"\nx = "reading_mm"\n'
-    (tmp_path / "run.toml").write_text(f"[command]\n{both}[sensors.arm]\n{both}")
+    table = 'file = "log.csv"\ntime = "stamp_ms"\nx = '
+    for told, measured in (
+        ('"reading_mm"', '"reading_mm"'),
+        ('["reading_mm", "reading_mm"]', '"reading_mm"'),
+        ('["stamp_ms", "reading_mm"]', '["reading_mm", "stamp_ms"]'),
+    ):
+        (tmp_path / "run.toml").write_text(f"[command]\n{table}{told}\n[sensors.arm]\n{table}{measured}\n")
+        assert ", and so is command.x: give each" in one_line(ConfigError, lambda: survey(tmp_path))
+    (tmp_path / "run.toml").write_text(f'[command]\n{table}"reading_mm"\n[sensors.arm]\n{table}"reading_mm"\n')
     refusal = one_line(ConfigError, lambda: survey(tmp_path))
     assert "sensors.arm.x is the column 'reading_mm' of log.csv, and so is command.x" in refusal
     (tmp_path / "run.toml").write_text("[command\n")

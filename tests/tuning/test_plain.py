@@ -129,21 +129,29 @@ def test_one_command_says_the_lag_of_an_arm_with_a_dead_band(tmp_path: Path) -> 
 
 
 def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_that_of_least_squares() -> None:
-    """80 (78 to 82) ms by the likelihood and 50 to 60 ms by least squares are 50 to 82; an open end stays open."""
+    """80 (78 to 82) ms by the likelihood and 50 to 60 ms by least squares are 50 to 82; an open end stays open.
+
+    One that was not fitted, and stays, is in its interval, too.
+    """
     simulated = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2)
     config, (first, *others) = simulated.config, simulated.config.arm.axes
     slow = replaced(config.arm.axes[first], delay=config.arm.delay_of(first) + 0.08 - config.arm.lag_of(first))
     slow = replaced(config, arm=replaced(config.arm, axes={**config.arm.axes, first: slow}))
     free = [one for one in free_of(Likelihood([simulated.run], slow), slow, ["delay"]) if one.axis == first]
+    replaced_arm = with_plain_arm(slow, others[0], Arm(0.03, 0.025))
     arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), Arm(0.054, 0.001), 1e-3, *[Measured([], T, [])] * 2)
     doubted = {axis: Doubt(arm, off=1.5e-3, lag=0.08) for axis in config.arm.axes}
 
-    def told(below: float, above: float, lost: Sequence[str] = ()) -> dict[str, tuple[float | None, float | None]]:
-        found = fitted_lags(free, config, slow, {first: (below, above)}, doubted, lost)
+    def told(
+        below: float, above: float, lost: Sequence[str] = (), after: pf.FusionConfig = replaced_arm
+    ) -> dict[str, tuple[float | None, float | None]]:
+        found = fitted_lags(free, config, after, {first: (below, above)}, doubted, lost)
         return {axis: one.lag_ms_ci95 for axis, one in found.items()}
 
     found = told(0.002, 0.002)
     assert found[first] == (50.0, pytest.approx(82.0)) and found[others[0]] == (50.0, 60.0)
+    lag = slow.arm.lag_of(others[0]) * 1e3
+    assert lag > 60.0 and told(0.002, 0.002, after=slow)[others[0]] == (50.0, pytest.approx(lag))
     assert others[0] not in told(0.002, 0.002, others[:1])
     assert told(0.002, np.inf)[first] == (50.0, None)
     assert [Doubt(arm, off, lag=0.08).refutes for off in (3.9e-3, 4.1e-3)] == [False, True]

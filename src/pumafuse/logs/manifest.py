@@ -277,10 +277,10 @@ def load(path: Path) -> Manifest:
 def refuse_twice(path: Path) -> None:
     """Refuse a ``run.toml`` in which one column, or sum of some, is what the arm is told and what a sensor measures."""
     listed = load(path)
-    told = {repr(columns): axis for axis, columns in listed.command.axes.items()}
+    told = {frozenset(map(repr, columns)): axis for axis, columns in listed.command.axes.items()}
     for name, entry in listed.sensors.items() if told else ():
         for axis, columns in entry.axes.items() if entry.rows == listed.command.rows else ():
-            if twice := told.get(repr(columns)):
+            if twice := told.get(frozenset(map(repr, columns))):
                 raise ConfigError(
                     f"{path}: sensors.{name}.{axis} is the column '{columns[0].column}' of {entry.label}, and so is"
                     f" command.{twice}: give each the column of its own, what the arm is told and what is measured"

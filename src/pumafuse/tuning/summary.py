@@ -143,7 +143,7 @@ def fitted_lags(
     """The lag of each axis that the free parameters change, or whose arm is doubted, but for those that are ``lost``.
 
     Intervals are ``around`` it, from :func:`lag_intervals`; where least squares doubt the arm they cover what these
-    say, and where the arm is theirs they are that.
+    say, and where it was not fitted they are that and the lag itself.
     """
     lags, slopes = dict[str, FittedLag](), lag_slopes(free, after)
     for axis in (axis for axis in dict.fromkeys([*slopes, *doubts]) if axis not in lost):
@@ -151,7 +151,8 @@ def fitted_lags(
         low, high = max(lag - below, min(lag, 0.0)), lag + above  # no arm is there before its commands
         if axis in doubts:
             least, most = doubts[axis].lag_ci95
-            low, high = (min(low, least), max(high, most)) if axis in slopes else (least, most)
+            low, high = (low, high) if axis in slopes else (lag, lag)
+            low, high = min(low, least), max(high, most)
         ends = [end * MS if abs(end) <= LONGEST else None for end in (low, high)]
         lags[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
     return lags
