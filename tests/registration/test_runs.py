@@ -267,6 +267,25 @@ def test_a_gap_of_the_commands_is_named_and_costs_nothing_else() -> None:
     np.testing.assert_allclose(frame.rotation, expected.rotation, atol=np.radians(0.1))
 
 
+@pytest.mark.long
+def test_noise_by_a_sensor_s_axes_is_turned_when_its_frame_is_found_and_then_stays() -> None:
+    """What was along its own axes, as no frame was known, is along the base's; what is that already is not changed."""
+    run, sds = recorded(as_it_is, seconds=20.0), np.array([1e-4, 2e-4, 8e-4])
+
+    def registered_from(config: pf.FusionConfig, **changes: object) -> tuple[pf.FusionConfig, np.ndarray]:
+        camera = msgspec.structs.replace(config.sensors["camera"], **changes)
+        found = pf.register(run, msgspec.structs.replace(config, sensors={"camera": camera})).config
+        return found, np.array([found.sensors["camera"].sd_of(axis) for axis in "xyz"])
+
+    config = pf.register(run).config
+    angles = {axis: config.sensors["camera"].sd_of(axis) for axis in ("rx", "ry", "rz")}
+    found, turned = registered_from(config, frame=None, sd=dict(zip("xyz", sds.tolist(), strict=True)) | angles)
+    along = Rotation.from_rotvec(found.sensors["camera"].frame.rotation).as_matrix()
+    np.testing.assert_allclose(turned, np.sqrt(along**2 @ sds**2), rtol=1e-9)
+    assert np.ptp(turned) > 1e-5
+    np.testing.assert_array_equal(registered_from(found)[1], turned)
+
+
 def along_base(marker: float) -> pf.Run:
     """A run beside a sensor that measures along the base's axes, so many times the marker of a set-up on the tool."""
     setup = Setup(3, seconds=12.0, wrong=1.0)
