@@ -24,6 +24,16 @@ struct Drive {
     Real error = 0.0;           // the gain error e now [m]
     Real x = 0.0, rate = 0.0;   // m, m/s; the rate of a plant of first order is not kept: it is 0
 
+    // A copy takes number by number: one that takes two at once has to wait for what was just stored singly, which is a
+    // third of a response's time.
+    Drive() = default;
+    Drive(double u, const Real& error, const Real& x, const Real& rate) : u(u), error(error), x(x), rate(rate) {}
+    Drive(const Drive& d) : Drive(d.u, d.error, d.x, d.rate) {}
+    Drive& operator=(const Drive& d) {
+        u = d.u, error = d.error, x = d.x, rate = d.rate;
+        return *this;
+    }
+
     Real gap() const { return u + error - x; }
 };
 
@@ -119,7 +129,7 @@ struct Arm {
 
     // The drive over dt, and what is left of the tool's slack (tool less drive) behind it.
     void move(Drive<Real>& d, Real& slack, const Real& dt) const {
-        if (linear) free(d, plant.over(dt), dt);
+        if (linear) d = free(d, plant.over(dt), dt);
         else in_pieces(d, slack, dt);
     }
 
@@ -165,22 +175,21 @@ struct Arm {
     }
 
     // x <- u + Phi (x - u) + Gamma_e e
-    void free(Drive<Real>& d, const Transition<Real>& f, const Real& dt) const {
+    Drive<Real> free(const Drive<Real>& d, const Transition<Real>& f, const Real& dt) const {
         const Decay<Real> e = plant.decaying(f, dt);
-        const Real gap = d.x - d.u, before = d.rate;
-        d.x = d.u + (f.f11 * gap + f.f12 * before) + e.position * d.error;
-        d.rate = f.f21 * gap + f.f22 * before + e.rate * d.error, d.error = d.error * e.left;
+        const Real gap = d.x - d.u;
+        return {d.u, d.error * e.left, d.u + (f.f11 * gap + f.f12 * d.rate) + e.position * d.error,
+                f.f21 * gap + f.f22 * d.rate + e.rate * d.error};
     }
 
     // x <- x + V dt, and of second order what it misses of V fades.
-    void at_limit(Drive<Real>& d, int side, const Real& dt) const {
-        using std::exp, std::expm1;
-        const Real fastest = double(side) * max_speed;
-        d.x = d.x + fastest * dt;
-        if (value_of(plant.decay) > 0.0) d.error = d.error * exp(-plant.decay * dt);
-        if (plant.order == 1) return;
-        const Real gained = expm1(-2.0 * plant.sigma * dt) * (d.rate - fastest);
-        d.x = d.x - gained / (2.0 * plant.sigma), d.rate = d.rate + gained;
+    Drive<Real> at_limit(const Drive<Real>& d, int side, const Real& dt) const {
+        using std::exp;
+        const Real fastest = double(side) * max_speed, x = d.x + fastest * dt;
+        const Real error = value_of(plant.decay) > 0.0 ? d.error * exp(-plant.decay * dt) : d.error;
+        if (plant.order == 1) return {d.u, error, x, 0.0};
+        const Real gained = (exp(-2.0 * plant.sigma * dt) - 1.0) * (d.rate - fastest);
+        return {d.u, error, x - gained / (2.0 * plant.sigma), d.rate + gained};
     }
 
     Real pushed(const Real& slack, const Drive<Real>& before, const Drive<Real>& after) const {
@@ -192,7 +201,7 @@ struct Arm {
     // a swing, and on either side of that each of the two does (Rolle).
     struct Motion { double rate, closing, slope, slope_rate; };
 
-    Motion motion(const Drive<Real>& d, int side) const {
+    [[gnu::always_inline]] Motion motion(const Drive<Real>& d, int side) const {
         const double s = value_of(asked(d, side)), rate = plant.order == 1 ? s : value_of(d.rate);
         const double decay = value_of(plant.decay), closing = decay * value_of(d.error) + rate;
         if (plant.order == 1) return {rate, closing, decay * rate - (side == 0 ? fast * closing : 0.0), 0.0};
@@ -225,6 +234,23 @@ struct Arm {
     // One of the two over time.
     Course course(const Motion& m, double Motion::*of) const { return {m.*of, m.slope - value_of(plant.decay) * m.*of}; }
 
+    // Whether the drive may have to be cut where one of the two changes its sign, as far as both ends tell at a glance:
+    // it need not where both keep it by more than rounding, and do not turn to it and back.
+    bool may_turn(const Drive<Real>& d, const Drive<Real>& then, int side) const {
+        if (!(cut_by_play || cut_by_limit)) return false;
+        const double still = STILL * fast;
+        const auto keeps = [&](double first, double last) {
+            return first > 0.0 ? first > still && last > still : first < -still && last < -still;
+        };
+        if (value_of(plant.decay) == 0.0) return !keeps(value_of(d.rate), value_of(then.rate));
+        const Motion m = motion(d, side), n = motion(then, side);
+        const auto stays = [&](double first, double last) {
+            const double away = last > 0.0 ? n.slope : -n.slope;
+            return keeps(first, last) && !(may_return && first * m.slope < 0.0 && away > -still * fast);
+        };
+        return (cut_by_play && !stays(m.rate, n.rate)) || (cut_by_limit && !stays(m.closing, n.closing));
+    }
+
     // Whether one of the two changes its sign on the way, or may do so and back.
     bool turns(const Motion& m, const Motion& n, double Motion::*of) const {
         return changes(m.*of, n.*of) || (may_return && m.*of * m.slope < 0.0 && n.*of * n.slope > 0.0);
@@ -238,14 +264,6 @@ struct Arm {
         const double apart = std::fabs(std::fabs(value_of(d.gap())) - farthest);
         return !changes(m.closing, n.closing) || m.closing * m.slope > 0.0 || std::fabs(m.closing) * dt > apart;
     }
-    bool cuts(const Drive<Real>& d, const Drive<Real>& then, int side, const Real& dt) const {
-        if (!(cut_by_play || cut_by_limit)) return false;
-        const double rate = value_of(d.rate);
-        if (value_of(plant.decay) == 0.0 && rate != 0.0 && !changes(rate, value_of(then.rate))) return false;
-        const Motion m = at_first(d, side, value_of(dt));
-        const Motion n = side == 0 ? later(m, then, plant.over(dt), value_of(dt)) : motion(then, side);
-        return play_cuts(m, n) || limit_cuts(d, m, n, value_of(dt));
-    }
 
     // The path, cut where the drive turns, and where it meets or leaves its limit.
     void in_pieces(Drive<Real>& d, Real& slack, const Real& dt) const {
@@ -255,25 +273,26 @@ struct Arm {
             const bool may_cut = pieces < MOST_PIECES;
             const bool swings = side == 0 && value_of(left) > half_swing && may_cut && !undisturbed(d, slack);
             Real taken = swings ? Real(half_swing) : left;
-            Drive<Real> then = d;
-            if (side != 0) at_limit(then, side, taken);
-            else free(then, plant.over(taken), taken);
-            if ((this->side(then) != side || cuts(d, then, side, taken)) && may_cut && !undisturbed(d, slack))
-                cut(d, then, side, taken);
+            Drive<Real> then = side != 0 ? at_limit(d, side, taken) : free(d, plant.over(taken), taken);
+            if ((this->side(then) != side || may_turn(d, then, side)) && may_cut)
+                std::tie(then, taken) = cut(d, then, slack, side, taken);
             slack = pushed(slack, d, then), d = then, left = left - taken;
         }
     }
 
-    // The first cut on the way to `then` becomes `then`, and its time `taken`.
-    void cut(const Drive<Real>& d, Drive<Real>& then, int side, Real& taken) const {
+    // The path up to its first cut on the way to `then`, or to that; and how long it takes. Not a part of the loop, which
+    // is small and seldom comes here.
+    [[gnu::noinline]] std::tuple<Drive<Real>, Real> cut(Drive<Real> d, Drive<Real> then, Real slack, int side,
+                                                        Real taken) const {
+        if (undisturbed(d, slack)) return {then, taken};
         const Motion m = at_first(d, side, value_of(taken));
         Motion n = side == 0 ? later(m, then, plant.over(taken), value_of(taken)) : motion(then, side);
         const auto move_to = [&](const Real& t) {
-            then = d, taken = t;
+            taken = t;
             if (side == 0) {
                 const Transition<Real> f = plant.computed(t);
-                free(then, f, t), n = later(m, then, f, value_of(t));
-            } else at_limit(then, side, t), n = motion(then, side);
+                then = free(d, f, t), n = later(m, then, f, value_of(t));
+            } else then = at_limit(d, side, t), n = motion(then, side);
         };
         const auto up_to_change = [&](const Course& first, auto course) {
             const Course last = course();
@@ -297,6 +316,7 @@ struct Arm {
             };
             up_to_change(beyond(d, m), [&] { return beyond(then, n); });
         }
+        return {then, taken};
     }
 };
 

@@ -167,8 +167,8 @@ class Filter {
 
     // Response and residual to an instant.
     void advance(AxisState<N, Real>& state, Time a, const Instant<Real>& to) const {
-        state.response.predict(axes[a].arm, to);
         state.residual.predict(axes[a].arm.plant, axes[a].noise, to);
+        state.response.predict(axes[a].arm, to);
     }
 
   private:
@@ -184,11 +184,11 @@ class Filter {
         const Known<N, Real>& axis = axes[a];
         const Instant<Real> acts{event.time, axis.delayed};
         Residual<N, Real>& xi = state.residual;
+        if (axis.noise.maneuvers) xi.enter(axis.arm.plant, acts);
         state.response.predict(axis.arm, acts);
         const double maneuver = state.response.command(axis.arm, event.value[a]);
         if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
         if (history) (*history)[a].push_back({event.time, value_of(xi.q), value_of(xi.drift)});
-        xi.enter(axis.arm.plant, acts);
         xi.set_noise(axis.noise, maneuver);
     }
 

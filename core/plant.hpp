@@ -15,7 +15,10 @@
 namespace pumafuse {
 
 template <class Real>
-struct Transition { Real f11{}, f12{}, f21{}, f22{}, q11{}, q12{}, q22{}; };  // Phi and Q
+struct Transition { Real f11{}, f12{}, f21{}, f22{}; };  // Phi
+
+template <class Real>
+struct Driven : Transition<Real> { Real q11{}, q12{}, q22{}; };  // and Q, of unit noise on the input
 
 template <class Real>
 struct Decay { Real position, rate, left; };  // what an input makes that decays from 1 m, and what is left of it
@@ -62,7 +65,7 @@ class Plant {
             y[k + 3] = -(6.0 * s * (p * q) * y[k + 2] + (8.0 * s * s + 4.0 * w) * p * y[k + 1] + 8.0 * s * w * y[k]) /
                        (p * q * r);
             if (close) h[k + 2] = (g[k + 1] - b * h[k + 1]) / q;
-            series[k] = {g[k + 1], g[k + 1] * p, y[k + 2] / r, h[k + 2]};
+            series[k] = {g[k + 1], g[k + 1] * p, h[k + 2], y[k + 2] / r};
         }
     }
 
@@ -73,23 +76,18 @@ class Plant {
     }
 
     // A plant of first order has a rate, too, that is always 0: the algebra is the same for both orders. Some intervals
-    // are remembered: response and residual share them, and what comes regularly has few.
+    // are remembered, as what comes regularly has few. The residual asks first: the response may share what it got.
+    const Driven<Real>& driven_over(Real t) const { return looked_up(driven, t); }
     const Transition<Real>& over(Real t) const {
-        auto& [last, found] = remembered[std::bit_cast<std::uint64_t>(value_of(t)) * 0x9E3779B97F4A7C15u >> 61];
-        if (!is_zero(t - last)) last = t, found = computed(t);
-        return found;
+        const auto& [last, found] = driven[slot(t)];
+        return is_zero(t - last) ? found : looked_up(undriven, t);
     }
 
     // Of an interval that will not come again.
     Transition<Real> computed(Real t) const {
-        using std::expm1;
-        if (order == 1) {
-            const Real lost = expm1(-rate * t);
-            return {1.0 + lost, 0.0, 0.0, 0.0, -0.5 * rate * lost * (2.0 + lost), 0.0, 0.0};
-        }
-        const auto [g, g_rate, energy, h] = free(t);
-        const Real w2 = omega * omega, x = w2 * g, q11 = w2 * w2 * energy, q12 = 0.5 * x * x;
-        return {g_rate + 2.0 * sigma * g, g, -x, g_rate, q11, q12, w2 * q11 + 2.0 * sigma * q12 + x * w2 * g_rate};
+        Transition<Real> f;
+        compute(t, f);
+        return f;
     }
 
     // Of an input that decays by `decay`; f is the plant's transition over t.
@@ -98,7 +96,7 @@ class Plant {
         if (value_of(decay) == 0.0) return {1.0 - f.f11, -f.f21, 1.0};
         const Real left = exp(-decay * t);
         if (order == 1) return {close ? rate * divided_difference(rate, decay, t) : share * (left - f.f11), 0.0, left};
-        const Real h = close ? free(t)[3] : share * (left - f.f22 - (2.0 * sigma - decay) * f.f12);
+        const Real h = close ? free<false>(t)[2] : share * (left - f.f22 - (2.0 * sigma - decay) * f.f12);
         return {omega * omega * h, omega * omega * (f.f12 - decay * h), left};
     }
 
@@ -106,7 +104,8 @@ class Plant {
     Real drawn() const { return close ? Real(0.0) : order == 1 ? share : omega * omega * share; }
 
   private:
-    // g, g', ∫ g^2 and h = ∫ g(s) exp(-decay (t - s)) ds; h only where the decay is close to a pole of the plant.
+    // g, g', h = ∫ g(s) exp(-decay (t - s)) ds and ∫ g^2; h only where the decay is close to a pole of the plant, and
+    // the last only where it is asked for.
     using Free = std::array<Real, 4>;
     static constexpr int TERMS = 16, FEW = 10;  // of each series: the next would be below 1e-16 of the sum
     static constexpr double TINY = 0.1;         // rad; up to which few terms are enough
@@ -119,51 +118,91 @@ class Plant {
     Real share = 0.0;                  // what a decay that is not close to the poles has of their response
     double fastest = 0.0;              // rad/s
     Real s = 0.0, w = 0.0, b = 0.0;    // sigma, omega^2 and decay in the time u = fastest t
-    struct Remembered { Real interval = -1.0; Transition<Real> transition{}; };
-    mutable std::array<Remembered, 8> remembered{};  // by a hash
-    std::array<Free, TERMS> series{};  // coefficients of g / u, g', ∫ g^2 / u^3 and h / u^2
+    std::array<Free, TERMS> series{};  // coefficients of g / u, g', h / u^2 and ∫ g^2 / u^3
+    template <class Of>
+    struct Remembered { Real interval = -1.0; Of transition{}; };
+    template <class Of>
+    using Some = std::array<Remembered<Of>, 8>;  // by a hash
+    mutable Some<Transition<Real>> undriven{};
+    mutable Some<Driven<Real>> driven{};
 
-    Free free(Real t) const {
-        return far_apart && fastest * value_of(t) > SHORT ? by_exponentials(t) : by_doubling(t);
+    static std::size_t slot(Real t) { return std::bit_cast<std::uint64_t>(value_of(t)) * 0x9E3779B97F4A7C15u >> 61; }
+
+    template <class Of>
+    const Of& looked_up(Some<Of>& some, Real t) const {
+        auto& [last, found] = some[slot(t)];
+        if (!is_zero(t - last)) last = t, compute(t, found);  // in place: a copy would wait for it
+        return found;
     }
 
+    template <class Of>
+    void compute(Real t, Of& f) const {
+        using std::expm1;
+        constexpr bool NOISE = std::is_same_v<Of, Driven<Real>>;
+        if (order == 1) {
+            const Real lost = expm1(-rate * t);
+            f.f11 = 1.0 + lost;
+            if constexpr (NOISE) f.q11 = -0.5 * rate * lost * (2.0 + lost);
+            return;
+        }
+        const auto [g, g_rate, h, energy] = free<NOISE>(t);
+        const Real w2 = omega * omega, x = w2 * g;
+        f.f11 = g_rate + 2.0 * sigma * g, f.f12 = g, f.f21 = -x, f.f22 = g_rate;
+        if constexpr (NOISE) {
+            f.q11 = w2 * w2 * energy, f.q12 = 0.5 * x * x;
+            f.q22 = w2 * f.q11 + 2.0 * sigma * f.q12 + x * w2 * g_rate;
+        }
+    }
+
+    template <bool ENERGY>
+    Free free(Real t) const {
+        return far_apart && fastest * value_of(t) > SHORT ? by_exponentials<ENERGY>(t) : by_doubling<ENERGY>(t);
+    }
+
+    template <bool ENERGY>
     Free by_doubling(Real t) const {
         using std::exp;
+        constexpr int SUMS = ENERGY ? 4 : 3;
         int doublings = 0;
         if (const double u = fastest * value_of(t); u > SHORT) std::frexp(u / SHORT, &doublings);
         const Real u = fastest * t / std::ldexp(1.0, doublings), v = u * u;
         Free evens{}, odds{};  // apart, so that sums wait for half as many others
         for (int k = (value_of(u) <= TINY ? FEW : TERMS) - 2; k >= 0; k -= 2)
-            for (int i = 0; i < 4; ++i)
+            for (int i = 0; i < SUMS; ++i)
                 evens[i] = evens[i] * v + series[k][i], odds[i] = odds[i] * v + series[k + 1][i];
-        Real g = (evens[0] + u * odds[0]) * u, g_rate = evens[1] + u * odds[1];
-        Real energy = (evens[2] + u * odds[2]) * u * v, h = (evens[3] + u * odds[3]) * v;
+        Real g = (evens[0] + u * odds[0]) * u, g_rate = evens[1] + u * odds[1], h = (evens[2] + u * odds[2]) * v;
+        Real energy = (evens[3] + u * odds[3]) * u * v;
         for (Real left = close ? exp(-b * u) : Real(0.0); doublings > 0; --doublings, left = left * left) {
             const Real f = g_rate + 2.0 * s * g, gg = g * g;  // Phi = [f, g; -w g, g']
             h = f * h + g * (g - b * h) + left * h;
-            energy = energy + f * f * energy + f * g * gg + gg * (w * energy + s * gg + g * g_rate);
+            if constexpr (ENERGY) energy = energy + f * f * energy + f * g * gg + gg * (w * energy + s * gg + g * g_rate);
             g = (f + g_rate) * g, g_rate = g_rate * g_rate - w * gg;
         }
-        return {g / fastest, g_rate, energy / (fastest * fastest * fastest), h / (fastest * fastest)};
+        return {g / fastest, g_rate, h / (fastest * fastest), energy / (fastest * fastest * fastest)};
     }
 
+    template <bool ENERGY>
     Free by_exponentials(Real t) const {
         using std::cos, std::exp, std::expm1, std::sin, std::sqrt;
+        Real h = 0.0, energy = 0.0;
         if (value_of(apart) < 0.0) {
             const Real beta = sqrt(-apart), lasting = exp(-sigma * t), sine = sin(beta * t), cosine = cos(beta * t);
-            const Real twice = lasting * lasting, straight = -expm1(-2.0 * sigma * t) / (2.0 * sigma);
-            const Real turning = (2.0 * sigma * (1.0 - twice * (cosine - sine) * (cosine + sine)) +
-                                  4.0 * beta * twice * sine * cosine) / (4.0 * omega * omega);
+            if constexpr (ENERGY) {
+                const Real twice = lasting * lasting, straight = -expm1(-2.0 * sigma * t) / (2.0 * sigma);
+                const Real turning = (2.0 * sigma * (1.0 - twice * (cosine - sine) * (cosine + sine)) +
+                                      4.0 * beta * twice * sine * cosine) / (4.0 * omega * omega);
+                energy = (straight - turning) / (2.0 * beta * beta);
+            }
             const Real g = lasting * sine / beta;
-            return {g, lasting * cosine - sigma * g, (straight - turning) / (2.0 * beta * beta), 0.0};
+            return {g, lasting * cosine - sigma * g, h, energy};
         }
         const Real beta = sqrt(apart), fast = sigma + beta, slow = omega * omega / fast;
         const Real brief = exp(-fast * t), lasting = exp(-slow * t);
-        const Real energy = (-expm1(-2.0 * slow * t) / (2.0 * slow) + expm1(-2.0 * sigma * t) / sigma -
-                             expm1(-2.0 * fast * t) / (2.0 * fast)) / (4.0 * beta * beta);
-        Real h = 0.0;
+        if constexpr (ENERGY)
+            energy = (-expm1(-2.0 * slow * t) / (2.0 * slow) + expm1(-2.0 * sigma * t) / sigma -
+                      expm1(-2.0 * fast * t) / (2.0 * fast)) / (4.0 * beta * beta);
         if (close) h = (divided_difference(slow, decay, t) - divided_difference(fast, decay, t)) / (2.0 * beta);
-        return {(lasting - brief) / (2.0 * beta), (fast * brief - slow * lasting) / (2.0 * beta), energy, h};
+        return {(lasting - brief) / (2.0 * beta), (fast * brief - slow * lasting) / (2.0 * beta), h, energy};
     }
 };
 

@@ -49,10 +49,10 @@ const char* pf_error(void) { return error.c_str(); }
 
 void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
-    const Transition<double>& f = arm.plant.over(dt);
+    const Driven<double>& f = arm.plant.driven_over(dt);
     const Decay<double> e = arm.plant.decaying(f, dt);
     const double lambda = std::sqrt(3.0) / axis->disturbance_time, density = 4.0 / lambda;
-    const Transition<double> d = Plant<double>(lambda, 1.0, 0.0).over(dt);
+    const Driven<double> d = Plant<double>(lambda, 1.0, 0.0).driven_over(dt);
     const double found[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, e.position, e.rate, e.left, d.f11, d.f12, d.f21,
                             d.f22, density * d.q11, density * d.q12, density * d.q22};
     std::copy_n(found, 17, step);

@@ -135,7 +135,7 @@ struct Residual {
     bool doubted = false;             // whether these are; a likelihood never asks
     Real q = 0.0, drift = 0.0;  // densities squared in force: input noise [m^2 s] and the offset's drift [m^2/s]
     Instant<Real> until;        // commands that change these have been taken into account until then:
-    Transition<Real> since;     // Phi and Q of the plant from `time` on, Q with the noise that there was
+    Driven<Real> since;         // Phi and Q of the plant from `time` on, Q with the noise that there was
     Real drifted = 0.0;         // what that has added to the offset's variance
 
     Residual() = default;
@@ -155,10 +155,10 @@ struct Residual {
     void enter(const Plant<Real>& plant, const Instant<Real>& to) {
         const Real dt = seconds(until, to);
         if (is_zero(dt)) return;
-        const Transition<Real>& f = plant.over(dt);
-        Transition<Real>& s = since;
+        const Driven<Real>& f = plant.driven_over(dt);
+        Driven<Real>& s = since;
         if (until.ns == time.ns && is_zero(until.shift - time.shift)) {  // the first: Phi_s is 1
-            s = {f.f11, f.f12, f.f21, f.f22, q * f.q11, q * f.q12, q * f.q22};
+            s = {f, q * f.q11, q * f.q12, q * f.q22};
         } else if (plant.order == 1) {
             s.f11 = f.f11 * s.f11, s.q11 = f.f11 * f.f11 * s.q11 + q * f.q11;
         } else {
@@ -185,7 +185,7 @@ struct Residual {
         P[OFFSET][OFFSET] = P[OFFSET][OFFSET] + drifted, drifted = 0.0;
         int i = DISTURBANCE;
         if (noise.smooth()) {
-            const Transition<Real>& d = noise.disturbance.over(dt);
+            const Driven<Real>& d = noise.disturbance.driven_over(dt);
             move(i, d), add(i, noise.density * d.q11, noise.density * d.q12, noise.density * d.q22);
             i += 2;
         }

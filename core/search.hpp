@@ -25,7 +25,7 @@ class Whitening {
             if (const double dt = k > 0 ? double(time[k] - time[k - 1]) / 1e9 : 0.0; dt > 0.0) {
                 P[0][0] += square(noise.walk) * dt;
                 if (smooth && disturbed) {
-                    const Transition<double>& f = plant.over(dt);
+                    const Driven<double>& f = plant.driven_over(dt);
                     step = {f.f11, f.f12, f.f21, f.f22};
                     predict(P, step, density * f.q11, density * f.q12, density * f.q22);
                 } else if (disturbed) {

@@ -22,10 +22,10 @@ struct Later {
     Matrix<N, double> M{};
 
     void over_interval(const Arm<double>& arm, const Noise<N, double>& noise, double dt, double q, double drift) {
-        over_pair(PLANT, arm.plant.over(dt), q);
+        over_pair(PLANT, arm.plant.driven_over(dt), q);
         through_noise(OFFSET, std::sqrt(drift * dt));
         int i = DISTURBANCE;
-        if (noise.smooth()) over_pair(i, noise.disturbance.over(dt), noise.density), i += 2;
+        if (noise.smooth()) over_pair(i, noise.disturbance.driven_over(dt), noise.density), i += 2;
         for (; i < noise.size; ++i) {
             if (noise.reverting[i] == 0.0) continue;
             const double fading = -noise.reverting[i] * dt, left = std::exp(fading);
@@ -63,7 +63,7 @@ struct Later {
 
   private:
     // Through the noise of the states i and i + 1, as two independent parts, and back over their transition.
-    void over_pair(int i, const Transition<double>& f, double density) {
+    void over_pair(int i, const Driven<double>& f, double density) {
         const double first = std::sqrt(density * f.q11), both = first > 0.0 ? density * f.q12 / first : 0.0;
         through_noise(i, first, both);
         through_noise(i + 1, std::sqrt(std::max(density * f.q22 - both * both, 0.0)));
