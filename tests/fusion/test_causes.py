@@ -147,6 +147,15 @@ def with_outliers(e: np.ndarray) -> np.ndarray:
     return np.where(np.arange(len(e)) % 50 == 7, 20.0 * e, e)
 
 
+def slow(fastest: float) -> pf.ArmModel:
+    """An arm whose drive goes that fast [m/s]."""
+    return changed(arm(), axes=dict.fromkeys(AXES, changed(arm().axes["a"], max_speed=fastest)))
+
+
+def slow_config(fastest: float) -> pf.FusionConfig:
+    return changed(config(), arm=slow(fastest))
+
+
 LAG_OF_SMOOTHING = EVERY / (math.exp(1.0 / 3.0) - 1.0)
 WORLDS = {
     "sd too large": (recorded, config(sd=3 * SD), Cause.NOISE, 1 / 3),
@@ -165,9 +174,13 @@ WORLDS = {
     "scale": (lambda: recorded(seen=lambda z: 1.04 * z), config(), Cause.POSITION, 0.04),
     "play": (lambda: recorded(moved=with_play), config(), Cause.PLAY, 1.5e-3),
     "limit": (lambda: recorded(moved=limited), config(), Cause.LIMIT, 0.0),
+    "a fastest speed too small": (lambda: recorded(model=slow(0.045)), slow_config(0.04), Cause.FASTEST, 0.125),
+    "a fastest speed far too small": (lambda: recorded(model=slow(0.045)), slow_config(0.035), Cause.FASTEST, 0.286),
+    "a fastest speed too large": (lambda: recorded(model=slow(0.045)), slow_config(0.055), Cause.FASTEST, -0.18),
 }
 
 
+@pytest.mark.filterwarnings("ignore:.*ask for more than")
 @pytest.mark.parametrize("world", WORLDS)
 def test_the_one_thing_that_is_wrong_is_named_first_with_its_size(world: str) -> None:
     """On both axes, its size to a quarter; of a lag alone a latency is said."""

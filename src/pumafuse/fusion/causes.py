@@ -64,6 +64,7 @@ _LIMITS = (0.95, 0.85, 0.7)  # of the speed, over the highest
 _LEAST_DRIFT = 0.03  # 1/√s: density of the least drift, over the smallest sd, that is made larger; none stays none
 _WHOLE_LAGS = 1.0, 3.0  # update periods: lags looked for as a whole: an accurate sensor sees more of them than velocity
 _SLOWER = 1.1  # times the plant's lag: a derivative by it
+_FASTER = 1.1, 1.5  # times the fastest speed
 
 
 class Cause(enum.Enum):
@@ -92,6 +93,7 @@ class Cause(enum.Enum):
     BIAS = "bias", "size"  # a sensor beside others is off by a constant
     PLAY = "play", "size"  # backlash
     LIMIT = "limit"  # of the speed
+    FASTEST = "fastest", "share"  # the fastest speed that the model has
 
 
 _ALIKE = {  # the better one of two is named
@@ -240,7 +242,7 @@ def _gain_of_shape(weight: Weight) -> float:
 
 def _is_possible(cause: Cause, which: float, size: float) -> bool:
     """Whether there is a cause of that size: no play is negative, and a lag of 1 ms does not look like one of 30."""
-    if cause in (Cause.LAG, Cause.LATENCY):
+    if cause in (Cause.LAG, Cause.LATENCY, Cause.FASTEST):
         return which == 0.0 or 0.5 < size / which < 2.0
     return size > 0.0 or cause not in _OF_ONE_SIGN
 
@@ -477,9 +479,15 @@ def _shapes(part: _Part) -> Iterator[tuple[Tried, FloatArray]]:
     least = min(sd for sensor in part.config.sensors.values() if (sd := sensor.sd_of(part.axis)))
     for half_play in (times * least for times in _PLAYS):
         yield Tried(Cause.PLAY, which=2.0 * half_play), scale * (_with_play(led, half_play) - led)
-    for share in _LIMITS:
+    for share in _LIMITS if model.max_speed is None else ():
         farthest = share * float(np.abs(lags[0.0]).max()) * np.diff(time, prepend=time[0]) / 1e9
         yield Tried(Cause.LIMIT, which=share), scale * (_limited(led, farthest) - led)
+    for factor in (each for times in _FASTER for each in (times, 1.0 / times) if model.max_speed is not None):
+        faster = msgspec.structs.replace(model, max_speed=factor * (model.max_speed or 0.0))
+        yield (
+            Tried(Cause.FASTEST, which=factor - 1.0),
+            scale * (part.position(faster, time) - led) / (factor - 1.0),
+        )
     for number in used if len(used) > 1 else ():
         name, rows = measured.sensors[number], measured.sensor == number
         for which, x in lags.items():

@@ -166,6 +166,8 @@ def in_words(suspect: Suspect, consistency: Consistency) -> str:
             return f"the error turns with the direction: a play of about {size * screen.scale:.2g} {screen.unit}"
         case Cause.LIMIT:
             return "the arm falls behind where it is fastest: a limit of its speed"
+        case Cause.FASTEST:
+            return f"{of_kind('max_speed_mm_s', consistency.kind)} is {size:.2g} of itself too {small}"
 
 
 def _factor(size: float) -> str:
