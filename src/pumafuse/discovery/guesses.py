@@ -89,7 +89,11 @@ def guess(survey: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     period = period_of(run.command)
     if math.isnan(period):
         raise RunError(f"{survey.log}: fewer than two commands with stamps of their own")
-    relations = {key: relation for key, relation in survey.relations.items() if abs(relation.correlation) >= FOLLOWS}
+    relations = {  # the axes of a sensor in a frame of its own are others
+        (name, axis): relation
+        for (name, axis), relation in survey.relations.items()
+        if abs(relation.correlation) >= FOLLOWS and name not in survey.own_frames
+    }
     first, latencies, pairs = _against_each_other(survey.run, relations)
     leads = {
         axis: {name: relations[name, axis] for name in run.sensors if (name, axis) in relations} for axis in run.axes
