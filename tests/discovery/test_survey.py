@@ -470,6 +470,20 @@ def test_set_points_are_what_is_measured_and_the_error_of_a_controller(tmp_path:
     assert relation.lag == pytest.approx(LAG, abs=0.01) and relation.slope == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("error", ["error_mm", "following_err"])
+def test_the_error_of_a_controller_alone_is_no_command(error: str, tmp_path: Path) -> None:
+    """It is said what it is, and that the set points are its sum with what is measured."""
+    t, u, z = recorded_at_once()
+    write(tmp_path / "log.csv", {"t_s": t, "level_mm": 1e3 * z[:, 0], error: 1e3 * (u - z)[:, 0]})
+    text = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    assert f"{error} of log.csv is an error: if it is the set point less what is measured" in text
+    columns = 'file = "log.csv"\ntime = "t_s"\nboom = '
+    told = f'[command]\n{columns}{{ column = "{error}", unit = "mm" }}\n'
+    (tmp_path / "run.toml").write_text(f'{told}[sensors.gauge]\n{columns}"level_mm"\n')
+    text = one_line(ConfigError, lambda: survey(tmp_path))
+    assert f'the commands are the sum of both: boom = ["MEASURED", "{error}"]' in text
+
+
 def test_a_status_that_changes_all_the_time_tells_nothing_apart(tmp_path: Path) -> None:
     t, u, z = recorded_at_once()
     words = np.where(np.random.default_rng(1).random(len(t)) < 0.5, "good", "poor")

@@ -61,7 +61,8 @@ _NO_POSITIONS = words_in(
     " longitude var variance yawspeed rollspeed pitchspeed good innov"
 )
 _FINGERS = words_in("index rotation")  # of a hand: beside words of roles, at the end, these are joints
-_SPREADS = words_in("std sd sigma error err errs covariance")  # in the unit of a position, and none
+_ERRORS = words_in("error err errs")
+_SPREADS = _ERRORS | words_in("std sd sigma covariance")  # in the unit of a position, and none
 _CHANGES = words_in("delta relative rel incremental increment diff")
 # Words that are something else only without a number and without a unit: ax1 and az_deg are axes.
 _WHOLE = {
@@ -208,6 +209,11 @@ def no_position(column: str) -> str | None:
         return None
     of_unit = f"in {unit.strip('_').replace('_', '/')}" if unit is not None and kind is None else None
     return next(iter(whats), "in °C or °/s" if "°" in column and not is_told else of_unit)
+
+
+def is_error(column: str) -> bool:
+    """Whether a column is called as what is left between a set point and what is measured."""
+    return has_word(leaf(column), _ERRORS)
 
 
 def no_position_by_place(label: str, columns: Iterable[str]) -> str | None:
