@@ -54,11 +54,11 @@ _SILENT = (
 _NO_POSITIONS = words_in(
     "velocity velocities vel speed speeds rate rates omega gyro dq qvel dot acceleration accelerations acc accel"
     " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tor tq tau moment moments force forces"
-    " wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts power pwm duty load"
-    " pressure kp ki kd mode scaling bits temperature temperatures temp quality confidence covariance orientation"
-    " rotation quaternion quat twist index id seq sequence count status valid std sd sigma latency duration error err"
-    " errs header stamp nanosec layout frame done reward task episode tick time timestamp reset lat lon latitude"
-    " longitude var variance yawspeed rollspeed pitchspeed good innov"
+    " tension tensions wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts"
+    " power pwm duty load pressure kp ki kd mode scaling bits temperature temperatures temp quality confidence"
+    " covariance orientation rotation quaternion quat twist index id seq sequence count status valid std sd sigma"
+    " latency duration error err errs header stamp nanosec layout frame done reward task episode tick time timestamp"
+    " reset lat lon latitude longitude var variance yawspeed rollspeed pitchspeed good innov"
 )
 _FINGERS = words_in("index rotation")  # of a hand: beside words of roles, at the end, these are joints
 _ERRORS = words_in("error err errs")
