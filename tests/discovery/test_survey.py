@@ -1260,6 +1260,14 @@ def test_commands_that_never_move_are_named(tmp_path: Path) -> None:
     assert "What is called so never moves: swing, always 0" in one_line(RunError, lambda: survey(tmp_path))
 
 
+def test_texts_of_commands_that_never_move_are_named(log: Path) -> None:
+    _, _, z = recorded_at_once()
+    np.savetxt(log / "Left_Des_Z.txt", np.full((len(z), 3), 0.07))
+    np.savetxt(log / "Left_Foot_Z.txt", z)
+    text = one_line(RunError, lambda: survey(log, 100.0))
+    assert "What is called so never moves: column 1, always 0.07" in text
+
+
 def test_texts_without_a_clock_are_named_and_read_at_a_rate(log: Path) -> None:
     """Alone in a folder; beside a table they may be anything."""
     t, u, z = recorded_at_once()

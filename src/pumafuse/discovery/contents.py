@@ -185,7 +185,7 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
         is_known = path.name.endswith(_TABLES) or formats.has_tables(path) or tables.is_recording(path)
         if path != log and not is_known:
             with suppress(RunError):  # beside others it may be anything, if it is no table with a clock of its own
-                texts += [part for part in _tabled(path, rate) if part.signals]
+                texts += [part for part in _tabled(path, rate) if part.signals or part.clock]
         elif tables.is_recording(path):
             parts += _recorded(path)
         else:
