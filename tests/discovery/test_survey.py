@@ -420,8 +420,18 @@ def test_of_raw_and_filtered_numbers_of_one_quantity_the_raw_ones_are_the_sensor
 def test_a_filtered_sensor_beside_another_device_stays(tmp_path: Path) -> None:
     t, u, z = recorded_at_once()
     columns = {**xyz(u, "goal_{}_m"), **xyz(z, "camera_{}_m"), **xyz(path(t - LAG), "encoder_filt_{}_m")}
-    write(tmp_path / "log.csv", {"t_s": t, **columns, **xyz(z, "tracker_{}_m")})
+    write(tmp_path / "log.csv", {"t_s": t, **columns, **xyz(2.0 * z - path(t - LAG), "tracker_{}_m")})
     assert len(survey(tmp_path / "log.csv").run.sensors) == 3
+
+
+def test_a_sensor_that_says_again_what_another_says_is_no_second_one(tmp_path: Path) -> None:
+    """As the log of a policy has the encoders twice, as what it observes and as what is measured."""
+    t, u, z = recorded_at_once()
+    columns = {**xyz(u, "goal_{}_m"), **xyz(z, "encoder_{}_m"), **xyz(z, "observed_{}_m")}
+    write(tmp_path / "log.csv", {"t_s": t, **columns})
+    found = survey(tmp_path / "log.csv")
+    assert found.roles is not None and list(found.run.sensors) == ["encoder"]
+    assert [why for _, why in found.roles.left_out] == ["the same numbers as encoder, at the same time"]
 
 
 def test_trials_one_below_another_are_no_signals(tmp_path: Path) -> None:
@@ -688,8 +698,8 @@ def test_a_clock_that_nothing_tells_from_the_lag_is_said_to_be_a_guess(log: Path
 
 def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:
     t, u, _, _ = recorded()
-    z = path(t - LAG) + np.random.default_rng(4).normal(0.0, 1e-4, u.shape)
-    columns = {f"camera{n}_{axis}_m": z[:, place] for n in (1, 2) for place, axis in enumerate("xy")}
+    z = path(t - LAG) + np.random.default_rng(4).normal(0.0, 1e-4, (2, *u.shape))
+    columns = {f"camera{n}_{axis}_m": z[n - 1, :, place] for n in (1, 2) for place, axis in enumerate("xy")}
     write(tmp_path / "log.csv", {"time_s": t, **columns, "goal_x_m": u[:, 0], "goal_y_m": u[:, 1]})
     found = survey(tmp_path / "log.csv").roles
     assert {one.name: [*one.axes] for one in found.sensors} == {"camera1": ["x", "y"], "camera2": ["x", "y"]}

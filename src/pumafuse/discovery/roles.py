@@ -210,7 +210,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
     may_measure = command.role != "reference"  # beside commands; another set point measures nothing
-    command, *kept = _in_order([command, *_raw(kept, left_out)], left_out)
+    command, *kept = _in_order([command, *_once(_raw(kept, left_out), left_out)], left_out)
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
     sensors = [stream for stream in kept if stream.role == "sensor"]
     references = [stream for stream in kept if stream.role == "reference"]
@@ -247,6 +247,20 @@ def _raw(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[
             left_out.append((replace(stream, axes={axis: stream.axes[axis] for axis in beside}), why))
         if axes := {axis: some for axis, some in stream.axes.items() if axis not in beside}:
             kept.append(replace(stream, axes=axes))
+    return kept
+
+
+def _once(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
+    """Sources without sensors that say again what another one of their table says: that is no second measurement."""
+    kept = list[Stream]()
+    for stream in streams:
+        beside = [other for other in kept if other.part.label == stream.part.label]
+        alike = [other for other in beside if stream.role == other.role == "sensor"]
+        again = (other for other in alike if stream.axes.keys() <= other.axes.keys() and _copies(other, stream))
+        if (first := next(again, None)) is None:
+            kept.append(stream)
+        else:
+            left_out.append((stream, f"the same numbers as {printable(first.name)}, at the same time"))
     return kept
 
 
@@ -650,9 +664,9 @@ def _is_namesake(command: Stream, stream: Stream) -> bool:
     return bool(names_of) and all(first == other and first[:1] != NAMELESS for first, other in names_of)
 
 
-def _copies(command: Stream, stream: Stream) -> bool:
-    """Whether a stream says again what is commanded just then, also where that changes: one that is late does not."""
-    told, source = command.source, stream.source
+def _copies(other: Stream, stream: Stream) -> bool:
+    """Whether a stream says again what another says just then, also where that changes: one that is late does not."""
+    told, source = other.source, stream.source
     order = np.argsort(told.stamp, kind="stable")
     rows = np.searchsorted(told.stamp[order], source.stamp, side="right") - 1
     return all(
