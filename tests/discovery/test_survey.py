@@ -434,6 +434,28 @@ def test_a_sensor_that_says_again_what_another_says_is_no_second_one(tmp_path: P
     assert [why for _, why in found.roles.left_out] == ["the same numbers as encoder, at the same time"]
 
 
+def many_joints(tmp_path: Path) -> list[str]:
+    """What a policy of 21 joints logs: what it puts out, set points made from that, and joints under other names."""
+    t = 0.02 * np.arange(600)
+    limbs, parts = ("left", "right", "rear"), ("hip", "thigh", "calf", "foot", "toe", "heel", "sole")
+    joints = [f"{limb}_{part}" for limb in limbs for part in parts]
+    pulse = np.linspace(0.5, 2.5, len(joints))
+    put_out = np.sin(t[:, None] * pulse + pulse)
+    seen = 0.2 * np.sin((t - LAG)[:, None] * pulse + pulse) + np.random.default_rng(3).normal(0.0, 1e-4, put_out.shape)
+    columns = {"t_s": t, **{f"action_net_{joint}": put_out[:, n] for n, joint in enumerate(joints)}}
+    columns |= {f"target_sent_{joint}": 0.2 * put_out[:, n] for n, joint in enumerate(joints)}
+    write(tmp_path / "log.csv", columns | {f"in_{n}: dof_pos_{joint}": seen[:, n] for n, joint in enumerate(joints)})
+    return joints
+
+
+def test_of_many_joints_the_ends_of_their_names_tell_which_is_which(tmp_path: Path) -> None:
+    """More pairs than could be compared by how they move."""
+    joints = many_joints(tmp_path)
+    relations = survey(tmp_path / "log.csv").relations
+    assert [axis.removeprefix("sent_") for _, axis in relations] == joints
+    assert {round(one.lag, 2) for one in relations.values()} == {LAG}
+
+
 def test_trials_one_below_another_are_no_signals(tmp_path: Path) -> None:
     """Where each part holds commands and measurements of the same axes, the words beside them tell runs apart."""
     t, u, z = recorded_at_once()

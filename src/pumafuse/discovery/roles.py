@@ -405,9 +405,7 @@ def streams_of(part: Part) -> list[Stream]:
 
 def _prefix(signals: Sequence[Signal], told: Set[str], taken: Set[str]) -> str:
     """What columns beside commands are called: by what all of them have before axes that are told, else measured."""
-    prefixes = {
-        signal.axis.removesuffix(axis) for signal in signals for axis in told if f"_{signal.axis}".endswith(f"_{axis}")
-    }
+    prefixes = {signal.axis.removesuffix(axis) for signal in signals for axis in told if _ends(signal.axis, axis)}
     return names.plain(prefixes.pop()) if len(prefixes) == 1 and prefixes != {""} else _free("measured", taken)
 
 
@@ -690,12 +688,16 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     """Axes of a stream by the names that the commands give them, by name or else by how they move; or why none is."""
     fits = {axis: signals for axis, signals in stream.axes.items() if axis in command.axes}
     fits = {axis: signals for axis, signals in fits.items() if _same_kind(command, axis, stream, axis)}
-    few, told, seen = len(command.axes) * len(stream.axes) <= _MOST_PAIRS, _bare(command.axes), _bare(stream.axes)
+    few, told = len(command.axes) * len(stream.axes) <= _MOST_PAIRS, _bare(command.axes)
     others = [axis for axis in stream.axes if axis not in fits and axis not in command.axes]
+    free = [axis for axis in command.axes if axis not in fits]
+    named = {(name, axis) for name, axis in product(others, free) if _ends(name, told[axis])}  # as p_RS_R_x is x
+    # Of joints names tell enough; coordinates may be another frame's.
+    few = few and not (_OF_POSE.isdisjoint(told.values()) and {axis for _, axis in named} == {*free})
     alike = [
         (name, axis)
-        for name, axis in product(others, [axis for axis in command.axes if axis not in fits])
-        if (few or seen[name] == told[axis]) and _same_kind(command, axis, stream, name)
+        for name, axis in product(others, free)
+        if (few or (name, axis) in named) and _same_kind(command, axis, stream, name)
     ]
     follows = {
         pair: relation.correlation
@@ -707,7 +709,6 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     pairs = {pair: abs(correlation) for pair, correlation in follows.items()}
     points = [name for name in others if name in _OF_POSE]
     least = {name: _OF_POINT if name in points and len(points) > 1 else SAME for name in others}
-    named = {(name, axis) for name, axis in pairs if axis in (seen[name], name.rpartition("_")[2])}  # as p_RS_R_x is x
     for name, axis in sorted(pairs, key=lambda pair: (pair in named, pairs[pair]), reverse=True):
         if pairs[name, axis] >= least[name] and axis not in fits and name in others:
             fits[axis] = stream.axes[name]
@@ -740,6 +741,11 @@ def _turned_point(
     if speeds is None or speeds.correlation < SAME:
         return {}
     return {axis: stream.axes[name] for axis, name in zip(CARTESIAN, moving, strict=True)}
+
+
+def _ends(axis: str, words: str) -> bool:
+    """Whether the name of an axis ends with some words."""
+    return f"_{axis}".endswith(f"_{words}")
 
 
 def _bare(axes: Iterable[str]) -> dict[str, str]:
