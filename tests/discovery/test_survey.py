@@ -456,6 +456,13 @@ def test_of_many_joints_the_ends_of_their_names_tell_which_is_which(tmp_path: Pa
     assert {round(one.lag, 2) for one in relations.values()} == {LAG}
 
 
+def test_set_points_are_what_is_followed_as_far_not_what_they_are_scaled_from(tmp_path: Path) -> None:
+    joints = many_joints(tmp_path)
+    found = survey(tmp_path / "log.csv")
+    assert of_roles(found)[0] == [f"target_sent_{joint}" for joint in joints]
+    assert not [question for question in asked(found) if "times as far" in question]
+
+
 def test_trials_one_below_another_are_no_signals(tmp_path: Path) -> None:
     """Where each part holds commands and measurements of the same axes, the words beside them tell runs apart."""
     t, u, z = recorded_at_once()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
@@ -594,13 +595,16 @@ def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
     return best, best.why or "others follow it"
 
 
-def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]:
-    """How many axes of others run behind a stream, each as far as its motion is the same; by how much, in all [s].
+def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float, float]:
+    """How many axes of others run behind a stream, each as far as its motion is the same.
+
+    Then by what factors they move less or more, in all, as a logarithm below 0, as they do of what set points are
+    scaled from; and by how much they run behind, in all [s].
 
     Less than half a row is at once, and what is later than an arm counts where names say that it is commanded. Where
     these are most axes, the others only seem late, as two bodies in one frame do that turn.
     """
-    count = late = 0.0
+    count = scaled = late = 0.0
     latest = LATEST if leader.role == "command" else MOST_LAG
     for other in streams:
         if other is not leader and other.role != "command":
@@ -613,8 +617,9 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float]
             behind = [relation for relation in alike if at_once < relation.lag < latest]
             if 2 * len(behind) >= len(alike):
                 count += sum(abs(relation.correlation) for relation in behind)
+                scaled -= sum(abs(math.log(abs(relation.slope))) for relation in behind)
                 late += sum(relation.lag for relation in behind)
-    return round(count, 1), late
+    return round(count, 1), round(scaled), late
 
 
 def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
