@@ -463,6 +463,14 @@ def test_set_points_are_what_is_followed_as_far_not_what_they_are_scaled_from(tm
     assert not [question for question in asked(found) if "times as far" in question]
 
 
+def test_a_command_that_leaps_away_decides_no_unit(tmp_path: Path) -> None:
+    t, u, z = recorded_at_once()
+    u[500, 1] *= 1000.0
+    write(tmp_path / "log.csv", {"t_s": t, **xyz(u, "sp_{}"), **xyz(z, "pv_{}")})
+    found = survey(tmp_path / "log.csv")
+    assert "are the numbers of log.csv in m? No name says it (run.toml)" in asked(found)
+
+
 def test_trials_one_below_another_are_no_signals(tmp_path: Path) -> None:
     """Where each part holds commands and measurements of the same axes, the words beside them tell runs apart."""
     t, u, z = recorded_at_once()

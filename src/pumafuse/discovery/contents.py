@@ -56,6 +56,7 @@ RANGES: dict[Kind, tuple[str, str, float]] = {  # small and large unit, and beyo
     "length": ("m", "mm", 10.0),
     "angle": ("rad", "deg", 2.0 * math.pi),
 }
+_USUALLY = 0.995  # share of the values of a column, among which there is none that leaps away
 _NUMBER = re.compile(r"\[?\d+\]?$")  # of a column in a list
 _OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
@@ -497,12 +498,17 @@ def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
             turns = names.turns(signal.column, signal.axis)
             alike = [other for other in signals if not other.unit and names.turns(other.column, other.axis) == turns]
             small, large, most = RANGES["angle" if turns else "length"]
-            largest = max(float(np.nanmax(np.abs(other.plain))) for other in alike)
+            largest = max(usual_size(other.plain) for other in alike)
             signal = replace(signal, unit=large if largest > most else small)
         if kind_of(f"_{signal.unit}") == "angle" and len(wraps(signal.value)):
             signal = replace(signal, turns=True, basis="turn" if signal.basis == "range" else signal.basis)
         in_units.append(signal)
     return tuple(in_units)
+
+
+def usual_size(plain: FloatArray) -> float:
+    """How large the numbers of a column are, a few that leap away apart."""
+    return float(np.nanquantile(np.abs(plain), _USUALLY))
 
 
 def _numeric_paths(table: Table) -> Iterator[str]:

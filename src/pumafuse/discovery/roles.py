@@ -22,7 +22,7 @@ from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
 from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
 from . import names
-from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, period_of, unused
+from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, period_of, unused, usual_size
 from .following import LATEST, Following, following
 from .matching import far_shift
 from .names import Role
@@ -814,7 +814,7 @@ def _ranged(stream: Stream, measured: Set[str]) -> Stream:
         plain = [
             signal.plain for axis in of_kind.keys() & measured for signal in of_kind[axis] if signal.basis == "range"
         ]
-        unit = large if max((float(np.nanmax(np.abs(values))) for values in plain), default=0.0) > most else small
+        unit = large if max(map(usual_size, plain), default=0.0) > most else small
         axes |= {axis: _in(signals, unit) for axis, signals in of_kind.items()} if plain else {}
     return replace(stream, axes=axes)
 
