@@ -29,7 +29,8 @@ _ROLES: dict[Role, frozenset[str]] = {
     "sensor": _DEVICES
     | words_in(
         "state states measured measurement measurements meas msr actual present real ist istwert pv process current"
-        " cur curr encoder encoders feedback fbk fb observed observation estimate estimated recorded reported odom"
+        " cur curr encoder encoders feedback fbk fb readback rbv observed observation estimate estimated recorded"
+        " reported odom"
     ),
 }
 # In the name of a topic or file these are something else.

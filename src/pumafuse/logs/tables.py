@@ -52,7 +52,10 @@ _SMOOTH, _ROUGH = 0.1, 0.5  # roughness of what follows from cell to cell; of wh
 _FIRST_ROWS = 100  # lines of a text, among which its rows begin
 _BESIDE = 3  # rows of numbers that make the line above them a header
 _COMMENT = re.compile(r"\s*(#|%|//)\s*")
-_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
+# In a text as rows of numbers have them; with blanks between cells, as EPICS writes them, a date is two.
+_NUMBER = re.compile(
+    r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf|\d{4}-\d\d-\d\d|\d\d:\d\d:\d\d([.,]\d+)?", re.IGNORECASE
+)
 _UNIT = re.compile(r"[\[(]?(|-|[µunm]?s|[µum]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(mm|m|deg|rad|°)/s²?)[\])]?")
 _ECHO = "%time,"  # begins the header that `rostopic echo -p` writes
 _TRANSFORMS = b"%time,field.transforms0."  # of /tf: a line has all transforms of a message, as many as it likes
