@@ -46,9 +46,9 @@ def swings(count: int = 900) -> tuple[FloatArray, FloatArray, FloatArray]:
     return t, u, z
 
 
-@pytest.mark.parametrize("away", [-35.0, 0.0, 0.05, 80.0])
+@pytest.mark.parametrize("away", [-35.0, 0.05])
 def test_an_arm_that_starts_elsewhere_starts_where_its_sensor_says(away: float, tmp_path: Path) -> None:
-    """35 mm below its first command, or 80 above: run.toml has the level; less than the noise and lag explain: not."""
+    """35 mm below its first command: run.toml has the level; less than the noise and lag explain: not."""
     t, u, z = swings()
     z = z + away * np.exp(-t / LATE) + np.random.default_rng(1).normal(0.0, 0.02, len(t))
     run, _ = written(survey(log(tmp_path, z, u)), tmp_path / "out")
@@ -58,6 +58,7 @@ def test_an_arm_that_starts_elsewhere_starts_where_its_sensor_says(away: float, 
     assert run.start["z"] == pytest.approx(1e-3 * (40.0 + away), abs=5e-4)
 
 
+@pytest.mark.long
 def test_one_command_follows_an_arm_that_homes(tmp_path: Path) -> None:
     """80 mm above its first command: no measurement is rejected, and the lag is right to 1 ms."""
     t, u, z = swings()
@@ -114,6 +115,7 @@ def test_an_encoder_at_rest_that_flickers_by_a_count_needs_no_gate(off: float, g
     assert sensors["actual"].gate == gate
 
 
+@pytest.mark.long
 def test_a_camera_whose_latency_steps_tells_nothing_of_the_arms_lag(tmp_path: Path) -> None:
     """40 ms late, from 18 s on 90 ms: said, with its sd, and the arm's lag is right to 2 ms beside an encoder.
 
@@ -138,7 +140,7 @@ def test_a_camera_whose_latency_steps_tells_nothing_of_the_arms_lag(tmp_path: Pa
         assert sensors["camera"].latency == pytest.approx(latency, abs=2e-3)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 1])
 def test_chance_makes_no_sensor_the_earliest(seed: int, tmp_path: Path) -> None:
     """A camera of a sixth of the rows and ten times the noise: the time of all is the encoder's, not the camera's."""
     rng = np.random.default_rng(seed)

@@ -41,7 +41,7 @@ def test_a_regression_at_a_shift_is_that_of_least_squares() -> None:
             assert np.sign(fits.correlation[axis, margin + shift]) == np.sign(slope)
 
 
-@pytest.mark.parametrize("shift", [-2.0, -0.7, 0.0, 0.31, 5.0])
+@pytest.mark.parametrize("shift", [-2.0, 0.31])
 def test_a_shift_is_found_between_the_bins(shift: float) -> None:
     """To a hundredth of a second, with bins of 28 ms and a sensor of 20 Hz."""
     rng = np.random.default_rng(2)
@@ -101,8 +101,7 @@ def tracking(measured: FloatArray, led: FloatArray | None = None, **more: float)
     return Tracking(TIME, measured, motion(TIME) if led is None else led, motion(TIME - LATER), **known)
 
 
-@pytest.mark.parametrize("zero", [0.05, -0.2])
-@pytest.mark.parametrize(("gain", "late"), [(1.0, 0.0), (0.8, 0.0), (1.3, 0.0), (1.0, 0.05), (0.9, -0.05)])
+@pytest.mark.parametrize(("zero", "gain", "late"), [(0.05, 1.3, 0.0), (-0.2, 0.9, -0.05)])
 def test_the_zero_is_the_constant_beside_gain_and_lag(zero: float, gain: float, late: float) -> None:
     """With its sign, to a few mm; without another zero there is none."""
     rng = np.random.default_rng(1)

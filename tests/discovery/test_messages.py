@@ -85,16 +85,15 @@ def moves(time: FloatArray) -> FloatArray:
     return ends[0] + np.sum(steps, axis=0)
 
 
-@pytest.mark.parametrize("kind", [TRAJECTORY, GOAL])
-def test_the_path_of_trajectories_is_the_commands(kind: str, tmp_path: Path) -> None:
-    """Trajectories, or goals with them, that name joints in another order and have 21 points: the lag is found."""
+def test_the_path_of_trajectories_is_the_commands(tmp_path: Path) -> None:
+    """Goals with trajectories that name joints in another order and have 21 points: the lag is found."""
     messages, time = [], np.arange(0.0, 11.0, 0.01)
     for n in range(3):
         since = 0.1 * np.arange(21)
         one = trajectory(
             ["wrist", "boom"], list(zip(since, moves(1.0 + 3.0 * n + since)[:, ::-1].tolist(), strict=True))
         )
-        messages.append(("/arm/execute", kind, START + 1.0 + 3.0 * n, {"trajectory": one} if kind == GOAL else one))
+        messages.append(("/arm/execute", GOAL, START + 1.0 + 3.0 * n, {"trajectory": one}))
     found = survey(bag(tmp_path / "log.mcap", [*messages, *states(["boom", "wrist"], moves(time - LAG), time)]))
     assert set(found.run.axes) == {"boom", "wrist"}
     assert found.run.kinds == {"boom": "angle", "wrist": "angle"}
@@ -146,9 +145,7 @@ def test_a_stream_of_trajectories_of_one_point_stays_commands_as_they_are_sent(t
     assert found.relations["joint_states", "boom"].lag == pytest.approx(LAG, abs=0.003)
 
 
-@pytest.mark.parametrize(
-    ("times", "reason"), [([0.0, 2.0, 1.0], "does not rise"), ([0.0, 1.0, 1.0], "does not rise"), ([0.0, 9e5], "a day")]
-)
+@pytest.mark.parametrize(("times", "reason"), [([0.0, 1.0, 1.0], "does not rise"), ([0.0, 9e5], "a day")])
 def test_a_trajectory_that_cannot_be_followed_is_left_out_with_the_reason(
     times: list[float], reason: str, tmp_path: Path
 ) -> None:
@@ -247,14 +244,3 @@ def test_a_type_without_a_definition_is_named(tmp_path: Path) -> None:
     refusal = one_line(RunError, lambda: survey(tmp_path / "a.mcap"))
     assert "/acme/setpoint: its messages cannot be decoded" in refusal
     assert "acme_msgs/msg/SetPoint" in refusal
-
-
-def test_topics_that_measure_no_position_are_named_where_nothing_else_does(tmp_path: Path) -> None:
-    """With the reason: a user sees that they were looked at."""
-    time, kind = np.arange(0.0, 11.0, 0.02), "sensor_msgs/msg/Imu"
-    sent = [
-        ("/goal_joints", "sensor_msgs/msg/JointState", *rest) for _, _, *rest in states(["lift"], moves(time), time)
-    ]
-    turning = [("/gyro", kind, START + t, {"angular_velocity": {"x": 0.1, "y": 0.0, "z": 0.2}}) for t in time]
-    said = one_line(RunError, lambda: survey(bag(tmp_path / "log.mcap", [*sent, *turning])))
-    assert "/gyro (no positions in messages of this type)" in said

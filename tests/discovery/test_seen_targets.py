@@ -71,15 +71,6 @@ def test_joints_of_which_few_run_behind_are_commanded(tmp_path: Path) -> None:
     assert set(found.run.sensors) and len(found.run.axes) == 5
 
 
-def test_a_target_that_leads_is_commanded(tmp_path: Path) -> None:
-    """The same names the other way round: what is called target runs ahead of what nothing names."""
-    time = np.arange(0.0, 40.0, 0.02)
-    write(tmp_path / "target.csv", time, path(time))
-    write(tmp_path / "base_link_hinge.csv", time, path(time - 0.06))
-    found = survey(tmp_path).roles
-    assert found.command.part.stem == "target"
-
-
 def test_a_motion_that_is_only_alike_is_not_fused(tmp_path: Path) -> None:
     """Of an axis that is as late as lags are looked for nothing is known: the line says what to write in run.toml."""
     time, log = np.arange(0.0, 60.0, 0.02), tmp_path / "log.csv"

@@ -56,7 +56,7 @@ def told(run: pf.Run, first: str = "encoder", second: str = "camera") -> Alignme
     return found
 
 
-@pytest.mark.parametrize(("rate", "dense"), [(30.0, 100.0), (5.0, 100.0), (5.0, 5.0), (100.0, 10.0)])
+@pytest.mark.parametrize(("rate", "dense"), [(5.0, 5.0), (100.0, 10.0)])
 def test_a_latency_is_found_whatever_the_rates(rate: float, dense: float) -> None:
     """The denser one is interpolated; which of both is asked for does not matter; outliers do not either."""
     run = recorded(rate=rate, dense=dense, outliers=0.01)
@@ -79,10 +79,9 @@ def test_intervals_hold() -> None:
     assert np.sqrt(np.mean(off**2)) > 0.3  # 0.51 if they are exact
 
 
-@pytest.mark.parametrize("scale", [0.96, -1.0, -1.05])
-def test_a_scale_costs_no_latency_on_a_path_in_one_direction(scale: float) -> None:
+def test_a_scale_costs_no_latency_on_a_path_in_one_direction() -> None:
     """40 s at constant speed with a rest at each end, where a scale that is not fitted is a latency of its own."""
-    rng = np.random.default_rng(3)
+    rng, scale = np.random.default_rng(3), -1.05
     t, s, x = np.arange(0.0, LENGTH, 0.02), np.arange(0.3, 59.0, 0.01), np.arange(0.5, 58.5, 0.03)
 
     def ramp(at: FloatArray) -> FloatArray:
@@ -110,11 +109,10 @@ def test_a_step_of_the_latency_is_named_and_a_steady_one_has_none() -> None:
     assert told(recorded(late=late), "camera", "encoder").steps[0].after == pytest.approx(-0.08, abs=5e-4)
 
 
-@pytest.mark.parametrize("dense", [100.0, 20.0])
-def test_jitter_is_told_from_noise(dense: float) -> None:
+def test_jitter_is_told_from_noise() -> None:
     """10 ms from row to row; the noise at rest is that of the sensor."""
     late = LATENCY + np.random.default_rng(9).normal(0.0, 0.01, 3000)
-    found = told(recorded(late=late, dense=dense))
+    found = told(recorded(late=late, dense=20.0))
     assert found.latency_sd == pytest.approx(0.01, rel=0.15)
     assert found.latency_ci95[0] < LATENCY < found.latency_ci95[1]
     assert not found.bunched
@@ -196,16 +194,6 @@ def test_what_leaves_and_returns_is_an_outlier_and_a_jerk_is_not() -> None:
     assert not isolated(t, value).any()
     value[[50, 120, 230]] += 20.0
     assert np.flatnonzero(isolated(t, value)).tolist() == [50, 120, 230]
-
-
-def test_a_row_that_is_measured_late_and_stamped_so_is_no_outlier() -> None:
-    """By its place among the rows it is 4 mm off, by its time it lies on the path of the others."""
-    rng, t = np.random.default_rng(5), np.arange(500) * 0.01
-    t[20::50] += 4e-3
-    value = np.sin(t) + rng.normal(0.0, 1e-5, len(t))
-    assert not isolated(t, value).any()
-    value[[75, 305]] += 0.01
-    assert np.flatnonzero(isolated(t, value)).tolist() == [75, 305]
 
 
 def test_a_row_that_is_stamped_late_is_no_outlier() -> None:
