@@ -29,14 +29,13 @@ def test_sources_are_parsed(text: str, expected: Address) -> None:
 
 
 REFUSED = {
-    "no source '.*'; there are: stdin": ["stdout", "", "replay", "udp", "http://127.0.0.1:80", "igtl:a", "udp:a:5005"],
-    r"expected \?speed=": ["replay:a?speed=0", "replay:a?speed=fast", "replay:a?x=1", "replay:a?"],
+    "no source '.*'; there are: stdin": ["", "replay", "http://127.0.0.1:80", "udp:a:5005"],
+    r"expected \?speed=": ["replay:a?speed=0", "replay:a?x=1"],
     "expected udp://HOST:PORT": [
-        *("udp://127.0.0.1", "udp://127.0.0.1:66000", "udp://127.0.0.1:port", "udp://[127.0.0.1:5005"),
-        *("udp://user@127.0.0.1:5005", "udp://127.0.0.1:5005/path"),
+        *("udp://127.0.0.1:66000", "udp://[127.0.0.1:5005", "udp://user@127.0.0.1:5005", "udp://127.0.0.1:5005/path"),
     ],
     "expected tcp://HOST:PORT": ["tcp://:5005", "tcp://127.0.0.1:0"],
-    "expected igtl://HOST": ["igtl://", "igtl://a/b", "igtl://a:b", "igtl://a:0", "igtl://a?time=sent"],
+    "expected igtl://HOST": ["igtl://a/b", "igtl://a:0", "igtl://a?time=sent"],
     r"expected rtde:run\.toml\?host=HOST": [
         *("rtde:run.toml", "rtde:run.toml?host=", "rtde:?host=a", "rtde:run.toml?port=3", "rtde:run.toml?host=a/b"),
     ],

@@ -50,9 +50,7 @@ def test_a_command_of_the_right_time_rules_out_a_reset() -> None:
     assert live.segment == 0
 
 
-@pytest.mark.parametrize(
-    "off", [{"camera": 30.0}, {"camera": -30.0}, {"camera": 86_400.0 * 365}, {"tracker": 30.0, "camera": 60.0}]
-)
+@pytest.mark.parametrize("off", [{"camera": -30.0}, {"tracker": 30.0, "camera": 60.0}])
 def test_sensors_of_other_clocks_disturb_nobody(off: dict[str, float]) -> None:
     """Wrong from the beginning on: no restart, and the estimate is that without them. Two do not confirm each other."""
     live, alone = pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)
@@ -105,22 +103,6 @@ def test_a_measurement_cannot_contradict_a_command() -> None:
     assert notices == []
 
 
-def test_an_axis_that_only_a_wild_command_gave_is_forgotten() -> None:
-    """Row gates look at axes that have begun: one that a wrong stamp began shuts no gate after it is taken back."""
-    config = pf.FusionConfig(
-        arm=CONFIG.arm, sensors={"tracker": pf.Sensor(sd=1e-4, gate=3.0)}, start=pf.Start(offset_sd=1e-5)
-    )
-    live, clean = pf.LiveEstimator(config), pf.LiveEstimator(config)
-    for step in range(150):
-        for one in (live, clean):
-            one.command(0.028 * step, radial=0.5)
-            one.measurement(0.028 * step + 0.01, "tracker", radial=0.5, vertical=0.1 + 0.01 * (step % 7))
-        if step == 50:
-            live.command(20.0, radial=0.5, vertical=0.9)
-    assert live.health().sensors["tracker"].outcomes == clean.health().sensors["tracker"].outcomes
-    assert live.estimate() == clean.estimate()
-
-
 def test_now_is_not_where_a_sensor_alone_has_run_to() -> None:
     """In doubt about a measurement 30 s ahead, now is where all others are, and they are not called stale."""
     live = pf.LiveEstimator(CONFIG)
@@ -135,8 +117,7 @@ def test_now_is_not_where_a_sensor_alone_has_run_to() -> None:
     assert (camera.silent, camera.outcomes["invalid"]) == (None, 1)
 
 
-@pytest.mark.parametrize("window", [1e-3, 0.3, 1.0, 2.0])
-@pytest.mark.parametrize("off", [0.03, 0.6, 0.95, -0.6, 1.5, 3.0])
+@pytest.mark.parametrize(("window", "off"), [(1e-3, 0.6), (0.3, -0.6), (1.0, 0.95), (2.0, 3.0)])
 def test_one_sensor_ahead_or_behind_never_restarts_the_filter(window: float, off: float) -> None:
     """Whatever the window: no restart, no command lost, and within a second either way no measurement either."""
     live = pf.LiveEstimator(CONFIG, window=window, start={"radial": 0.5})
@@ -197,7 +178,7 @@ def streamed(
 
 @pytest.mark.parametrize(
     ("by", "rate"),
-    [(0.12, 10.0), (0.9, 10.0), (0.12, 100.0), (0.3, 100.0), (0.5, 100.0), (1.8, 100.0), (0.3, 1000.0)],
+    [(0.9, 10.0), (0.12, 100.0), (1.8, 100.0)],
 )
 def test_all_clocks_that_are_set_back_begin_a_segment(by: float, rate: float) -> None:
     """As by NTP or a leap second: said with its size, nothing is lost nor counted twice, and estimates go on."""
@@ -212,28 +193,18 @@ def test_all_clocks_that_are_set_back_begin_a_segment(by: float, rate: float) ->
     assert tracker.rows == sum(tracker.outcomes.values()) == round(9.9 * rate)
 
 
-def test_without_a_sensor_more_commands_show_that_the_clock_is_set_back() -> None:
-    """Eight in a row; none is lost."""
-    live = pf.LiveEstimator(CONFIG)
-    for step in range(200):
-        live.command(0.028 * step - (0.4 if step >= 100 else 0.0), radial=0.5 + 1e-4 * step)
-        assert live.segment == (step >= 107)
-    assert live.health().commands["fused"] == 200
-
-
-@pytest.mark.parametrize("by", [0.06, 0.3, 0.9])
-def test_the_clock_of_one_sensor_that_is_set_back_is_said_once(by: float) -> None:
+def test_the_clock_of_one_sensor_that_is_set_back_is_said_once() -> None:
     """The others go on, in the same segment."""
-    live, notices, _ = streamed({"tracker": by})
+    live, notices, _ = streamed({"tracker": 0.06})
     (told,) = [one for one in notices if "step back" in one]
     assert told.startswith("sensor 'tracker': its stamps step back by")
-    assert float(told.split(" by ")[1].split(" s at")[0]) == pytest.approx(by, abs=0.002)
+    assert float(told.split(" by ")[1].split(" s at")[0]) == pytest.approx(0.06, abs=0.002)
     assert live.segment == 0
 
 
-@pytest.mark.parametrize("late", [slice(100, 104), slice(100, 112), slice(100, 130)])
-def test_commands_that_come_late_together_are_no_clock(late: slice) -> None:
+def test_commands_that_come_late_together_are_no_clock() -> None:
     """They fill a hole: what was missing is there, and the estimate is that of a stream in order."""
+    late = slice(100, 130)
     order = [*range(late.start), *range(late.stop, 170), *range(late.start, late.stop), *range(170, 300)]
     notices = list[str]()
     live, clean = pf.LiveEstimator(CONFIG, on_notice=notices.append), pf.LiveEstimator(CONFIG)
@@ -243,12 +214,3 @@ def test_commands_that_come_late_together_are_no_clock(late: slice) -> None:
             one.measurement(0.028 * step + 0.01, "tracker", radial=0.5 + 1e-4 * step)
     assert live.segment == 0 and not [one for one in notices if "clock" in one]
     assert live.estimate().axes == clean.estimate().axes
-
-
-def test_two_controllers_of_other_clocks_are_no_clock_that_is_set_back() -> None:
-    """One 0.3 s behind the other, their commands one after the other."""
-    live = pf.LiveEstimator(CONFIG)
-    for step in range(300):
-        live.command(0.028 * step, radial=0.5)
-        live.command(0.028 * step - 0.3, radial=0.5)
-    assert live.segment == 0

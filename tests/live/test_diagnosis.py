@@ -78,12 +78,9 @@ def zero_while_lost(one: Source) -> Source:
 
 
 SLIPS: dict[str, tuple[Callable[[Source], Source], str]] = {
-    "late": (later(0.5), "s late: it follows the commands of"),
     "early": (later(-1.5), "s early: it follows the commands of"),
     "exchanged": (exchanged, "follows on x the commands of y"),
     "inches": (larger(1.0 / 25.4), "are its values inch called mm"),
-    "twice": (larger(2.0), "times the position of x, y, z: is the unit"),
-    "against": (larger(-1.0), "moves against the commands of"),
     "turned": (turned, "looks turned by"),
 }
 
@@ -120,11 +117,10 @@ def longer_delay(config: pf.FusionConfig) -> pf.FusionConfig:
 @pytest.mark.parametrize(
     ("slip", "configured", "words", "size"),
     [
-        (later(0.05), lambda config: config, "ms too small (latency_ms, delay_ms or plant)", 50.0),
         (later(0.0), longer_delay, "ms too large (latency_ms, delay_ms or plant)", 70.0),
         (noisy, lambda config: config, "sd_mm is too small", None),
     ],
-    ids=["late by less than a look sees", "a delay of the arm", "noise"],
+    ids=["a delay of the arm", "noise"],
 )
 def test_innovations_that_are_too_large_are_explained_as_fuse_explains_them(
     slip: Callable[[Source], Source],
@@ -155,16 +151,6 @@ def mixed(one: Source) -> Source:
     return replace(one, values={axis: 0.9 * v + 0.1 * np.interp(t - 0.2, t, v) for axis, v in one.values.items()})
 
 
-def smoothed(one: Source) -> Source:
-    """A mean of five values."""
-    return replace(
-        one,
-        values={
-            axis: np.convolve(np.pad(v, (4, 0), "edge"), np.ones(5) / 5, "valid") for axis, v in one.values.items()
-        },
-    )
-
-
 def of_tracker(**keys: float) -> Callable[[pf.FusionConfig], pf.FusionConfig]:
     def configured(config: pf.FusionConfig) -> pf.FusionConfig:
         sensors = {"tracker": msgspec.structs.replace(config.sensors["tracker"], **keys)}
@@ -177,12 +163,10 @@ def of_tracker(**keys: float) -> Callable[[pf.FusionConfig], pf.FusionConfig]:
     ("slip", "configured", "words", "spoils"),
     [
         (mixed, of_tracker(), "the error turns with the direction", True),
-        (smoothed, of_tracker(), "ms too small (latency_ms, delay_ms or plant)", True),
         (later(0.0), of_tracker(gate=0.8), "were rejected: sd_mm", True),
         (later(0.0), of_tracker(sd=1e-4), "sd_mm is too large by a factor of", False),
-        (later(0.0), of_tracker(latency=-0.004), "ms too small (latency_ms, delay_ms or plant)", True),
     ],
-    ids=["an echo", "a mean", "a narrow gate", "noise that is too large", "a latency that is too small by 12 ms"],
+    ids=["an echo", "a narrow gate", "noise that is too large"],
 )
 def test_what_is_wrong_by_little_is_named_as_fuse_names_it(
     slip: Callable[[Source], Source],
@@ -212,16 +196,6 @@ def test_innovations_are_judged_by_the_noise_of_each_row() -> None:
 
     run, config = tracked()
     assert said(slipped(run, noisier), config)[0] == []
-
-
-def test_a_sensor_of_a_kilohertz_is_named_as_one_of_100_hz() -> None:
-    """Of a dense sensor some rows are looked at."""
-    run, config = tracked()
-    source = run.sensors["tracker"]
-    stamp = np.arange(source.stamp[0], source.stamp[-1], 1_000_000)
-    dense = Source(stamp, {axis: np.interp(stamp, *source.series(axis)) for axis in source.values}, "tracker")
-    notices, _ = said(slipped(replace(run, sensors={"tracker": dense}), exchanged), config)
-    assert len([one for one in notices if SLIPS["exchanged"][1] in one]) == 1
 
 
 def test_what_the_gate_keeps_out_makes_no_estimate_doubtful() -> None:
@@ -265,13 +239,12 @@ def clock_set_twice(by: float) -> tuple[list[str], pf.LiveEstimator, list[float]
     return [one for one in notices if "was its clock set" in one], live, [at / 1e9 for at in steps]
 
 
-@pytest.mark.parametrize("by", [0.1, 0.2, 0.8])
-def test_a_clock_that_is_set_ahead_is_named_within_ten_seconds(by: float) -> None:
+def test_a_clock_that_is_set_ahead_is_named_within_ten_seconds() -> None:
     """Once each time, by a look at what came since; that it is over nobody knows."""
-    told, live, steps = clock_set_twice(by)
+    told, live, steps = clock_set_twice(0.2)
     assert len(told) == 2
     for one, at in zip(told, steps, strict=True):
-        assert 0.0 < float(one.rsplit("(by ", 1)[1].split(" s)")[0]) - at < 10.0 + 2.0 * by
+        assert 0.0 < float(one.rsplit("(by ", 1)[1].split(" s)")[0]) - at < 10.0 + 2.0 * 0.2
     assert live.estimate().doubtful
 
 
@@ -279,23 +252,6 @@ def test_a_clock_that_is_set_back_is_said_once_by_its_stamps_or_by_its_motion() 
     """At once where stamps alone show it, as of 20 rows of 10 ms, which is said the first time; 4 rows do not."""
     assert ["go on there" in one for one in clock_set_twice(-0.2)[0]] == [True]
     assert ["go on there" in one for one in clock_set_twice(-0.045)[0]] == [False, False]
-
-
-def test_at_rest_nothing_shows_that_a_fault_is_over() -> None:
-    """The commands stop: the sensor may be as wrong as before."""
-    run, config = tracked()
-    run = slipped(run, exchanged)
-    rest = run.command.stamp[-1] + 28_000_000 * np.arange(1, 1500)
-    values = {axis: np.append(value, np.full(len(rest), value[-1])) for axis, value in run.command.values.items()}
-    tracker = run.sensors["tracker"]
-    seen = tracker.stamp[-1] + 10_000_000 * np.arange(1, 4000)
-    noise = 5e-5 * np.random.default_rng(2).standard_normal(len(seen))
-    measured = {axis: np.append(value, value[-1] + noise) for axis, value in tracker.values.items()}
-    command = replace(run.command, stamp=np.append(run.command.stamp, rest), values=values)
-    sensors = {"tracker": replace(tracker, stamp=np.append(tracker.stamp, seen), values=measured)}
-    notices, live = said(replace(run, command=command, sensors=sensors), config)
-    assert not [one for one in notices if "shows no more" in one]
-    assert len([one for one in live.health().faults if SLIPS["exchanged"][1] in one]) == 1
 
 
 def test_a_sensor_that_is_taken_again_is_said_and_doubted_at_once() -> None:
@@ -332,14 +288,14 @@ def test_the_wire_says_which_axes_are_doubtful() -> None:
         assert expected or told == [None] * len(told)
 
 
-GOOD = ("fast-arm", "panel-tracker-outage", "panel-vision", "saturating-servo", "smooth-disturbance", "tool-with-play")
+GOOD = ("panel-tracker-outage", "tool-with-play")
+OTHERS = ("fast-arm", "panel-vision", "saturating-servo", "smooth-disturbance")
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
-@pytest.mark.parametrize("name", GOOD)
-def test_a_good_stream_says_nothing(name: str, seed: int) -> None:
+@pytest.mark.parametrize("name", [*GOOD, *(pytest.param(name, marks=pytest.mark.long) for name in OTHERS)])
+def test_a_good_stream_says_nothing(name: str) -> None:
     """With outliers, outages, play and limits that the model has."""
-    sim = pf.simulate(pf.Scenario.load(ROOT / "scenarios" / f"{name}.toml"), seed)
+    sim = pf.simulate(pf.Scenario.load(ROOT / "scenarios" / f"{name}.toml"), 1)
     notices, live = said(sim.run, sim.config)
     assert notices == [] and live.health().faults == ()
 
@@ -348,17 +304,6 @@ def test_the_shipped_scan_says_nothing() -> None:
     """Though `fuse` of 20 s of it says that the lag of x is 6 ms too large: a detail, and NIS is 0.9 to 1.1."""
     notices, live = said(replace(pf.Run.read(SCAN), reference=None), scan()[1])
     assert notices == [] and live.health().faults == ()
-
-
-def test_error_bars_that_are_too_wide_are_no_fault_of_a_stream() -> None:
-    """The arm strays ten times less than the configuration has it: `fuse` of a log names it, a stream does not."""
-    run, config = tracked()
-    process = {
-        axis: msgspec.structs.replace(one, drift=10.0 * one.drift, input_noise=10.0 * one.input_noise)
-        for axis, one in config.process.items()
-    }
-    notices, _ = said(run, msgspec.structs.replace(config, process=process))
-    assert not notices
 
 
 @pytest.mark.long

@@ -93,19 +93,13 @@ def test_a_late_measurement_within_the_window_is_fused_and_beyond_it_is_too_late
     [
         ("lidar", {"radial": 0.57}, "unknown", "accepted: tracker, camera"),
         ("traker", {"radial": 0.57}, "unknown", "did you mean 'tracker'"),
-        ("", {"radial": 0.57}, "unknown", "unknown sensor"),
-        ("tracker", {"radal": 0.57}, "unknown", "did you mean 'radial'"),
         ("tracker", {}, "unknown", "gives no axis"),
         ("camera", {"vertical": 0.1}, "unknown", "no such sensor or axis"),
         ("tracker", {"radial": math.nan}, "invalid", "not a finite position"),
-        ("tracker", {"radial": math.inf}, "invalid", "not a finite position"),
         ("tracker", {"radial": 1e300}, "invalid", "not a finite position"),
-        ("tracker", {"radial": "much"}, "invalid", "not a finite position"),
-        ("tracker", {"radial": None}, "invalid", "not a finite position"),
         ("tracker", {"radial": 10**400}, "invalid", "not a finite position"),
         ("tracker", {"radial": "0.57"}, "invalid", "not a finite position"),
         ("tracker", {"radial": True}, "invalid", "not a finite position"),
-        (None, {"radial": 0.57}, "unknown", "unknown sensor"),
         (["tracker"], {"radial": 0.57}, "unknown", "unknown sensor"),
         ("camera", {"radial": 0.9}, "rejected", "gate"),
     ],
@@ -168,31 +162,16 @@ def test_silence_only_makes_the_estimate_less_certain() -> None:
     "wrong",
     [
         {"window": 0.0},
-        {"window": math.nan},
         {"window": "2"},
         {"stale_after": -1.0},
         {"start": {"radal": 0.1}},
         {"start": {"radial": math.nan}},
-        {"start": {"radial": "a"}},
     ],
 )
 def test_what_is_wrong_at_the_start_is_refused(wrong: dict) -> None:
     """One clear line, as for files."""
     with pytest.raises(pf.PumafuseError, match=r"window|stale_after|radal|start"):
         pf.LiveEstimator(CONFIG, **wrong)
-
-
-def test_x_and_y_mean_nothing_before_the_frame_has_its_place() -> None:
-    """A frame about the base waits for a command in x and y; on the base's axis there is no place. x alone is none."""
-    live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=Cylindrical()))
-    told = live.measurement(0.0, "tracker", x=0.1, y=0.5)
-    assert told.outcome is pf.Outcome.BEFORE_START
-    assert "where x and y are" in told.reason
-    assert live.command(0.01, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
-    assert live.command(0.03, x=0.1, y=0.5).outcome is pf.Outcome.FUSED
-    assert live.estimate().outcome is pf.Outcome.FUSED
-    half = live.measurement(0.04, "tracker", x=0.1)
-    assert dict(half.axes) == dict.fromkeys(("tangential", "radial"), pf.Outcome.INVALID)
 
 
 def test_commands_beyond_the_models_limits_are_said() -> None:
@@ -273,8 +252,7 @@ def test_missing_commands_are_counted(lost: int, said: bool) -> None:
         assert f"one is due every {PERIOD * 1e3:g} ms), the longest gap is {2 * PERIOD:.3g} s" in found[0]
 
 
-@pytest.mark.parametrize("copied", [False, True], ids=["of one path", "one repeats the other"])
-@pytest.mark.parametrize("later", [0.006, 0.009, 0.02])
+@pytest.mark.parametrize(("copied", "later"), [(False, 0.02), (True, 0.006)])
 def test_two_senders_are_named_and_no_command_is_called_missing(later: float, copied: bool) -> None:
     """Two nodes, each at the arm's period: said once, with both intervals; recorded as live."""
     notices: list[str] = []

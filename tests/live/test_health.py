@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -180,31 +179,3 @@ def test_all_outcomes_are_counted() -> None:
     assert health.unknown == 2
     assert health.commands["fused"] + health.commands["duplicate"] == 400
     assert health.segments == 1
-
-
-def test_a_slower_sensor_has_a_new_usual_interval() -> None:
-    """From 100 to 20 Hz: some dropouts until that is usual, then none; the first interval may be any."""
-    live = pf.LiveEstimator(CONFIG)
-    times = np.concatenate(([0.0], 1.9 + 0.01 * np.arange(1000), 11.9 + 0.05 * np.arange(1000)))
-    dropouts = []
-    for t in times.tolist():
-        live.command(t, radial=0.57)
-        live.measurement(t, "tracker", radial=0.57)
-        dropouts.append(live.health().sensors["tracker"].dropouts) if t == times[1200] else None
-    assert dropouts == [live.health().sensors["tracker"].dropouts]
-    assert dropouts[0] < 60
-
-
-def test_the_cameras_dropouts_are_counted() -> None:
-    """The shipped scan's camera misses some 5 % of its rows: as many gaps as its stamps have, the tracker none."""
-    data = files("pumafuse") / "data"
-    run, config = pf.Run.read(str(data / "scan1")), pf.FusionConfig.load(str(data / "fusion.toml"))
-    live = pf.LiveEstimator(config)
-    for event in events_of(run):
-        feed(live, event)
-    interval = np.diff(run.sensors["vision"].stamp)
-    gaps = int(np.sum(interval > 1.5 * np.median(interval)))
-    assert gaps > 80
-    health = live.health().sensors
-    assert health["vision"].dropouts == pytest.approx(gaps, abs=2)  # the first twenty intervals tell what is usual
-    assert health["tracker"].dropouts == health["range"].dropouts == 0

@@ -153,21 +153,6 @@ elbow = { column = "position[elbow]", unit = "rad", turn_deg = 360.0 }
     assert np.nanmax(run_read.sensors["encoder"].values["elbow"]) > 2.0 * math.pi
 
 
-def test_angles_about_three_axes_and_sums(tmp_path: Path) -> None:
-    """Roll, pitch and yaw in degrees of a vector; a position that is the sum of two fields; a shift of the clock."""
-    sent = list[Sent]()
-    for k, place in enumerate(MOTION):
-        at = START + STEP * k
-        fields = {"header": header(at), "twist": {"linear": xyz(place), "angular": xyz(90.0 * place)}}
-        sent.append(("/pose6", "geometry_msgs/msg/TwistStamped", at, fields))
-    entry = """topic = "/pose6"
-time = { column = "header.stamp", shift_s = 0.25 }
-x = [{ column = "twist.linear.x", unit = "m" }, { column = "twist.linear.y", unit = "mm" }]
-orientation = { euler = ["twist.angular.x", "twist.angular.y", "twist.angular.z"], convention = "rpy", unit = "deg" }
-"""
-    assert_equal(written(tmp_path, f"[command]\n{entry}[sensors.s]\n{entry}", sent))
-
-
 def test_trajectories_as_time_goes_by(tmp_path: Path) -> None:
     """A new trajectory ends the one before when it begins, not when it comes; one without points stops it."""
     kind, sent = "trajectory_msgs/msg/JointTrajectory", list[Sent]()

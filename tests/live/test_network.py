@@ -70,20 +70,6 @@ class TestUdpListener:
         assert any(f"{shed} of measurements shed so far" in one for one in self.notices)
         assert f"{len(lines)} datagrams taken in, 0 lost, {shed} shed" in self.source.summary()
 
-    @pytest.mark.usefixtures("hasty")
-    def test_what_waited_in_a_pause_is_not_shed(self) -> None:
-        """The reader stands still for a while and catches up: it is said, and nothing is missing."""
-        self.start()
-        sent = [b"%d" % number for number in range(3000)]
-        self.send(sent)
-        lines = self.source.get()
-        time.sleep(0.1)
-        lines += until(self.source, lambda found: len(lines) + len(found) == len(sent))
-        assert lines == sent
-        assert any("datagrams wait for" in one for one in self.notices)
-        self.source.stop()
-        assert "shed" not in self.source.summary()
-
     def test_datagrams_are_lines(self) -> None:
         """One line or several a datagram, in their order; silence is no lines; what waits at the end comes, too."""
         self.start()
@@ -92,16 +78,6 @@ class TestUdpListener:
         lines = [*self.source.get(), *self.source.stop()]
         assert [float(line) for line in lines if line] == [half / 2 for half in range(200)]
         assert "100 datagrams taken in, 0 lost" in self.source.summary()
-
-    @pytest.mark.parametrize(("bound", "most"), [("_MOST", 10), ("_MOST_BYTES", 20)])
-    def test_the_oldest_are_dropped_and_counted(self, monkeypatch: pytest.MonkeyPatch, bound: str, most: int) -> None:
-        """When too many wait, or too many bytes, what remains is the newest."""
-        monkeypatch.setattr(backlog, bound, most)
-        self.start()
-        self.send([b"%02d" % number for number in range(50)])
-        assert [int(line) for line in until(self.source, lambda found: b"49" in found)] == list(range(40, 50))
-        self.source.stop()
-        assert "10 datagrams taken in, 40 lost" in self.source.summary()
 
     @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell what they dropped")
     def test_what_the_system_drops_is_counted(self) -> None:
@@ -214,24 +190,6 @@ class TestTcpClient:
         source.stop()
         assert [float(line) for line in lines] == [0, 0.5, 1, 1.5, 2, 2.5]
         assert "connections made: 3" in source.summary()
-
-    def test_it_waits_longer_and_longer(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Half a second, twice that, up to half a minute."""
-        waits: list[float] = []
-        source = TcpClient(Address.parse("tcp://127.0.0.1:9"), lambda _: None)
-
-        def wait(seconds: float) -> None:
-            waits.append(seconds)
-            if len(waits) == 9:
-                source._end()
-
-        def nobody(*_: object) -> None:
-            raise ConnectionRefusedError(111, "Connection refused")
-
-        monkeypatch.setattr(source._stopped, "wait", wait)
-        monkeypatch.setattr(network.socket, "create_connection", nobody)
-        source._stay_connected()
-        assert waits == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0]
 
 
 def test_estimates_are_datagrams() -> None:

@@ -107,12 +107,8 @@ def record_says_what_live_said(
 @pytest.mark.parametrize(
     ("late", "rate", "seconds"),
     [
-        ("vision", None, 10.0),
-        ("tracker", 100.0, 10.0),
         ("tracker", 100.0, 8.0),  # its last row is valid before the last tick, and stamped behind it
-        ("commands", 100.0, 10.0),
         ("all", None, 10.0),
-        ("all", 100.0, 10.0),
     ],
 )
 def test_a_record_of_late_rows_is_as_live(tmp_path: Path, late: str, rate: float | None, seconds: float) -> None:
@@ -229,25 +225,6 @@ def test_a_reset_clock_begins_another_record(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "record.2" / "commands.csv").read_text() == "mine"
 
 
-def test_an_axis_without_a_number_is_none_of_the_run(recorded: Recorded) -> None:
-    """Commands and measurements whose other axis is always null: a run of one axis, which fuses."""
-    recorded.live.measurement(0, "tracker", radial=np.nan)
-    for step in range(50):
-        recorded.live.command(step * T, radial=0.57, vertical=np.nan)
-        recorded.live.measurement(step * T + 10_000_000, "tracker", radial=0.57, vertical=np.nan)
-        recorded.live.measurement(step * T + 10_000_001, "tracker", radial=np.nan)
-    found = recorded.close()
-    assert found.axes == ("radial",)
-    assert len(found.sensors["tracker"].stamp) == 100  # that it saw nothing is a row, too
-    pf.fuse(found, TRACKED)
-
-
-def test_a_record_of_nothing_leaves_nothing(recorded: Recorded) -> None:
-    """A service that cannot start makes no folder at each try."""
-    recorded.recorder.close(None)
-    assert not recorded.folder.exists()
-
-
 def test_rows_that_a_run_may_not_have_are_left_out_and_counted(recorded: Recorded) -> None:
     """A command 1.5 s behind its predecessors is fused live, but would be a new segment of a recorded run."""
     recorded.go(100)
@@ -308,20 +285,6 @@ def test_a_full_disk_is_reported_and_nothing_is_written_twice(
     assert found.notes == ()
     assert found.command.stamp.tolist() == [step * T for step in range(40)]
     assert len(found.sensors["tracker"].stamp) == 40
-
-
-def test_a_trouble_that_lasts_is_reported_every_minute(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At once, and then once a minute."""
-    recorded.go(10)
-    recorded.recorder._writer.trouble = "the disk is full"
-    now = [1000.0]
-    monkeypatch.setattr(record.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(recorded.recorder._writer, "hand_over", lambda _: True)
-    for _ in range(300):
-        now[0] += 0.6
-        recorded.recorder.tick(recorded.live.sure)
-    assert sum("the disk is full" in text for text in recorded.notices) == 3
-    recorded.recorder._writer.close()
 
 
 def test_rows_beyond_what_may_wait_are_lost_and_counted(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -186,7 +186,6 @@ def test_a_robot_that_hangs_up_is_called_again(robot: Callable[..., Robot]) -> N
         ({"version": 1}, RUN, "does not know version 2"),
         ({"types": {"timestamp": "DOUBLE", "target_q": "VECTOR6D"}}, RUN, "no variable actual_q, target_TCP_pose"),
         ({"types": TYPES | {"target_q": "DOUBLE"}}, RUN, "no column target_q_2"),
-        ({"types": TYPES | {"target_q": "VECTOR9"}}, RUN, "no variable target_q"),
         ({}, RUN.replace(', unit = "s"', ""), "column 'timestamp' has no unit"),
     ],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -15,7 +14,6 @@ from scipy.spatial.transform import Rotation
 import pumafuse as pf
 from pumafuse.fusion.config import Placement
 from pumafuse.fusion.placing import with_tool
-from pumafuse.live.export import header
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import BadLine, Event, LineDecoder
 from pumafuse.logs.frames import Rotated
@@ -118,28 +116,17 @@ FRAMED = msgspec.structs.replace(
 ALL_RUNS = pytest.mark.parametrize("run", [RUN, NOISY], ids=["even", "noisy"])
 
 
-def test_an_orientation_without_noise_is_not_used_live_either() -> None:
-    """Of a sensor without a deviation of its attitude: a replay is as live, and as without it."""
-    lengths = {axis: SD[axis] for axis in "xyz"}
-    mocap = msgspec.structs.replace(CONFIG.sensors["mocap"], sd=lengths)
-    config = msgspec.structs.replace(KNOWN, sensors={**KNOWN.sensors, "mocap": mocap})
-    replay_is_as_live(RUN, config)
-    mute = replace(RUN, sensors={**RUN.sensors, "mocap": replace(RUN.sensors["mocap"], orientation=None)})
-    some, none = (pf.fuse(run, config, mode="as-live") for run in (RUN, mute))
-    np.testing.assert_array_equal(some["x"].position, none["x"].position)
-
-
 def test_in_a_frame_of_the_arm() -> None:
     """What sensors and commands tell in x, y, z becomes the arm's tangential, radial and vertical, as offline."""
     offline, live = pf.fuse(NOISY, FRAMED), pf.LiveEstimator(FRAMED)
     assert differences(live, delayed(events_of(NOISY), 1.2, seed=2), offline, 1.45) == []
 
 
-@pytest.mark.parametrize(("longest", "run"), [(0.0, RUN), (1.2, RUN), (1.2, NOISY)], ids=["in order", "even", "noisy"])
-def test_in_any_order(longest: float, run: pf.Run) -> None:
+@ALL_RUNS
+def test_in_any_order(run: pf.Run) -> None:
     """Each event up to 1.2 s late, a tenth twice: the offline estimates, also of what the commands place."""
     offline, live = pf.fuse(run, KNOWN), pf.LiveEstimator(KNOWN)
-    expected = fused_in_any_order(run, offline, live, longest)
+    expected = fused_in_any_order(run, offline, live, 1.2)
     for sensor in ("mocap", "tracker", "camera"):
         assert expected[sensor]["fused"] > 400
         assert expected[sensor]["rejected"] < 40
@@ -195,7 +182,7 @@ def test_orientations_on_the_wire() -> None:
         LineDecoder({**ARM.kind_of, "q": "length"}, framed=False)
 
 
-@pytest.mark.parametrize("q", ["[0, 0, 1]", '"north"', '[0, 0, 0, "1"]', "[0, 0, 0, NaN]", "[0, 0, 0, 1, 0]", "1.0"])
+@pytest.mark.parametrize("q", ["[0, 0, 1]", '[0, 0, 0, "1"]', "[0, 0, 0, NaN]"])
 def test_a_line_with_a_q_of_another_form_has_a_reason(q: str) -> None:
     """Each is refused with a reason that names it, or is no JSON."""
     with pytest.raises(BadLine, match=r"\.q|not JSON"):
@@ -205,16 +192,12 @@ def test_a_line_with_a_q_of_another_form_has_a_reason(q: str) -> None:
 @pytest.mark.parametrize(
     "orientation",
     [
-        np.array(1.0),
         np.eye(4),
         [[0], 0, 0, 1],
         [0.0, 0.0, 0.0, 0.0],
-        [0.0, 0.0, 1.0],
         "north",
         [0.0, 0.0, 0.0, math.nan],
         [0, 0, 0, 1.2],
-        1.0,
-        None,
     ],
 )
 def test_what_is_no_orientation_is_refused(orientation: object) -> None:
@@ -263,9 +246,3 @@ def test_a_command_that_turns_too_far_is_refused() -> None:
         assert (result.outcome is pf.Outcome.FUSED) == taken
     assert "170°" in result.reason
     assert ["beyond 120°" in text for text in said] == [True]
-
-
-def test_a_header_says_that_the_placing_is_not_in_it() -> None:
-    """As of a [frame]: a controller gives events of the tool point, along the base's axes."""
-    text = header(KNOWN, "filter", "fusion.toml")
-    assert "the reference of its [tool]; frame and marker of mocap, tracker are not in here" in text
