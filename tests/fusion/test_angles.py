@@ -248,7 +248,7 @@ def test_one_run_may_have_both(tmp_path: Path) -> None:
     assert msgspec.structs.asdict(again) == pytest.approx(msgspec.structs.asdict(score), rel=1e-13)  # by way of degrees
 
 
-@pytest.mark.parametrize("mode", [{}, {"mode": "as-live"}, {"mode": "smoothed"}, {"engine": "filterpy"}])
+@pytest.mark.parametrize("mode", [{"mode": "smoothed"}, {"engine": "filterpy"}])
 def test_a_sensor_within_a_turn_is_as_good_as_one_that_counts_them(mode: dict[str, Any]) -> None:
     """Estimates are those of the same measurements without the jumps by 360°, and so is the skill."""
     whole, within = (pf.fuse(*mixed(turns), **mode) for turns in (0.0, 1.0))
@@ -269,9 +269,7 @@ def within(yaw: np.ndarray) -> np.ndarray:
     return (yaw + 180.0) % 360.0 - 180.0
 
 
-@pytest.mark.parametrize("rate", [-200.0, -60.0, 45.0, 600.0])
-@pytest.mark.parametrize("noise", [0.0, 0.3])
-@pytest.mark.parametrize("turns", [1, 2])
+@pytest.mark.parametrize(("rate", "noise", "turns"), [(-200.0, 0.3, 2), (45.0, 0.3, 1), (600.0, 0.0, 1)])
 def test_angles_that_begin_anew_are_known(rate: float, noise: float, turns: int) -> None:
     """Slowly and fast, also where noise goes to and fro across the turn: every row in which a turn is counted.
 
@@ -289,12 +287,9 @@ def test_angles_that_begin_anew_are_known(rate: float, noise: float, turns: int)
 @pytest.mark.parametrize(
     "angle",
     [
-        np.repeat([0.0, 300.0, 0.0, 300.0], 50),
         np.repeat([-179.0, 179.0], 50) * np.repeat([1.0, 0.5], 50),
-        np.random.default_rng(2).uniform(-180.0, 180.0, 300),
         np.repeat(np.random.default_rng(3).uniform(-180.0, 180.0, 60), 5),
         np.full(50, np.nan),
-        np.arange(3.0),
     ],
 )
 def test_steps_are_no_turns(angle: np.ndarray) -> None:
@@ -330,10 +325,12 @@ def turning(turn_deg: float = 0.0) -> pf.FusionConfig:
     return pf.FusionConfig.parse({"arm": arm, "process": {"input_noise_deg_rtHz": 0.3}, "sensors": sensors})
 
 
-@pytest.mark.parametrize("turn", [", turn_deg = 360", ', unit = "deg", turn_deg = 360.0'])
-def test_columns_within_a_turn_go_on_beside_the_commands(turn: str, tmp_path: Path) -> None:
+def test_columns_within_a_turn_go_on_beside_the_commands(tmp_path: Path) -> None:
     """Wherever a source begins, with ``turn_deg`` it gives what one gives that counts its turns."""
-    whole, made = turned(tmp_path / "whole", "whole"), turned(tmp_path / "made", "within", turn, turn)
+    whole, made = (
+        turned(tmp_path / "whole", "whole"),
+        turned(tmp_path / "made", "within", ', unit = "deg", turn_deg = 360.0', ', unit = "deg", turn_deg = 360.0'),
+    )
     for one, other in zip(
         (whole.command, *whole.sensors.values(), whole.reference),
         (made.command, *made.sensors.values(), made.reference),
@@ -384,10 +381,8 @@ def test_two_rejected_measurements_on_both_sides_of_the_turn_agree() -> None:
     ("sd", "gate_rows", "wanted"),
     [
         ({"yaw": 1e-3}, None, False),
-        ({"x": 1e-3}, None, True),
         (1e-3, None, True),
         ({"yaw": 1e-3}, True, True),
-        (1e-3, False, False),
     ],
 )
 def test_an_encoder_for_each_axis_is_gated_apart(
@@ -400,13 +395,8 @@ def test_an_encoder_for_each_axis_is_gated_apart(
 WRONG = [  # with the keys of angles, what is replaced by what, and what is said
     ("sd_deg = { a", "sd_mm = { a", "sensors.eye.sd_mm: no axis of the arm is an angle|sensors.eye.sd_mm.*give sd_deg"),
     ("input_noise_deg_rtHz", "input_noise_mm_rtHz", "input_noise_mm_rtHz.*input_noise_deg_rtHz"),
-    ("disturbance_sd_deg", "disturbance_sd_mm", "process.b.disturbance_sd_mm.*disturbance_sd_deg"),
-    ("offset_sd_deg", "offset_sd_mm", "start.offset_sd_mm.*offset_sd_deg"),
     ("sd_deg = { a", "# sd_deg = { a", "'sensors.eye.sd_deg' is missing; accepted: sd_deg, .*bias_sd_deg"),
-    ("sd_deg = { a", "sd_degs = { a", "unknown key 'sensors.eye.sd_degs'; .*'sd_deg'"),
-    ("offset_sd_deg", "offset", "unknown key 'start.offset'; .*offset_sd_deg"),
     ("sd_deg = { a = ", "sd_deg = { a = 10000000000000", r"sensors.eye.sd_deg: must be <= 5.72958e\+10"),
-    ("offset_sd_deg = ", "offset_sd_deg = -", "start.offset_sd_deg: must be >= 0"),
 ]
 
 
@@ -424,19 +414,10 @@ def test_a_unit_of_the_other_kind_is_refused_with_the_right_one(
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_a_turn_is_of_angles(folders: dict[str, Path]) -> None:
-    """``turn_deg`` of a sensor that measures no angle is refused."""
-    arm = pf.ArmModel.load(folders["mm"] / "arm.toml")
-    with pytest.raises(pf.ConfigError, match=r"sensors\.gauge\.turn_deg: no axis of the arm is an angle"):
-        pf.FusionConfig(arm=arm, sensors={"gauge": pf.Sensor(sd=1e-3, turn=2.0 * math.pi)})
-
-
 @pytest.mark.parametrize(
     ("unit", "right", "wrong", "said"),
     [
         ("deg", "max_speed_deg_s", "max_speed_m_s", r"validity\.max_speed_m_s: no axis .*; give max_speed_deg_s$"),
-        ("mm", "max_speed_m_s", "max_speed_deg_s", r"validity\.max_speed_deg_s: no axis .*; give max_speed_m_s$"),
-        ("deg", "update_period_ms = 20.0", "update_period_ms = 0.0005", r"update_period_ms: must be >= 0\.001$"),
         ("deg", "delay_ms = 30.0", "delay_ms = 2e7", r"delay_ms: must be <= 1e\+07$"),
     ],
 )
@@ -449,18 +430,3 @@ def test_a_limit_of_the_other_kind_and_a_number_out_of_bounds_are_refused(
     (tmp_path / "arm.toml").write_text(text.replace(right, wrong))
     with pytest.raises(pf.ConfigError, match=rf"arm\.toml: {said}"):
         pf.ArmModel.load(tmp_path / "arm.toml")
-
-
-def test_columns_of_the_other_kind_are_refused(folders: dict[str, Path], tmp_path: Path) -> None:
-    """A run in mm does not go with an arm of angles, nor a sensor in mm with commands in degrees."""
-    config = pf.FusionConfig.load(folders["deg"] / "fusion.toml")
-    with pytest.raises(pf.RunError, match=r"a is a length, the arm 'bench' says an angle"):
-        pf.fuse(pf.Run.read(folders["mm"]), config)
-    write_run(tmp_path, "deg")
-    old = '"eye.csv"\ntime = "time_s"\na = "a_deg"'
-    for name, other in (("eye.csv", "a_deg"), ("run.toml", old)):
-        text = (tmp_path / name).read_text()
-        assert other in text
-        (tmp_path / name).write_text(text.replace(other, other.replace("a_deg", "a_mm")))
-    with pytest.raises(pf.RunError, match=r"column 'a_mm' is a length, but a is an angle elsewhere"):
-        pf.Run.read(tmp_path)

@@ -44,14 +44,12 @@ def with_all_commands(run: pf.Run, since: float, until: float) -> pf.Run:
     return replace(cut(run, since, until), command=cut(run, -np.inf, until).command, start=run.start)
 
 
-@pytest.mark.parametrize("how", [*MODES, "filterpy"])
-@pytest.mark.parametrize("case", PARTS.values(), ids=PARTS.keys())
+@pytest.mark.parametrize(("case", "how"), list(zip(PARTS.values(), MODES, strict=True)), ids=PARTS)
 def test_a_part_is_the_conditional_gaussian_given_its_measurements(case: Case, how: str) -> None:
     """In mid-motion: means, error bars and innovations given all commands, and what is stamped from 150 to 360 ms."""
     run, config = case.made()
-    more = {"engine": "filterpy"} if how == "filterpy" else MODES[how]
     with warned(run.between(0.15, 0.36), config):
-        est = pf.fuse(run.between(0.15, 0.36), config, rate=case.rate, **more)
+        est = pf.fuse(run.between(0.15, 0.36), config, rate=case.rate, **MODES[how])
     times, oracle = nanoseconds(est), AxisOracle(with_all_commands(run, 0.15, 0.36), config, "radial")
     grid = GRID if case.rate is None else np.rint(np.arange(99) * 1e9 / case.rate).astype(np.int64)
     ends = [one.stamp if how == "as_live" else one.valid for one in oracle.measurements]
@@ -59,7 +57,7 @@ def test_a_part_is_the_conditional_gaussian_given_its_measurements(case: Case, h
     assert times.tolist() == grid[(grid >= 150 * MS) & (grid <= last)].tolist()
     assert 0 < len(oracle.measurements) < sum(len(source.stamp) for source in run.sensors.values())
     check_innovations(est.measurements, oracle)
-    check_estimates(est["radial"], getattr(oracle, "filtered" if how == "filterpy" else how)(times))
+    check_estimates(est["radial"], getattr(oracle, how)(times))
 
 
 @quiet

@@ -112,7 +112,7 @@ def test_rows_of_all_segments_are_added() -> None:
     assert sum(est.command_counts.values()) == len(run.command.stamp)
 
 
-@pytest.mark.parametrize("how", [{"mode": "smoothed"}, {"mode": "as-live"}, {"engine": "filterpy"}], ids=str)
+@pytest.mark.parametrize("how", [{"mode": "as-live"}, {"engine": "filterpy"}], ids=str)
 def test_counts_agree_with_the_outcomes_of_components(how: dict[str, object]) -> None:
     """A sensor of one axis: its rows are its components, in every mode of either engine."""
     scan, conf = pf.Run.read(SCAN).between(0.0, 2.0), pf.FusionConfig.load(FUSION)

@@ -1,16 +1,11 @@
 """Logs at the edge of sense: infinities, frames, clocks, references that fit nothing. Each is said, none breaks."""
 
-import re
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 import pumafuse as pf
 from pumafuse.fusion import results
-from pumafuse.logs.axes import in_axes
 from pumafuse.logs.frames import Cylindrical
-from pumafuse.views.figures import error_figure, validation_figure
 from refusals import one_line
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -54,12 +49,6 @@ def test_an_infinite_command_is_no_radius():
     assert pf.fuse(run, config()).radius == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("start", [{"x": 0.5}, {"y": 0.5}])
-def test_half_a_start_level_is_refused(start):
-    with pytest.raises(pf.RunError, match="start"):
-        in_axes(replace(arc(), start=start), None)
-
-
 def test_a_sensor_in_x_y_without_a_frame_is_refused():
     """Its axes are none of the arm's."""
     run = pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]}, {"camera": ([0.01], {"x": [0.5], "y": [0.0]})})
@@ -92,34 +81,6 @@ def test_a_second_segment_keeps_the_frame_of_the_run():
     assert est["tangential"].position[-1] == pytest.approx(0.1)
 
 
-def small(shift=0.0, spoil=0.0):
-    time = 10 + 0.028 * np.arange(60)
-    seen = 10 + 0.01 * np.arange(1, 100)
-    sight = 0.5 + spoil * np.where(np.arange(99) % 2, 1.0, -1.0)
-    return pf.Run.from_arrays(
-        time,
-        {"radial": np.full(60, 0.5)},
-        {"camera": (seen, {"radial": sight})},
-        (seen + shift, {"radial": np.full(99, 0.5)}),
-    )
-
-
-def test_a_reference_that_covers_nothing_makes_no_picture():
-    assert error_figure(pf.fuse(small(shift=1000.0), config())) is None
-
-
-def test_innovations_all_beyond_the_histogram_make_no_warning():
-    assert validation_figure(pf.fuse(small(spoil=1.0), config(gate=0.0))) is not None
-
-
-def test_no_variance_leaves_a_readable_folder(tmp_path):
-    run = replace(small(), sensors={}, reference=replace(small().reference, values={"radial": np.full(99, 0.5001)}))
-    sure = {"radial": pf.Process(input_noise=0.0, drift=0.0)}
-    est = pf.fuse(run, pf.FusionConfig(arm=ARM, start=pf.Start(offset_sd=0.0), process=sure))
-    results.write(est, tmp_path / "out", False)
-    results.read(tmp_path / "out")
-
-
 def test_a_reference_s_own_noise_scales_like_a_measurement_s():
     """Scoring: the tangential variance of a reference at r is (sd R0/r)²."""
     time = 0.028 * np.arange(60)
@@ -138,9 +99,3 @@ def test_a_reference_s_own_noise_scales_like_a_measurement_s():
     table = results.reference_table(est.reference, est.config)
     np.testing.assert_allclose(table["tangential.position_sd_mm"], 0.5 / x)
     np.testing.assert_allclose(table["radial.position_sd_mm"], 1.0)
-
-
-def test_an_axis_that_was_not_fused_is_named_with_those_that_were():
-    """Asking the estimates for another axis is one line that lists them."""
-    est = pf.fuse(pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]}, name="short"), config())
-    assert re.search(r"run 'short'.*'nothing'.*radial", one_line(pf.UnknownNameError, lambda: est["nothing"]))

@@ -81,8 +81,6 @@ def test_the_segments_of_a_run_are_counted_together() -> None:
     ("scenario", "said"),
     [
         ("saturating-servo", "joint: fastest speed: about 365 deg/s, up to which its lag holds"),
-        ("tool-with-play", "wrist: play: about 3.4 deg, half of which over its speed adds to its lag"),
-        ("sagging-lever", "sag: above about 40 deg it moves about 0.898 times as far as elsewhere"),
         ("wrong-latency", ""),
     ],
 )

@@ -100,9 +100,7 @@ def test_across_a_turn_sds_shrink_by_the_sine(est: pf.Estimates) -> None:
     np.testing.assert_allclose(found[0], 1e-4 * np.diag([np.sin(1.0) ** 2, np.sin(1.0) ** 2, 1.0]), atol=1e-16)
 
 
-@pytest.mark.parametrize(
-    "frame", [Cylindrical(base=(0.1, -0.2), positive="clockwise"), Cylindrical(), Rotated(azimuth=0.5)]
-)
+@pytest.mark.parametrize("frame", [Cylindrical(base=(0.1, -0.2), positive="clockwise"), Rotated(azimuth=0.5)])
 def test_with_a_frame_positions_and_their_covariance_are_in_the_log(frame: Frame, config: pf.FusionConfig) -> None:
     """Axes drawn with their sds lie in x, y, z as the covariance says: within 2 % of the largest variance."""
     names, est = ("tangential", "radial", "vertical"), turning.commanded(config, frame)

@@ -116,7 +116,7 @@ def test_a_configuration_is_made_of_a_dict_or_a_text() -> None:
             pf.FusionConfig.parse({}, arm)  # pyright: ignore
 
 
-@pytest.mark.parametrize("number", [np.float64(0.5), np.float32(0.5), np.int64(1), np.array(0.5), 1, 0.5])
+@pytest.mark.parametrize("number", [np.float32(0.5), np.array(0.5)])
 def test_numbers_of_numpy_are_numbers(number: Any) -> None:
     """As `np.std` gives them; what is parsed can be written."""
     arm = {**ARM, "name": np.str_("arm"), "provenance": {"sd": number}}
