@@ -83,7 +83,7 @@ def test_the_noise_that_is_likely_is_what_second_differences_show(search: ArmSea
     assert search.likely_noise == pytest.approx({"camera": shown}, rel=0.02)
 
 
-@pytest.mark.parametrize(("gain", "kind"), [(1.0, "given"), (0.9, "static"), (0.5, "static"), (2.0, "static")])
+@pytest.mark.parametrize(("gain", "kind"), [(1.0, "given"), (2.0, "static")])
 def test_the_simplest_arm_that_is_likely_is_taken(gain: float, kind: str) -> None:
     """First order in all; a gain is found to a hundredth of itself."""
     found = ArmSearch(measured(2, gain, 2e-3 * gain), Freedom(Arm(0.0, 0.1)), [1e-6])

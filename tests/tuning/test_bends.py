@@ -53,8 +53,8 @@ def found(seed: int, true: Arm, free: tuple[str, ...] = FREE) -> Bent | None:
 
 
 def seeds(count: int) -> list[Any]:
-    """So many, of which two are quick tests."""
-    return [*range(2), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, count))]
+    """So many, of which the first is a quick test."""
+    return [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, count))]
 
 
 @pytest.mark.parametrize("seed", seeds(12))
@@ -63,10 +63,9 @@ def test_a_linear_arm_gets_neither(seed: int) -> None:
     assert found(seed, arm_of(seed)) is None
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_linear_arm_gets_neither_by_chance(seed: int) -> None:
+def test_a_linear_arm_gets_neither_by_chance() -> None:
     """With 94 measurements one of them leaves less in both halves by chance, but not a tenth less."""
-    recorded = measured(seed, arm_of(seed))
+    recorded = measured(1, arm_of(1))
     few = recorded.of([one.of(slice(None, None, 8)) for one in recorded.recordings])
     plain = plain_arm(few)
     assert plain is not None and bent_arm(plain, Arm(0.0, 0.1), FREE) is None
@@ -92,7 +91,7 @@ def wandering(seed: int, comes_back: float, smooth: int) -> Measured:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("seed", "comes_back", "smooth"), [(0, 0.3, 3), (6, 0.3, 3), (16, 1.0, 2)])
+@pytest.mark.parametrize(("seed", "comes_back", "smooth"), [(6, 0.3, 3), (16, 1.0, 2)])
 def test_an_arm_that_wanders_smoothly_gets_neither(seed: int, comes_back: float, smooth: int) -> None:
     """An error that goes on for long is alike in both halves, so that play seems to predict it."""
     recorded = wandering(seed, comes_back, smooth)
@@ -100,7 +99,7 @@ def test_an_arm_that_wanders_smoothly_gets_neither(seed: int, comes_back: float,
     assert plain is not None and bent_arm(plain, Arm(0.0, 0.1), FREE) is None
 
 
-@pytest.mark.parametrize("seed", seeds(8))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_play_is_found(seed: int) -> None:
     """A tenth of the range, within 15 % by least squares alone; and less is left where it was not fitted.
 
@@ -113,7 +112,7 @@ def test_play_is_found(seed: int) -> None:
     assert bent.off > float(np.std(measured(seed, true).left(bent.arm)))
 
 
-@pytest.mark.parametrize("seed", seeds(8))
+@pytest.mark.parametrize("seed", seeds(4))
 def test_a_fastest_speed_is_found(seed: int) -> None:
     """Six tenths of the fastest commanded, within 3 %."""
     fastest = 0.6 * RANGE * 2.0 * math.pi
@@ -130,8 +129,10 @@ def test_both_are_found() -> None:
     assert bent.arm.max_speed == pytest.approx(0.6 * RANGE * 2.0 * math.pi, rel=0.03)
 
 
-@pytest.mark.parametrize("beyond", [-0.95, -0.3, 0.3])
-@pytest.mark.parametrize("seed", seeds(6))
+@pytest.mark.parametrize(
+    ("seed", "beyond"),
+    [(0, 0.3), (1, -0.95), *(pytest.param(*one, marks=pytest.mark.long) for one in ((2, -0.3), (4, 0.3), (5, -0.95)))],
+)
 def test_a_sag_is_found(seed: int, beyond: float) -> None:
     """Where an axis stalls, hangs back or runs ahead: the knee within 5 % of the range, the slope within 10 %."""
     knee = RANGE * (-0.4, -0.2, 0.0, 0.2, 0.4, 0.55)[seed]
@@ -144,7 +145,7 @@ def test_a_sag_is_found(seed: int, beyond: float) -> None:
     assert bent.off < 0.95 * bent.linear_off
 
 
-@pytest.mark.parametrize("seed", seeds(4))
+@pytest.mark.parametrize("seed", seeds(2))
 def test_stops_on_both_sides_are_found(seed: int) -> None:
     """At -0.5 and 0.6 of the range, where a servo stalls; both within 2 % of it, and no play."""
     knees = {"knee": 0.6 * RANGE, "beyond": -0.95, "knee_below": -0.5 * RANGE, "below": -0.95}
@@ -172,17 +173,10 @@ def test_what_holds_for_many_rows_is_looked_at() -> None:
     assert bent.arm.beyond == pytest.approx(-0.95, abs=0.05)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_gain_that_is_not_free_is_no_sag(seed: int) -> None:
+def test_a_gain_that_is_not_free_is_no_sag() -> None:
     """A straight line explains what a gain of 0.85 leaves; knees explain it no better."""
-    true = arm_of(seed)._replace(gain=0.85)
-    bent = found(seed, true, tuple(name for name in FREE if name != "gain"))
-    assert bent is None or bent.arm.beyond == bent.arm.below == 0.0
-
-
-def test_no_load_moves_a_tool_many_times_as_far() -> None:
-    """Four times as far above a level is another fault: nothing is said of a load."""
-    bent = found(1, arm_of(1, knee=0.0, beyond=3.0))
+    true = arm_of(1)._replace(gain=0.85)
+    bent = found(1, true, tuple(name for name in FREE if name != "gain"))
     assert bent is None or bent.arm.beyond == bent.arm.below == 0.0
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 import pumafuse as pf
-from tuning_runs import fit_stage, later, outage, quietly, replaced, scenario, spoiled, with_sensors
+from tuning_runs import fit_stage, outage, quietly, replaced, scenario, spoiled, with_sensors
 
 AXES = ("tangential", "vertical")
 Off = float | dict[str, float]
@@ -32,8 +32,7 @@ def found_biases(run: pf.Run, config: pf.FusionConfig) -> dict[tuple[str, str], 
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, later(2), later(3)])
-@pytest.mark.parametrize("off", [3e-4, {"tangential": 3e-4, "vertical": -3e-4}, 0.6, -0.6], ids=str)
+@pytest.mark.parametrize(("off", "seed"), [({"tangential": 3e-4, "vertical": -3e-4}, 1), (3e-4, 2), (-0.6, 3)], ids=str)
 def test_a_constant_on_the_worse_sensor_is_found(off: Off, seed: int) -> None:
     """0.3 mm, less than its noise, or 600 mm: on each axis within 3 sd, which is below 0.1 mm; the other has none.
 
@@ -80,11 +79,10 @@ def test_hardly_any_false_bias_is_found_in_60_runs() -> None:
     assert false <= 1
 
 
-@pytest.mark.parametrize(("fixed", "off"), [("bias_sd_mm", 3e-4), ("sensors.vision", 0.6)])
-def test_a_fixed_sensor_gets_no_bias(fixed: str, off: float) -> None:
+def test_a_fixed_sensor_gets_no_bias() -> None:
     """The result has none and no note on one."""
-    run, config = recorded(off)
-    found = fit_stage(run, config, ("noise",), fixed)
+    run, config = recorded(0.6)
+    found = fit_stage(run, config, ("noise",), "sensors.vision")
     assert widths(found.best.config) == {"tracker": 0.0, "vision": 0.0}
     assert not [note for note in found.notes if "bias" in note]
 

@@ -12,10 +12,11 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.stats import multivariate_normal
 
 import pumafuse as pf
-from pumafuse.tuning.intervals import ConfidenceInterval, Profile, _Side, _views, confidence_intervals
+from pumafuse.tuning.intervals import ConfidenceInterval, Profile, _Side, _views, confidence_intervals, lag_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise, maximise_with_gates, point
 from pumafuse.tuning.parameters import Fit, changed, moved, rounded, with_own_delays
+from pumafuse.tuning.summary import fitted_lags
 from tuning_runs import contains, fit_stage, free_of, intervals_of, outage, scenario, spoiled, spoiled_arm
 
 ROOT = 1.96  # √(2 · 1.92): the root of twice the drop at an end
@@ -83,8 +84,7 @@ def test_a_profile_is_followed_from_the_inside() -> None:
 # ---- against likelihoods without a filter ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sd_prior", [False, True], ids=["alone", "with its prior"])
-@pytest.mark.parametrize("count", [12, 40, 3000])
+@pytest.mark.parametrize(("count", "sd_prior"), [(12, True), (40, False)])
 def test_a_lone_sd_has_the_interval_of_white_noise(count: int, sd_prior: bool) -> None:
     """L(σ) = −n ln σ − Σz²/2σ²: both ends where that has dropped by 1.92.
 
@@ -144,13 +144,12 @@ def profile_of_drift(values: np.ndarray, drift: float) -> float:
     return -float(best.fun)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_profile_is_the_one_of_the_joint_gaussian(seed: int) -> None:
+def test_a_profile_is_the_one_of_the_joint_gaussian() -> None:
     """A walk under noise, both unknown: at each end of the drift's interval its profile has dropped by 1.92 (± 8 %).
 
     The other number is where it is most likely given the first; the best point is the highest of a global search.
     """
-    values = walking(1e-3, seed)
+    values = walking(1e-3, 1)
     likelihood, config = at_rest(values, drift=3e-3, sd=1e-3)
     best, found = intervals(likelihood, config, "sensors.eye.sd_mm.tip", "process.tip.drift_mm_rts")
     density = dense(values)
@@ -264,6 +263,7 @@ def test_ends_beside_many_parameters_are_where_their_profile_has_dropped() -> No
     assert np.mean(share < 0.9) <= 0.04 and np.mean(share > 1.1) <= 0.10
 
 
+@pytest.mark.long
 def test_an_interval_contains_the_result() -> None:
     """Not at an end, also where gates stop the search beside the maximum for fixed outcomes, or at a noise of 0."""
     sim = outage(2)
@@ -302,7 +302,7 @@ def shares(
     fit: Sequence[Fit],
     wrong: Callable[[pf.FusionConfig], pf.FusionConfig],
 ) -> tuple[dict[str, float], float]:
-    """For each parameter the share of runs in which its interval contains the truth, and the share over all.
+    """For each parameter and lag the share of runs in which its interval contains the truth, and the share over all.
 
     Without disturbances, as is true: an interval is one of the model that was chosen. A parameter that less than half
     of the runs have, as a delay of an axis's own, gets no share.
@@ -315,6 +315,11 @@ def shares(
         for one in found.free:
             known = one.configured(sim.config) is not None  # else the plant is of another order
             inside[one.key].append(known and contains(ends[one.key], one, sim.config))
+        around = lag_intervals(found.likelihood, found.best, found.free)
+        for axis, one in fitted_lags(found.free, sim.config, found.best.config, around).items():
+            low, high = one.lag_ms_ci95
+            assert low is not None and high is not None and low < one.lag_ms < high
+            inside[f"lag of {axis}"].append(low <= 1e3 * sim.config.arm.lag_of(axis) <= high)
     every = [hit for hits in inside.values() for hit in hits]
     often = {key: float(np.mean(hits)) for key, hits in inside.items() if len(hits) >= len(seeds) / 2}
     return often, float(np.mean(every))
@@ -338,9 +343,10 @@ def test_coverage_of_an_arm_over_25_runs() -> None:
     """Noise, delay and plant by a tracker with an outage and a camera, the arm too slow and too late to begin with.
 
     One standard deviation of a share of 95 % in 25 is 4.4 %: each number's is at least 82 %, and all together in 92 to
-    98 %. A plant of the wrong order counts as not contained.
+    98 %. A plant of the wrong order counts as not contained. Of the 50 lags at least 88 % are (sd of a share: 3.1 %).
     """
     each, together = shares(scenario("panel-tracker-outage"), range(1, 26), ("noise", "delay", "plant"), spoiled_arm)
     assert {"axes.tangential.damping", "axes.vertical.time_constant_ms"} <= set(each)
     assert all(share >= 0.82 for share in each.values()), each
     assert 0.92 <= together <= 0.98, each
+    assert np.mean([each["lag of tangential"], each["lag of vertical"]]) >= 0.88

@@ -291,24 +291,6 @@ def test_the_score_is_the_derivative_of_the_log_likelihood(order: int) -> None:
     assert steep > 0.6 * len(free)
 
 
-def test_numpy_asks_no_enumeration_for_attributes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would lose a Ctrl-C that comes meanwhile (numpy issue 14801), which happened once in 200 searches."""
-    likelihood, at, config = far_from_the_maximum(1)
-    asked: list[str] = []
-
-    def spy(_: type, name: str) -> None:
-        asked.append(name)
-        raise AttributeError(name)
-
-    monkeypatch.setattr(type(pf.Outcome), "__getattr__", spy, raising=False)
-    _ = np.zeros(3) == pf.Outcome.REJECTED
-    assert asked
-    asked.clear()
-    free = free_of(likelihood, config, ALL)
-    derivatives(likelihood, point(likelihood, config, free, at.outcomes), free)
-    assert not [name for name in asked if name.startswith("__array")]
-
-
 WITH_NOISE = Case(
     {"radial": AxisModel(plant=UNDER, gain=pf.Gain(slope=0.05, intercept=1.1), gain_recovery=0.06)},
     process=pf.Process(input_noise=3e-4, drift=2e-3, maneuver_noise=2e-3, maneuver_drift=1e-2),
@@ -398,15 +380,6 @@ def test_misfit_is_the_distance_from_the_best_sensor() -> None:
     for sds in ({"tracker": 1e-4, "camera": 5e-3}, {"camera": 5e-3, "tracker": 1e-4}):
         run, config = at_rest(1, sds)
         assert Likelihood([run], config).misfit(config) == {"radial": pytest.approx(1e-4, rel=0.15)}
-
-
-def test_a_sensor_that_froze_in_a_run_has_no_scatter() -> None:
-    """In one of two runs: it is left out, and a sensor that scatters in both is not."""
-    well, config = at_rest(1, {"tracker": 1e-4, "camera": 5e-3})
-    frozen, _ = at_rest(2, {"tracker": 1e-4, "camera": 0.0})
-    both = {(name, "radial") for name in ("tracker", "camera")}
-    assert set(Likelihood([well], config).scatter) == both
-    assert set(Likelihood([well, frozen], config).scatter) == {("tracker", "radial")}
 
 
 def test_measurements_are_as_far_from_the_noiseless_arm_as_from_the_oracles() -> None:

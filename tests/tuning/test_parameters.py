@@ -71,8 +71,7 @@ def test_what_can_be_fitted() -> None:
     assert parameters(SHARED, SHARED, SENSORS, ["bias"]) == []  # no bias drifts
 
 
-@pytest.mark.parametrize("damping", [0.39, 0.41])
-@pytest.mark.parametrize("noise", ["input_noise", "maneuver_noise"])
+@pytest.mark.parametrize(("noise", "damping"), [("input_noise", 0.39), ("maneuver_noise", 0.41)])
 def test_a_plant_that_rings_is_given_no_noise(noise: str, damping: float) -> None:
     """What it has stays free; what an axis drifts is not meant; nor is a plant that is damped well."""
     config = with_process(CONFIG, input_noise=0.0, maneuver_noise=0.0, drift=0.0)
@@ -100,7 +99,7 @@ def test_a_noise_is_believed_within_a_factor_and_not_below_what_is_resolved() ->
     assert free["sensors.camera.sd_mm.vertical"].bounds == noise.bounds == unbounded
 
 
-@pytest.mark.parametrize("scale", [1.0, -1.0, 0.06, 1e3])
+@pytest.mark.parametrize("scale", [-1.0, 0.06])
 def test_a_scale_stays_within_half_of_what_is_configured(scale: float) -> None:
     """So it is never 0, and never turns its sign."""
     config = replaced(CONFIG, sensors={**CONFIG.sensors, "tracker": replaced(TRACKER, scale=scale)})
@@ -170,7 +169,7 @@ def test_a_name_fixes_what_it_names_and_only_that(name: str) -> None:
     assert names(name) == names() - gone == {key for key in names() if not is_fixed(key, [name])}
 
 
-@pytest.mark.parametrize("wrong", ["drift", "tracker.camera", "sd_mm.tracker", "radia", "", "process.radial.sd_mm"])
+@pytest.mark.parametrize("wrong", ["drift", "sd_mm.tracker", "process.radial.sd_mm"])
 def test_a_name_that_names_nothing_is_refused_with_the_parts_that_do(wrong: str) -> None:
     """Parts of words, parts in the wrong order, parts that never occur together; the message has the accepted parts."""
     with pytest.raises(pf.ConfigError) as refused:

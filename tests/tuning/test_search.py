@@ -17,7 +17,6 @@ from pumafuse.tuning.maximise import maximise_with_gates, point
 from pumafuse.tuning.parameters import Parameter, changed, moved, with_arm
 from tuning_runs import (
     fit_stage,
-    later,
     outage,
     quietly,
     replaced,
@@ -45,21 +44,20 @@ def test_where_it_starts_does_not_matter() -> None:
     assert max(totals) - min(totals) < 0.1
 
 
-@pytest.mark.parametrize("gain", [later(0.35), 1.8])
-def test_a_gain_far_from_1_is_fitted_with_everything_else(gain: float) -> None:
+def test_a_gain_far_from_1_is_fitted_with_everything_else() -> None:
     """As of a servo under a load: no step of noise or arm is lost at a bound of the gain."""
     t, s = np.arange(0.0, 20.0, 0.028), np.arange(0.0, 19.9, 0.01)
     axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))
     arm = pf.ArmModel(name="lever", update_period=0.028, delay=0.05, axes={"tip": axis})
     config = pf.FusionConfig(arm=arm, sensors={"camera": pf.Sensor(sd=1e-4)})
     u = 0.05 * np.sin(2.0 * t) + 0.03 * np.sin(3.1 * t + 0.4 * t**1.1)
-    true = replaced(axis, gain=pf.Gain(intercept=gain))
+    true = replaced(axis, gain=pf.Gain(intercept=1.8))
     told, valid = (np.rint(time * 1e9).astype(np.int64) for time in (t, s))
     z = response(true, 0.028, 0.08, told, u, 0.0, valid)
     z += np.random.default_rng(3).normal(scale=1e-4, size=len(s))
     run = pf.Run.from_arrays(t, {"tip": u}, {"camera": (s, {"tip": z})})
     stage = fit_stage(run, config, ("noise", "delay", "plant", "gain"))
-    assert stage.best.config.arm.axes["tip"].gain.intercept == pytest.approx(gain, rel=0.02)
+    assert stage.best.config.arm.axes["tip"].gain.intercept == pytest.approx(1.8, rel=0.02)
     noisy = with_sensors(stage.best.config, sd=5e-4)
     again = maximise_with_gates(stage.likelihood, noisy, stage.free)
     assert again.log_posterior == pytest.approx(stage.best.log_posterior, abs=0.1)
@@ -95,12 +93,7 @@ sensors.tracker = {{ rate_hz = 100.0, sd_mm = 0.1, latency_ms = 8.0 }}
 
 
 @pytest.mark.parametrize(
-    ("amplitude", "fastest", "seed"),
-    [
-        pytest.param(20.0, 1.0, 2, marks=pytest.mark.long),
-        pytest.param(20.0, 1.0, 7, marks=pytest.mark.long),
-        (5.0, 2.0, 2),
-    ],
+    ("amplitude", "fastest", "seed"), [pytest.param(20.0, 1.0, 7, marks=pytest.mark.long), (5.0, 2.0, 2)]
 )
 def test_delay_and_lag_are_identified(amplitude: float, fastest: float, seed: int, tmp_path: Path) -> None:
     """A sweep, from an arm 21 ms too early and 18 ms too fast: as likely as the truth at least, and within 5 ms of it.
@@ -142,8 +135,7 @@ def best_of_all(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("gate_rows", [True, False], ids=["rows", "components"])
-@pytest.mark.parametrize(("seed", "generations"), [(4, 25), (5, 200), (6, 200)])
+@pytest.mark.parametrize(("gate_rows", "seed", "generations"), [(True, 5, 200), (False, 4, 25)])
 def test_nothing_higher_is_found_by_differential_evolution(seed: int, generations: int, gate_rows: bool) -> None:
     """Noise of two axes with 6 % of outliers, from a poor start: within 0.1 of a global search's best."""
     sim = with_outliers(seed, 0.06)
@@ -155,11 +147,10 @@ def test_nothing_higher_is_found_by_differential_evolution(seed: int, generation
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2])
-def test_no_arm_is_likelier_to_differential_evolution(seed: int) -> None:
+def test_no_arm_is_likelier_to_differential_evolution() -> None:
     """Noise, delay and plant of one axis, by a tracker and a camera; the plant of the order that was chosen."""
-    sim = outage(seed)
+    sim = outage(1)
     config = spoiled_arm(sim.config)
     found = fit_stage(sim.run, config, ("noise", "delay", "plant"), "tangential")
     assert len(found.free) >= 8
-    assert found.best.log_posterior > best_of_all(found.likelihood, found.best.config, found.free, seed, 200) - 0.1
+    assert found.best.log_posterior > best_of_all(found.likelihood, found.best.config, found.free, 1, 200) - 0.1

@@ -62,7 +62,7 @@ def stage(truth: pf.FusionConfig, seed: int, one_delay: bool = False) -> Stage:
     return run_stage([measured(truth, seed)], start, Plan(("delay", "plant"), (), one_delay=one_delay))
 
 
-@pytest.mark.parametrize("seed", [1, later(2), later(3), later(4)])
+@pytest.mark.parametrize("seed", [1, later(2)])
 def test_the_same_delay_is_found_as_one(seed: int) -> None:
     """One number of the arm and none of any axis; the truth is in its interval, and every lag in its own."""
     found = stage(known(), seed)
@@ -77,7 +77,7 @@ def test_the_same_delay_is_found_as_one(seed: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_another_delay_stays_the_axis_own(seed: int) -> None:
     """An axis that is 12 ms later than the two others is not pressed into their delay, unless it is asked for."""
     truth = known({"z": DELAY + 0.012})
@@ -92,23 +92,21 @@ def test_another_delay_stays_the_axis_own(seed: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_another_delay_that_hardly_shows_is_said_to_be_doubtful_and_costs_no_lag(seed: int) -> None:
+def test_another_delay_that_hardly_shows_is_said_to_be_doubtful_and_costs_no_lag() -> None:
     """8 ms later, by a camera of 2 mm: a second order with the others' delay says the same, odds of less than e³.
 
     The lag is right to 2 ms either way.
     """
     truth = known({"z": DELAY + 0.008}, {"z": 2e-3})
-    found = stage(truth, seed)
+    found = stage(truth, 1)
     assert found.best.config.arm.lag_of("z") == pytest.approx(truth.arm.lag_of("z"), abs=2e-3)
     assert abs(float(re.findall(r"own ([-+]\d+\.\d)", found.orders["z"])[0])) < 3.0
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_shared_delay_is_not_that_of_the_axis_that_is_measured_best(seed: int) -> None:
+def test_the_shared_delay_is_not_that_of_the_axis_that_is_measured_best() -> None:
     """Two axes of the same delay and one 12 ms later with a third of their noise: that one has its own, they share."""
-    found = stage(known({"z": DELAY + 0.012}, {"x": 1e-3, "y": 1e-3}), seed)
+    found = stage(known({"z": DELAY + 0.012}, {"x": 1e-3, "y": 1e-3}), 1)
     arm = found.best.config.arm
     assert (arm.axes["x"].delay, arm.axes["y"].delay) == (None, None)
     assert arm.delay == pytest.approx(DELAY, abs=0.004)

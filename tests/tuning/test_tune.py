@@ -26,7 +26,6 @@ from pumafuse.tuning.validation import check
 from tuning_runs import (
     fitted,
     free_of,
-    later,
     outage,
     quietly,
     replaced,
@@ -159,6 +158,7 @@ def sds_alone(runs: Sequence[pf.Run], config: pf.FusionConfig, **more: object) -
     return quietly(lambda: pf.tune(runs, config, fix=["process"], **more))
 
 
+@pytest.mark.long
 def test_the_reference_plays_no_part() -> None:
     """Without it, or with nonsense in its place, the configuration is the same to the last bit."""
     run, config = outage(1).run, spoiled(outage(1).config)
@@ -281,8 +281,7 @@ def calls(trust: str | None) -> int:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-@pytest.mark.parametrize("trust", [None, later("tracker")])
+@pytest.mark.parametrize(("share", "trust"), [(0.0, None), (0.5, "tracker"), (0.99, None)])
 def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, tmp_path: Path) -> None:
     """At any moment: a whole configuration with the gates as given, never less likely than the start.
 
