@@ -21,7 +21,6 @@ from pumafuse.logs.frames import Cylindrical, Frame, Placed, Rotated
 from pumafuse.logs.run import Source
 from refusals import one_line
 
-PERIOD = 0.028
 SIGN = {"counterclockwise": 1.0, "clockwise": -1.0}
 EXACT = 1e-12  # m
 
@@ -165,11 +164,7 @@ X, Y, Z = [0.5, 0.6], [0.0, 0.1], [0.0, 0.0]
     ("command", "camera", "message"),
     [
         ({"x": X, "y": Y}, {"x": X}, "camera: gives x without y"),
-        ({"x": X, "y": Y}, {"y": X}, "camera: gives y without x"),
         ({"x": X, "y": Y}, {"x": X, "y": Y, "radial": X}, "camera: gives radial both by its name and by x, y"),
-        ({"x": X, "y": Y}, {"x": X, "y": Y, "tangential": X}, "camera: gives tangential both by its name and by x, y"),
-        ({"x": X, "y": Y, "z": Z}, {"z": Z, "vertical": Z}, "camera: gives vertical both by its name and by z"),
-        ({"x": X, "y": Y, "radial": X}, None, "command: gives radial both by its name and by x, y"),
         ({"x": [0.2, 0.3], "y": [-0.1, 0.0]}, None, "starts on its base's axis"),
         ({"x": X, "z": Z}, None, "give the commands, or start, in x and y"),
         ({"x": [0.5, np.nan], "y": [np.nan, 0.1]}, None, "no command has both x and y"),
@@ -209,7 +204,6 @@ def test_commands_in_x_y_z_without_a_frame_are_refused_with_what_is_missing() ->
     ("file", "frame", "tangential", "radial"),
     [
         ("log.csv", "", 500.0, 100.0),  # at azimuth 0 radial is x and tangential y
-        ("run.toml", "", 500.0, 100.0),
         ("run.toml", '[frame]\nkind = "rotated"\nazimuth_deg = 90.0\n', -100.0, 500.0),
         ("run.toml", '[frame]\nkind = "cylindrical"\nbase_mm = [100.0, 200]\npositive = "clockwise"\n', 0.0, 300.0),
     ],

@@ -42,9 +42,9 @@ def test_the_grid_behind_jittered_stamps_is_even_to_a_nanosecond(period: float, 
     assert abs(float(np.median(stamp - got))) <= 1.0
 
 
-@pytest.mark.parametrize("ppm", [50.0, -50.0, 400.0])
-def test_a_drifting_clock_is_followed_and_noted(ppm: float) -> None:
+def test_a_drifting_clock_is_followed_and_noted() -> None:
     """50 ppm over an hour are 180 ms, six ticks: the grid stays on the true ticks, and the note has the drift."""
+    ppm = -50.0
     ticks = np.flatnonzero(np.random.default_rng(3).random(130_000) < 0.9)
     true = grid_of(ticks, TICK * (1 + ppm * 1e-6))
     jitter = np.random.default_rng(4).normal(0.0, 1e6, len(ticks))
@@ -63,9 +63,9 @@ def test_one_or_two_stamps_are_a_grid(stamp: list[int], wanted: list[int]) -> No
     assert got.tolist() == wanted
 
 
-@pytest.mark.parametrize("ppm", [50.0, -50.0])
-def test_a_pause_does_not_hide_the_drift(ppm: float) -> None:
+def test_a_pause_does_not_hide_the_drift() -> None:
     """50 ppm through a pause of 10 minutes are one tick: the grid is on the true ticks after it."""
+    ppm = 50.0
     true = grid_of(np.concatenate([np.arange(20_000), np.arange(20_000) + 41_500]), TICK * (1 + ppm * 1e-6))
     got, note = regular_grid(true, PERIOD, "host")
     assert note is not None
@@ -73,8 +73,7 @@ def test_a_pause_does_not_hide_the_drift(ppm: float) -> None:
     assert np.abs(got - true).max() < 1000
 
 
-@pytest.mark.parametrize("ratio", [2.0, 1.5, 4 / 3, 1.01, 1.004, 0.996, 0.99, 64 / 65, 63 / 64, 0.75, 2 / 3])
-@pytest.mark.parametrize("sd", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize(("ratio", "sd"), [(2.0, 0.2), (1.004, 0.0), (64 / 65, 0.1), (0.75, 0.2)])
 def test_a_wrong_period_is_refused(ratio: float, sd: float) -> None:
     """Also one that fits as well at each second or 64th command: refused with both periods and what to do."""
     _, stamp = logged(np.arange(500), PERIOD, sd, 5)
@@ -84,7 +83,7 @@ def test_a_wrong_period_is_refused(ratio: float, sd: float) -> None:
         assert words in text
 
 
-@pytest.mark.parametrize("place", [50, 100, 190, 3900])
+@pytest.mark.parametrize("place", [50, 3900])
 def test_a_command_between_two_ticks_is_refused(place: int) -> None:
     """Two commands on one tick are no regular clock; no other command is moved to make room for them."""
     true = grid_of(np.arange(4000))
@@ -109,9 +108,7 @@ def share_right(got: np.ndarray, true: np.ndarray, period: float) -> float:
     return float(np.mean(np.abs(got - true) < 0.4 * period * SECOND))
 
 
-@pytest.mark.parametrize("sd", [0.05, 0.15, 0.2, 0.25])
-@pytest.mark.parametrize("period", [0.002, 0.004, PERIOD])
-@pytest.mark.parametrize("ppm", [0.0, 50.0])
+@pytest.mark.parametrize(("sd", "period", "ppm"), [(0.25, 0.002, 0.0), (0.25, PERIOD, 50.0), (0.05, 0.004, 50.0)])
 def test_jitter_of_a_quarter_of_a_period_is_fitted(sd: float, period: float, ppm: float) -> None:
     """Of 0.25 T every twentieth stamp is nearer to another tick: without missing ticks the order decides."""
     for seed in range(3):
@@ -120,8 +117,7 @@ def test_jitter_of_a_quarter_of_a_period_is_fitted(sd: float, period: float, ppm
         assert share_right(got, true, period) >= 0.9995
 
 
-@pytest.mark.parametrize("sd", [0.0, 0.1, 0.2])
-@pytest.mark.parametrize("length", [1, 4, 8])
+@pytest.mark.parametrize(("sd", "length"), [(0.0, 1), (0.2, 8)])
 def test_a_queue_behind_a_stalled_logger_is_set_back_to_its_ticks(sd: float, length: int) -> None:
     """Up to 8 commands stamped when the logger goes on, then a tick missing soon after: all are on their own ticks."""
     ticks = np.delete(np.arange(4000), [1020, 2020])
@@ -165,7 +161,7 @@ def test_stamps_without_ticks_are_refused(count: int, apart: float, seed: int) -
     assert text.endswith("; check update_period_ms, or use clock = 'stamps'")
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, 1])
 def test_much_jitter_beside_many_missing_ticks_is_refused(seed: int) -> None:
     """Of 0.25 T, with every second tick missing, some 2 % lie nearer to a free tick: no order decides which."""
     rng = np.random.default_rng(seed)
@@ -199,8 +195,7 @@ def test_more_stamps_than_ticks_about_them_are_no_row() -> None:
     assert "of 312 are stamped nearest to the tick of the one before" in text
 
 
-@pytest.mark.parametrize("period", [0.0033367, 1.0 / 60.0, 0.101])
-@pytest.mark.parametrize("jitter", [0.02, 0.15])
+@pytest.mark.parametrize(("period", "jitter"), [(0.0033367, 0.02), (0.101, 0.15)])
 def test_the_ticks_of_a_sensor_are_found_in_its_stamps(period: float, jitter: float) -> None:
     """With one row in ten missing, as well as the jitter lets a straight line through the stamps tell it."""
     rng = np.random.default_rng(7)

@@ -113,17 +113,12 @@ BAD = {
         '{ quaternion = ["qx", "qy", "qz", "qw"], rotation_vector = ["qx", "qy", "qz"], unit = "rad" }',
         "expected one of quaternion",
     ),
-    "three of four": ('{ quaternion = ["qx", "qy", "qz"] }', "orientation.quaternion"),
     "no convention": ('{ euler = ["qx", "qy", "qz"], unit = "deg" }', "kuka, fanuc, rpy, or letters"),
-    "a letter twice": ('{ euler = ["qx", "qy", "qz"], convention = "XXY", unit = "deg" }', "kuka, fanuc, rpy"),
     "no unit": ('{ rotation_vector = ["qx", "qy", "qz"] }', "'qx' ends in no unit of an angle"),
-    "a length": ('{ rotation_vector = ["qx", "qy", "qz"], unit = "mm" }', "unit 'mm'"),
     "convention of a vector": (
         '{ rotation_vector = ["qx", "qy", "qz"], convention = "kuka", unit = "rad" }',
         "only Euler angles have one",
     ),
-    "unknown key": ('{ quat = ["qx", "qy", "qz", "qw"] }', "quat"),
-    "no such column": ('{ quaternion = ["qx", "qy", "qz", "q0"] }', "q0"),
 }
 
 

@@ -105,21 +105,13 @@ def test_notes_of_a_table_are_noted_once(folder: Path) -> None:
 MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     # what the manifest says: what the one line must name
     "no command at all": ("", ("run.toml", "'command'")),
-    "command is a number": ("command = 3", ("run.toml", "command", "table")),
-    "command without file": ('[command]\ntime = "t_ms"\nradial = "z_m"', ("run.toml", "'command.file'")),
     "file is absent": (COMMAND.replace("host", "absent"), ("absent.csv", "no such file")),
     "file with a null character": (COMMAND.replace("host.csv", "a\\u0000b"), ("NUL",)),
     "time is absent": (COMMAND.replace("t_ms", "t_s"), ("host.csv", "'t_s'", "did you mean 't_ms'", COLUMNS)),
-    "column is a number": (COMMAND.replace('"z_m"', "3"), ("run.toml", "command.vertical", "column")),
     "start without unit": (COMMAND + "start = { radial = 560.0 }", ("run.toml", "command.start.radial", "radial_mm")),
-    "start of an unknown axis": (COMMAND + "start = { radail_mm = 1.0 }", ("'radail'", "did you mean 'radial'")),
-    "clock is unknown": (COMMAND + 'clock = "exact"', ("run.toml", "command.clock", "'exact'")),
-    "sensors is a number": ("sensors = 3\n" + COMMAND, ("run.toml", "sensors", "table")),
     "sensor of an unknown axis": (COMMAND + SENSOR + 'radail = "y_mm"', ("tracker", "'radail'", "radial, vertical")),
     "sensor with noise": (COMMAND + SENSOR + "sd_mm = 0.1", ("run.toml", "sensors.tracker.sd_mm", "column")),
-    "reference with negative sd": (COMMAND + REFERENCE + "sd_mm = -1.0", ("run.toml", "reference.sd_mm", "0")),
     "unknown key": ("commands = 3\n" + COMMAND, ("run.toml", "'commands'", "did you mean 'command'", "sensors")),
-    "not TOML": ("command file host.csv", ("run.toml", "TOML")),
     "endless nesting": (f"x = {'[' * 5000}{']' * 5000}\n{COMMAND}", ("run.toml", "nest")),
 }
 
@@ -159,9 +151,7 @@ def test_a_single_table_holds_every_source(tmp_path: Path) -> None:
     [
         ("stamp_s,command.radial_mm", ("time_s", "stamp_s, command.radial_mm")),
         ("time_s,time_ms", ("one time column", "time_s, time_ms")),
-        ("time_x,command.radial_mm", ("time_x", "_s, _ms, _us, _ns")),
         ("time_s,tracker.radial_mm", ("command.<axis>_mm", "tracker.radial_mm")),
-        ("time_s,command.radial", ("'command.radial'", "_m, _mm, _um")),
         ("time_s,command.radial_mm,tracker.radial_mm,tracker.radial_um", ("two columns", "tracker.radial")),
         ("time_s,command.radial_mm,tracker.vertical_mm", ("tracker", "'vertical'", "radial")),
     ],
@@ -228,26 +218,13 @@ ARRAY_REFUSALS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     # what is given instead of two commands: what the one line must name
     "too few values": ({"command": {"radial": [1.0]}}, ("command", "radial", "(1,)", "(2,)")),
     "two dimensions": ({"time": [[0.0]], "command": {"radial": [[1.0]]}}, ("command", "(1, 1)")),
-    "no axis": ({"command": {}}, ("command",)),
-    "no stamps": ({"time": [np.nan, np.inf]}, ("command", "radial")),
     "stamp and value in no row": ({"time": [0.0, np.nan], "command": {"radial": [np.inf, 1.0]}}, ("command", "radial")),
-    "sensor of an unknown axis": (
-        {"sensors": {"tracker": ([0.0], {"yaw": [1.0]})}},
-        ("sensor tracker", "yaw", "radial"),
-    ),
     "reference of an unknown axis": ({"reference": ([0.0], {"vertical": [1.0]})}, ("reference", "vertical", "radial")),
-    "start of an unknown axis": ({"start": {"vertical": 1.0}}, ("start", "vertical", "accepted: radial")),
     "text for values": ({"command": {"radial": ["a", "b"]}}, ("command", "number")),
-    "text for stamps": ({"time": ["a", "b"]}, ("command", "stamp")),
     "seconds beyond reach": ({"time": [0.0, 4.6e9]}, ("command", "stamp")),
-    "nanoseconds beyond reach": ({"time": [0, -4_600_000_000_000_000_000]}, ("command", "stamp")),
     "dates beyond reach": ({"time": np.array(["1970-01-01", "2200-01-01"], "M8[D]")}, ("command", "stamp")),
-    "stamps beyond any integer": ({"time": [0, 2**70]}, ("command", "stamp")),
-    "sensor with too few values": ({"sensors": {"tracker": ([0.0, 1.0], {"radial": [1.0]})}}, ("tracker", "radial")),
-    "reference beyond reach": ({"reference": ([5e9], {"radial": [1.0]})}, ("reference", "stamp")),
     "reference with negative sd": ({"reference": TRUTH_ROWS, "reference_sd": -1.0}, ("reference", "sd")),
     "start nan": ({"start": {"radial": np.nan}}, ("start", "radial", "finite")),
-    "clock is unknown": ({"clock": "regulr"}, ("clock", "'regulr'", "did you mean 'regular'", "stamps")),
 }
 
 

@@ -22,7 +22,7 @@ from pumafuse.logs.save import save
 from refusals import one_line
 
 DAYS_26 = 26 * 86400 * 10**9
-TAKEN = ["commands", "truth", "trials", "samples", "../eye", "a/b", "/tmp/eye", "", ".", ".eye", "a\0b", "a\nb"]
+TAKEN = ["commands", "truth", "../eye", "/tmp/eye", "", ".eye", "a\0b"]
 stamps = st.lists(st.one_of(st.integers(-DAYS_26, DAYS_26), st.just(NO_STAMP)), min_size=1, max_size=8)
 nanometres = st.one_of(st.integers(-(10**12), 10**12), st.just(None))
 
@@ -87,7 +87,6 @@ def plain(**different: object) -> Run:
     "frame",
     [
         None,
-        Cylindrical(),
         Cylindrical(base=(0.0123456789, -1.1), positive="clockwise"),
         Rotated(azimuth=math.radians(37.25), positive="clockwise"),
     ],
@@ -109,7 +108,7 @@ def test_frame_start_clock_and_reference_come_back(frame: Cylindrical | Rotated 
     assert again.reference.sd == 0.00002
 
 
-@pytest.mark.parametrize("name", ["run", "two words", "Ä", "a.b", "_eye-2", *TAKEN])
+@pytest.mark.parametrize("name", ["two words", "a.b", *TAKEN])
 def test_a_sensors_file_spoils_no_other(name: str, tmp_path: Path) -> None:
     """A name that would write another file is refused before anything is written; with any other all is read back."""
     rows = ([0.01], {"radial": [0.7]})

@@ -166,7 +166,7 @@ def test_elements_are_found_by_their_names_in_any_order(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("unit", "kind", "factor"),
-    [("m", "length", 1), ("mm", "length", 1e3), ("um", "length", 1e6), ("rad", "angle", 1), ("mrad", "angle", 1e3)],
+    [("um", "length", 1e6), ("mrad", "angle", 1e3)],
 )
 def test_a_unit_beside_the_column_is_the_unit_of_its_name(tmp_path: Path, unit: str, kind: str, factor: float) -> None:
     named = read(tmp_path, f'time = "t_ns"\na = "x_{unit}"', {"t_ns": STAMP, f"x_{unit}": X})
@@ -174,14 +174,6 @@ def test_a_unit_beside_the_column_is_the_unit_of_its_name(tmp_path: Path, unit: 
     same(named.command, STAMP, a=X / factor)
     same(beside.command, STAMP, a=X / factor)
     assert named.kinds == beside.kinds == {"a": kind}
-
-
-def test_degrees_in_a_list_with_a_unit_in_its_name(tmp_path: Path) -> None:
-    """``state_deg[1]`` ends in a unit before its bracket."""
-    state = pa.array([[0.0, value] for value in np.rad2deg(ANGLE)])
-    run = read(tmp_path, 'time = "t_ns"\na = "state_deg[1]"', {"t_ns": STAMP, "state_deg": state})
-    np.testing.assert_allclose(run.command.values["a"], ANGLE, rtol=1e-15)
-    assert run.kinds == {"a": "angle"}
 
 
 def test_columns_of_one_axis_are_added_up_whatever_their_units(tmp_path: Path) -> None:
@@ -216,10 +208,7 @@ AXIS = 'time = "t_ns"\nx = "x_m"'
 @pytest.mark.parametrize(
     ("where", "rows"),
     [
-        ("group = 3", (150, 200)),
-        ("group = 3.0", (150, 200)),
         ("name = 'run3'", (150, 200)),
-        ("'meta.run' = 3", (150, 200)),
         ("'tags[1]' = 3", (150, 200)),
         ("part = 0.3", (150, 200)),
         ("group = 4, even = true", (200, 250)),
@@ -236,7 +225,7 @@ def test_where_chooses_rows(tmp_path: Path, where: str, rows: tuple[int, int], n
     same(run.command, STAMP[slice(*rows)], x=X[slice(*rows)])
 
 
-@pytest.mark.parametrize("kind", [pa.large_string(), pa.string_view(), pa.dictionary(pa.int32(), pa.string())])
+@pytest.mark.parametrize("kind", [pa.string_view(), pa.dictionary(pa.int32(), pa.string())])
 def test_where_compares_text_of_each_type(tmp_path: Path, kind: pa.DataType) -> None:
     """Text has three types: pandas writes large strings and categories, polars views."""
     columns = episodes()
@@ -339,43 +328,31 @@ def test_axes_with_stamps_of_their_own_are_interpolated_each(tmp_path: Path) -> 
         same(alone, both.stamp[known], **{one: both.values[one][known]})
 
 
-def test_sources_of_one_file_have_rows_of_their_own(tmp_path: Path) -> None:
-    sensor = '[sensors.s]\nfile = "log.parquet"\ntime = "t_ns"\nx = "x_m"\nwhere = { even = true }'
-    columns = episodes(even=pa.array(np.arange(ROWS) % 2 == 0), one=pa.array(np.ones(ROWS, np.int64)))
-    run = read(tmp_path, f"{AXIS}\nwhere = {{ one = 1 }}\n{sensor}", columns)
-    same(run.command, STAMP, x=X)
-    same(run.sensors["s"], STAMP[::2], x=X[::2])
-
-
 def test_a_value_of_where_is_in_the_unit_of_its_column(tmp_path: Path) -> None:
     """``height_mm = 250`` finds the rows with 250 in them, though Python is in metres."""
     run = read(tmp_path, f"{AXIS}\nwhere = {{ height_mm = 250 }}", episodes(height_mm=np.arange(ROWS) // 50 * 50))
     same(run.command, STAMP[250:300], x=X[250:300])
 
 
-@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
 @pytest.mark.parametrize(
     ("where", "said"),
     [
         ("group = 30", ("no row has group = 30", "group goes from 0 to 9")),
-        ("group = 3.5", ("no row has group = 3.5", "0 to 9")),
         ("name = 'walk'", ("no row has name = 'walk'", "'run0', 'run1'", "…")),
         ("group = 3, even = true", ("no row has group = 3 and even = true", "even goes from false to true")),
         ("group = '3'", ("column 'group' holds int64, never '3'",)),
-        ("name = 3", ("column 'name' holds string, never 3",)),
-        ("group = true", ("column 'group' holds int64, never true",)),
         ("even = 1", ("column 'even' holds bool, never 1",)),
         ("gruop = 3", ("unknown column 'gruop'", "did you mean 'group'", "t_ns")),
         (f"group = {2**70}", ("command.where", "expected a number")),
     ],
 )
 def test_where_that_leaves_no_row_is_refused_with_what_there_is(
-    tmp_path: Path, name: str, where: str, said: tuple[str, ...]
+    tmp_path: Path, where: str, said: tuple[str, ...]
 ) -> None:
     """One line with the range of the column, some of its values, or its type."""
     columns = episodes()
     del columns["meta"], columns["tags"]
-    text = refusal(lambda: read(tmp_path, f"{AXIS}\nwhere = {{ {where} }}", columns, name))
+    text = refusal(lambda: read(tmp_path, f"{AXIS}\nwhere = {{ {where} }}", columns, "log.csv"))
     assert all(words in text for words in said), text
 
 
@@ -419,10 +396,7 @@ def moving(ticks: npt.NDArray[np.float64], rows: int = 7500, rate: float = 125.0
     return np.rint(stamp * 1e9).astype(np.int64), 0.1 * np.sin(2 * np.pi * 5.0 * time)
 
 
-@pytest.mark.parametrize("source", ["command", "sensor"])
-@pytest.mark.parametrize(
-    ("tick", "rate"), [(1.0, 125.0), (0.1, 125.0), (1.0, 5.0), (128.0, 1000.0), (1e6, 10.0)], ids=str
-)
+@pytest.mark.parametrize(("source", "tick", "rate"), [("command", 0.1, 125.0), ("sensor", 1e6, 10.0)])
 def test_a_clock_that_stands_still_is_refused(tmp_path: Path, source: str, tick: float, rate: float) -> None:
     """Whole seconds, one decimal of them, today in float32, or all 0: the line has how many stamps there are."""
     stamp, x = moving(tick, rate=rate)
@@ -437,9 +411,9 @@ def test_a_clock_that_stands_still_is_refused(tmp_path: Path, source: str, tick:
 
 
 @pytest.mark.parametrize(
-    "names", [("sec_s", "nanosec"), ("header.stamp.sec", "header.stamp.nanosec"), ("t_s", "t_nsecs")]
+    ("names", "name"),
+    [(("sec_s", "nanosec"), "log.csv"), (("header.stamp.sec", "header.stamp.nanosec"), "log.parquet")],
 )
-@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
 def test_seconds_without_their_nanoseconds_are_refused_with_the_line_to_write(
     tmp_path: Path, names: tuple[str, str], name: str
 ) -> None:
@@ -455,7 +429,7 @@ def test_seconds_without_their_nanoseconds_are_refused_with_the_line_to_write(
 
 @pytest.mark.parametrize(
     ("tick", "rate", "rows"),
-    [(1e-3, 4000.0, 5624), (0.01, 1000.0, 6749), (0.015625, 1000.0, 7019), (0.05, 125.0, 6299), (1.0, 1.0, 0)],
+    [(1e-3, 4000.0, 5624), (0.015625, 1000.0, 7019), (1.0, 1.0, 0)],
 )
 def test_a_coarse_clock_is_told(tick: float, rate: float, rows: int) -> None:
     """Whole ms at 4 kHz, jiffies, Windows: fused, and the rows that share a stamp are counted."""
@@ -504,55 +478,30 @@ def timed(time: str) -> str:
 RECORDED = '[sensors.s]\nfile = "a.mcap"\ntime = "log_time"\nx = "x_m"'
 REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "unit of time for an axis": (axis("x_m").replace('"m"', '"s"'), ("command.x", "'s'", "m, mm, um, rad")),
-    "unit of length for time": (timed('{ column = "t", unit = "mm" }'), ("command.time", "'mm'", "s, ms, us, ns")),
-    "unit is a number": ('time = "t_ns"\nx = { column = "x_m", unit = 3 }', ("command.x.unit", "str")),
     "no unit": ('time = "t_ns"\nx = "plain"', ("'plain'", "_mm", "unit = 'mm'")),
     "time without unit": (timed('"plain"'), ("'plain'", "_ms", "unit = 's'")),
-    "table without column": ('time = "t_ns"\nx = { unit = "m" }', ("command.x", "column")),
     "unknown key of a column": (axis("x_m").replace("unit", "scale"), ("'command.x.scale'", "column, unit")),
-    "empty list": ('time = "t_ns"\nx = []', ("command.x", "column")),
     "a rate of 0": (timed("{ rate_hz = 0 }"), ("command.time", "{ rate_hz = 100 }")),
-    "a negative rate": (timed("{ rate_hz = -5 }"), ("command.time", "rate_hz", ">= 0")),
-    "a rate and a unit": (timed('{ column = "t", rate_hz = 5, unit = "s" }'), ("command.time", "column")),
     "a rate of centuries": (timed("{ rate_hz = 1e-8 }"), ("log.parquet", "beyond the year 2110")),
-    "frames that are words": (timed('{ column = "yes", rate_hz = 5 }'), ("'yes'", "bool", "not numbers")),
     "rows of nobody": (
         'time = "t_ns"\nx = { column = "x_m", where = { plain = 1000 } }',
         ("no row has plain = 1000", "0 to 499"),
     ),
-    "rows by a column that is not there": (
-        'time = "t_ns"\nx = { column = "x_m", where = { joint = "elbow" } }',
-        ("unknown column 'joint'",),
-    ),
-    "rows by nothing": ('time = "t_ns"\nx = { column = "x_m", where = {} }', ("command.x.where", "expected")),
-    "empty time": (timed('""'), ("command.time", "column")),
     "one time in a list": (timed('["t_ns"]'), ("command.time", "['sec', 'nanosec']")),
     "where is a text": ('where = "group"\n' + AXIS, ("command.where", "episode_index = 3")),
-    "where is a list": ("where = { group = [1, 2] }\n" + AXIS, ("command.where", "number", "quoted")),
-    "where is a date": ("where = { group = 2024-01-01 }\n" + AXIS, ("command.where", "number")),
     "topic of a table": ('topic = "/servo"\n' + AXIS, ("log.parquet", "no topic", ".mcap", "'where'")),
-    "entity of a table": ('entity = "/servo"\n' + AXIS, ("log.parquet", "no entity", ".rrd", "'where'")),
     "field of a number": ('time = "t_ns"\nx = "x_m.y_m"', ("'x_m.y_m'", "no field 'y_m'", "double")),
-    "element of a number": (axis("x_m[0]"), ("'x_m[0]'", "no element '0'", "double")),
     "a whole struct": (axis("pose"), ("'pose'", "structs of position", "not numbers")),
-    "a whole list": (axis("list"), ("'list'", "lists", "[0]", "not numbers")),
     "field that is not there": (axis("pose.positoin.x"), ("'pose.positoin.x'", "did you mean 'position'")),
     "element too far": (axis("list[2]"), ("'list[2]'", "no row has", "at most 2 elements")),
-    "element far too far": (axis(f"list[{9**99}]"), ("no row has", "at most 2")),
     "negative element": (axis("list[-1]"), ("'-1'", "0, 1, 2")),
     "element without names": (axis("list[elbow]"), ("'elbow'", "'name'")),
     "unknown name of an element": (axis("joints.position[ellbow]"), ("'ellbow'", "elbow")),
     "bracket without end": (axis("list[0"), ("'list[0'", "without ']'")),
-    "bracket and more": (axis("list[0]x"), ("'list[0]x'", "missing before 'x'")),
-    "only dots": (axis("..."), ("'...'", "t_ns")),
     "a deep path": (axis("pose" + ".position" * 1200), ("unknown field", "accepted: x, y")),
-    "a path of brackets": (axis("list" + "[0]" * 1200), ("no element '0'", "double")),
     "an endless name": (axis("x" * 10_000), ("unknown column", "…")),
     "booleans": (axis("yes"), ("'yes'", "bool", "not numbers")),
-    "time is booleans": (timed('{ column = "yes", unit = "s" }'), ("'yes'", "bool")),
-    "time is a struct without stamps": (timed('"pose.position"'), ("'pose.position'", "structs of x, y")),
     "nanoseconds beyond a second": (timed('["plain", "t_ns"]'), ("'t_ns'", "row 1", "999999999")),
-    "seconds with decimals": (timed('["half", "plain"]'), ("'half'", "whole")),
     "a recording": (f"{AXIS}\n{RECORDED}", ("a.mcap",)),
 }
 
