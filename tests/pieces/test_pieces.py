@@ -167,8 +167,9 @@ def close(found: Any, expected: Any, relative: float) -> bool:
 @pytest.mark.parametrize(
     ("single", "how"),
     [
-        *((True, {}), (True, {"part": (5.0, 50.0), "rate": 90.0}), (True, {"part": (30.0, None)})),
-        *((False, {"rate": 100.0}), (False, {"sensors": ["camera"]}), (False, {"part": (5.0, 50.0), "rate": 90.0})),
+        (True, {"part": (5.0, 50.0), "rate": 90.0}),
+        (False, {"rate": 100.0}),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in ((True, {}), (False, {"sensors": ["camera"]}))),
     ],
 )
 def test_pieces_are_the_whole(logs: dict[bool, Path], tmp_path: Path, single: bool, how: dict[str, Any]) -> None:
@@ -204,18 +205,16 @@ def test_pieces_are_the_whole(logs: dict[bool, Path], tmp_path: Path, single: bo
             assert close(other.skill.command_alone.rms, its.skill.command_alone.rms, 0.5)
 
 
-@pytest.mark.parametrize(("none", "statistics"), [(9999.0, True), (-32768.0, False)])
-def test_what_stands_for_none_is_told_by_the_whole_file(tmp_path: Path, none: float, statistics: bool) -> None:
+def test_what_stands_for_none_is_told_by_the_whole_file(tmp_path: Path) -> None:
     """Of ten seconds in which a tracker is lost some pieces have nothing else, and the first rows none of it."""
 
     def is_lost(given: dict[str, tuple[Rows, np.ndarray]]) -> None:
         tracker = given["tracker"][0]
-        tracker["x"] = np.where((tracker["t"] > 41.0) & (tracker["t"] < 51.0), none, tracker["x"])
+        tracker["x"] = np.where((tracker["t"] > 41.0) & (tracker["t"] < 51.0), -32768.0, tracker["x"])
 
     path = written(tmp_path / "log", single=False, damage=is_lost)
-    if not statistics:
-        for file in path.glob("*.parquet"):
-            pq.write_table(pq.read_table(file), file, write_statistics=False)
+    for file in path.glob("*.parquet"):
+        pq.write_table(pq.read_table(file), file, write_statistics=False)
     expected, found = both_ways(path, tmp_path)
     estimates = pq.read_table(tmp_path / "pieces" / results.ESTIMATES)
     assert np.abs(estimates["x.position_mm"].to_numpy()).max() < 1e3
@@ -234,6 +233,7 @@ def test_a_fault_is_the_verdict_of_pieces_and_whole(tmp_path: Path) -> None:
         assert of_camera["x"].finding != "faulty"
 
 
+@pytest.mark.long
 def test_what_stands_for_none_in_a_piece_may_be_a_position_in_the_file(tmp_path: Path) -> None:
     """999 m is ten times as far as all else of its piece; but much later once there are 150 m."""
 
@@ -248,14 +248,13 @@ def test_what_stands_for_none_in_a_piece_may_be_a_position_in_the_file(tmp_path:
     assert not [note for note in found.notes if "ten times as far" in note]
 
 
-@pytest.mark.parametrize("single", [True, False])
-def test_rows_that_come_too_late(tmp_path: Path, single: bool) -> None:
+def test_rows_that_come_too_late(tmp_path: Path) -> None:
     """One stray row is left out, with its number; many, or a clock that was set back, are refused."""
 
     def stray(given: dict[str, tuple[Rows, np.ndarray]]) -> None:
         given["camera"][0]["t"][900] -= 20.0
 
-    path = written(tmp_path / "stray", single=single, damage=stray)
+    path = written(tmp_path / "stray", single=True, damage=stray)
     found = fusing.fuse_to(path, tmp_path / "out", CONFIG)
     assert [note for note in found.notes if "1 row left out, stamped more than 10 s behind" in note]
     whole = pf.fuse(pf.Run.read(path), CONFIG)
@@ -263,16 +262,17 @@ def test_rows_that_come_too_late(tmp_path: Path, single: bool) -> None:
     assert found.rows["tracker"] == whole.counts["tracker"]
 
     def back(given: dict[str, tuple[Rows, np.ndarray]]) -> None:
-        late, arrival = given["camera" if single else "command"]
+        late, arrival = given["camera"]
         late["t"] = np.where(arrival > 50.0, late["t"] - 30.0, late["t"])
 
-    path = written(tmp_path / "back", single=single, damage=back)
+    path = written(tmp_path / "back", single=True, damage=back)
     before = set(tmp_path.iterdir())
     with pytest.raises(PumafuseError, match=r"behind an earlier one|set back") as error:
         fusing.fuse_to(path, tmp_path / "refused", CONFIG)
     assert "\n" not in str(error.value) and set(tmp_path.iterdir()) == before
 
 
+@pytest.mark.long
 def test_stray_and_missing_stamps(tmp_path: Path) -> None:
     """Rows far ahead and rows without a stamp: the same estimates, and the same counts."""
 
@@ -339,11 +339,10 @@ def test_the_command_line_takes_the_way_by_the_rows(tmp_path: Path, monkeypatch:
     assert rows_of(path) == 0  # how many are chosen is not known
 
 
-@pytest.mark.parametrize("single", [True, False])
-def test_dates_as_text_are_read_as_a_whole(single: bool, tmp_path: Path) -> None:
+def test_dates_as_text_are_read_as_a_whole(tmp_path: Path) -> None:
     """All of a column tells which number of 11/12/2026 is the day."""
-    path = written(tmp_path / "log", single=single)
-    file = path if single else path / "command.parquet"
+    path = written(tmp_path / "log", single=False)
+    file = path / "command.parquet"
     table = pq.read_table(file)
     dates = pa.array(["11/12/2026 10:00:00"] * len(table))
     pq.write_table(table.set_column(table.schema.get_field_index("time_ns"), "time_ns", dates), file)

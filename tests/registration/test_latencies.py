@@ -36,7 +36,7 @@ def pair(late: float, seed: int, seconds: float = 30.0) -> tuple[Motion, Motion]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("late", [-0.035, 0.0, 0.012])
+@pytest.mark.parametrize("late", [-0.035, 0.012])
 def test_intervals_hold_the_true_difference(late: float) -> None:
     """Of 100 pairs 88 or more of 95 % intervals hold it, three standard deviations from 95; most are below 1 ms."""
     found = [later(*([one] for one in pair(late, seed))) for seed in range(100)]

@@ -46,6 +46,7 @@ def turned_by(config: Path) -> dict[str, float]:
     return found
 
 
+@pytest.mark.long
 def test_frames_and_markers_are_those_of_the_set_up(registered: Path) -> None:
     """Rotations within 0.35° and markers within 2.5 mm: the arm's own kinematics are wrong by about as much."""
     assert max(turned_by(registered / "fusion.toml").values()) < 0.35
@@ -55,6 +56,7 @@ def test_frames_and_markers_are_those_of_the_set_up(registered: Path) -> None:
         np.testing.assert_allclose(np.array(found.at) * 1e3, marker, atol=2.5)
 
 
+@pytest.mark.long
 def test_what_is_written_as_json_is_what_is_configured(registered: Path) -> None:
     """Numbers are in the units of their names, each with an interval that holds it."""
     told = json.loads((registered / "registration.json").read_text())
@@ -124,6 +126,7 @@ def placed(sensors: dict[str, RegisteredSensor]) -> tuple[np.ndarray, np.ndarray
     return np.array([number for number, _ in known]), 0.5 * np.array([np.ptp(interval) for _, interval in known])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sensor", ["mocap", "tracker"])
 def test_another_run_of_the_set_up_is_fused_by_it(registered: Path, sensor: str) -> None:
     """About the arm's constant error the tool is known to 0.6 mm and 0.3°, untuned; error bars hold for the sum.
@@ -254,6 +257,7 @@ def test_rows_that_are_no_news_change_no_frame(change: Callable[[np.ndarray], np
     np.testing.assert_allclose(found.rotation, whole.rotation, atol=np.radians(0.1))
 
 
+@pytest.mark.long
 def test_a_gap_of_the_commands_is_named_and_costs_nothing_else() -> None:
     """When it is and how long is said; orientations are used, and the frame stays within 1 mm and 0.1°."""
     whole = recorded(as_it_is, seconds=40.0)
@@ -328,6 +332,7 @@ def test_a_sensor_that_lacks_an_axis_is_named() -> None:
         pf.register(replace(run, sensors={"flat": flat}))
 
 
+@pytest.mark.long
 def test_a_run_in_which_a_sensor_lacks_an_axis_is_not_looked_at_for_it() -> None:
     """The sensor is registered by the other run alone."""
     run = recorded(as_it_is)
