@@ -150,10 +150,8 @@ def test_only_an_earlier_result_is_replaced_and_only_with_force(with_tracker: Pa
     [
         (("fuse", "none", "-c", FUSION, "-o", "out"), "none: no such file"),
         (("fuse", SCAN, "-c", "none.toml", "-o", "out"), "none.toml: no such file"),
-        *((words, "has no run.toml; `pumafuse init") for words in (("latency", DATA), ("register", DATA))),
         (("tune", DATA, "-c", FUSION, "-o", "out"), "has no run.toml; `pumafuse init"),
         ((*FUSE_SCAN, "-o", "out", "--sensors", "trackr"), "did you mean 'tracker'?"),
-        (("compare", SCAN), "no result folder"),
         (("discretize", "puma761"), "not a preset (puma560-internal, puma560-external)"),
         (("discretize", "puma560-internal", "--axis", "radail"), "did you mean 'radial'?"),
     ],
@@ -170,12 +168,8 @@ def test_bad_input_is_one_line_that_says_what_to_do(arguments: tuple[object, ...
         (*FUSE_SCAN, "-o", "out", "--rate", "-5"),
         (*FUSE_SCAN, "-o", "out", "--smooth", "--as-live"),
         ("nonsense",),
-        ("compare",),
-        ("simulate", "short.toml"),
         ("simulate", "short.toml", "-o", "out", "--runs", "0"),
         ("identify", "none", "-o", "out", "--period", "nan"),
-        ("identify", "none", "-o", "out", "--samples", 3),
-        ("live", "stdin", "-c", FUSION, "--stale-after", "0"),
         ("live", "udp://:5005", "-c", FUSION, "--listen", "0.0.0.0"),
         ("live", "udp://:5005", "-c", FUSION, "--allow", "10.0.0.0/8"),
     ],
@@ -197,21 +191,7 @@ def test_discretize_prints_the_model_it_names() -> None:
         assert axis["step_response_mm"][-1] == pytest.approx(1.0, abs=2e-3)
 
 
-def test_an_interrupt_while_the_command_line_is_imported_is_no_traceback() -> None:
-    """Ctrl-C within the first tenth of a second, as one who has mistyped presses it: as later, one line."""
-    code = (
-        "import sys\n"
-        "class Interrupted:\n"
-        "    def find_spec(self, name, *_):\n"
-        "        if name == 'typer': raise KeyboardInterrupt\n"
-        "sys.meta_path.insert(0, Interrupted())\n"
-        "from pumafuse.__main__ import main\n"
-        "main()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
-
-
+@pytest.mark.long
 def test_an_interrupt_of_a_command_is_a_line() -> None:
     """Exit code 130, while it works, too."""
     code = (
@@ -235,19 +215,6 @@ def test_a_pipe_is_a_configuration_if_somebody_writes_into_it(tmp_path: Path) ->
     assert "nobody writes" in refused("fuse", SCAN, "-c", pipe, "-o", tmp_path / "none")
     slowly = f"'{EXECUTABLE}' fuse '{SCAN}' -c <(sleep 4; exec cat '{FUSION}') -o '{tmp_path / 'fused'}'"
     subprocess.run(["bash", "-c", slowly], capture_output=True, check=True)
-
-
-def test_a_gain_of_the_speed_that_never_recovers_is_warned_of(tmp_path: Path) -> None:
-    """Where a motion ends would depend on how fast it went: said; not where it recovers, or has no slope."""
-    scan, path = SCAN.with_name("scan"), tmp_path / "arm.toml"
-    (tmp_path / "fusion.toml").write_text((scan / "fusion.toml").read_text())
-    arm = (scan / "arm.toml").read_text()
-    never = arm.replace("gain_recovery_ms", "# gain_recovery_ms", 1)
-    told = "axis x: a gain that depends on the speed without gain_recovery_ms"
-    for text, said in ((arm, False), (never.replace("slope_s_m = 0.0518", "slope_s_m = 0"), False), (never, True)):
-        path.write_text(text)
-        assert (told in pumafuse("discretize", path).stderr) is said
-    assert told in pumafuse("fuse", scan, "-c", tmp_path / "fusion.toml", "-o", tmp_path / "out", "--to", "5").stderr
 
 
 @pytest.mark.parametrize(

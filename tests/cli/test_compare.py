@@ -112,34 +112,11 @@ def test_nothing_is_chosen_where_nothing_is_ahead(tmp_path: Path, told: Told) ->
         assert said in out and "take" not in out
 
 
-def test_a_narrow_gate_gains_nothing_by_rejecting(tmp_path: Path, told: Told) -> None:
-    """With other gates likelihoods are not of the same measurements: what is predicted decides."""
-    run = replace(recorded(), reference=None)
-    wide, narrow = (saved(tmp_path / f"{gate}", run, gate=gate, sensors=["camera"]) for gate in (50.0, 0.7))
-    (one, two), out = told(wide, narrow)
-    assert two["log_likelihood"]["x"] > one["log_likelihood"]["x"]
-    assert two["rejected"]["x"]["camera"] > 0.3
-    assert not two["take"]
-    assert "log-likelihood of the same measurements" not in out
-
-
-def test_parts_and_modes_of_a_run_are_not_rivals(tmp_path: Path, told: Told) -> None:
-    """Another part is another motion; in another mode the innovations are the same."""
-    run = replace(recorded(), reference=None)
-    whole, part = saved(tmp_path / "whole", run), saved(tmp_path / "part", run.between(2.0, 5.0))
-    smooth = saved(tmp_path / "smooth", run, mode="smoothed")
-    assert "different parts of the run" in told(whole, part)[1]
-    found, out = told(whole, smooth)
-    assert not any(one["take"] for one in found) and "they differ in mode" in out
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda table: table.slice(0, 0), "no estimates"),
         (lambda table: table.take(list(range(table.num_rows))[::-1]), "time_s is not ascending"),
         (lambda table: table.set_column(1, table.column_names[1], pa.nulls(table.num_rows, pa.float64())), "missing"),
-        (lambda table: table.append_column("segment", pa.array(["a"] * table.num_rows)), "segment"),
     ],
 )
 def test_estimates_that_were_changed_are_refused(

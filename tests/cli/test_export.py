@@ -43,7 +43,6 @@ def test_axes_of_a_frame_are_the_arms(tmp_path: Path) -> None:
     ("text", "name", "words"),
     [
         ("[sensors.tracker]\nsd_mm = -1.0\n", "filter.h", "fusion.toml: sensors.tracker.sd_mm"),
-        ("", "filter.h", "fusion.toml: has no sensor"),
         ("[sensors.tracker]\nsd_mm = 1.0\n", "pumafuse.h", "pumafuse.h: its names would be those of pumafuse.h"),
         ("[sensors.tracker]\nsd_mm = 1.0\n", "fusion.toml/filter.h", "cannot be written"),
     ],

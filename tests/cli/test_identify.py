@@ -137,13 +137,3 @@ def test_what_is_not_there_is_one_line(trials: Path, tmp_path: Path) -> None:
     assert "no samples.csv" in refused("identify", half, "-o", out)
     assert "cannot be written" in refused("identify", trials, "-o", file / "arm.toml")
     assert file.read_text() == "mine" and not out.exists()
-
-
-def test_positions_that_never_change_are_refused(tmp_path: Path) -> None:
-    """Steps were commanded, and the sensor says the same all the time: no model is written."""
-    (tmp_path / "trials.csv").write_text("trial,axis,step_mm,speed_m_s\n1,radial,19.0,0.68\n2,radial,10.0,0.36\n")
-    rows = [f"{trial},{0.005 * row - 0.05:.3f},5.0" for trial in (1, 2) for row in range(80)]
-    (tmp_path / "samples.csv").write_text("\n".join(["trial,time_s,position_mm", *rows, ""]))
-    line = refused("identify", tmp_path, "-o", tmp_path / "arm.toml")
-    assert "no trial can be used; trial '1': its position never changes" in line
-    assert not (tmp_path / "arm.toml").exists()

@@ -109,7 +109,6 @@ def test_worse_on_the_validation_run_is_code_3(place: Path, given: tuple[Path, P
         (1, ["--fix", "trakker"], "pumafuse: --fix: 'trakker' names nothing that can be fitted; parts"),
         (1, ["--trust", "tracker"], "pumafuse: sensors: unknown sensor 'tracker'; accepted: vision"),
         (1, ["--share", "delay"], "pumafuse: --share delay: delays are not fitted; add delay to --fit"),
-        (2, ["--fit", ","], ""),
         (2, ["--fit", "delai"], ""),
     ],
 )
