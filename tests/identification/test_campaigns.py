@@ -172,15 +172,14 @@ def test_the_papers_time_constant_has_the_t_interval_of_a_mean() -> None:
     assert plant.time_constant_ci95 == pytest.approx((fitted.mean() - half, fitted.mean() + half), rel=1e-5)
 
 
-@pytest.mark.parametrize("times", [1e3, 1e-3], ids=["ms for s", "ks for s"])
-def test_a_lag_that_no_arm_has_is_reported(times: float) -> None:
+def test_a_lag_that_no_arm_has_is_reported() -> None:
     """Times in another unit than their column's name: everything is found, a thousand times too slow or fast."""
     trials = Arm(1, noise=0.03e-3).campaign(3)
     assert identified(trials).notes == []
-    wrong = [replace(trial, time=times * trial.time) for trial in trials]
+    wrong = [replace(trial, time=1e-3 * trial.time) for trial in trials]
     (note,) = pf.identify(pf.StepTrials(tuple(wrong), ()), period=0.028).notes
     assert note.endswith(" s behind its commands; is the unit of time wrong?")
-    assert float(note.split()[4]) == pytest.approx(times * (DELAY + TAU), rel=0.02)
+    assert float(note.split()[4]) == pytest.approx(1e-3 * (DELAY + TAU), rel=0.02)
 
 
 def test_sticking_trials_are_named_and_left_out() -> None:
@@ -192,15 +191,6 @@ def test_sticking_trials_are_named_and_left_out() -> None:
     axis = identified(trials).axes["radial"]
     assert set(axis.left_out) == {"radial-1", "radial-2"}
     assert all(why.startswith("hardly moved (stiction?)") for why in axis.left_out.values())
-
-
-def test_one_speed_gives_no_slope() -> None:
-    """The gain is then that of this speed."""
-    trials = [trial for trial in Arm(1, noise=0.03e-3, replicates=5).campaign(8) if trial.step == 0.008]
-    axis = identified(trials).axes["radial"]
-    assert axis.model.gain.slope == 0.0 and axis.model.gain.slope_ci95 is None
-    assert axis.gain_words == "slope 0: one speed only (0.29 m/s)"
-    assert axis.model.gain.intercept == pytest.approx(SLOPE * 0.008 / PERIOD + INTERCEPT, rel=0.01)
 
 
 def test_a_gain_that_is_no_line_is_called_none() -> None:

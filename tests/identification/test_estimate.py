@@ -48,7 +48,7 @@ def test_a_robust_mean_solves_hubers_equation() -> None:
 # ---- random effects -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("sd", [0.0, 0.002, 0.2])
+@pytest.mark.parametrize("sd", [0.0, 0.2])
 def test_equal_sds_give_ordinary_least_squares(sd: float) -> None:
     """A line of 20 values with the t-intervals of scipy's `linregress`; no sd at all likewise."""
     values = 1.0 + 0.05 * SPEEDS + scattered(4, 20, 0.01, np.full(20, 0.005))
@@ -59,8 +59,7 @@ def test_equal_sds_give_ordinary_least_squares(sd: float) -> None:
     np.testing.assert_allclose(halves, [t * line.intercept_stderr, t * line.stderr], rtol=1e-9)
 
 
-@pytest.mark.parametrize("between", [0.1, 1.0, 30.0])
-@pytest.mark.parametrize("design", [np.ones((20, 1)), LINE], ids=["mean", "line"])
+@pytest.mark.parametrize(("design", "between"), [(np.ones((20, 1)), 1.0), (LINE, 30.0)], ids=["mean", "line"])
 def test_the_variance_between_trials_is_paule_and_mandels(design: np.ndarray, between: float) -> None:
     """Weighted squares equal their degrees of freedom, weights are 1/(sd² + between²) with one `between`."""
     sd = np.geomspace(0.01, 0.2, 20)
@@ -79,7 +78,7 @@ def test_the_variance_between_trials_is_paule_and_mandels(design: np.ndarray, be
 # ---- what is degenerate ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("values", [[], [3.0], [3.0, 3.0], [3.0] * 6, [0.0] * 6, [1.0, 1.0, 1.0, 1.0, 2.0]], ids=str)
+@pytest.mark.parametrize("values", [[], [3.0], [0.0] * 6, [1.0, 1.0, 1.0, 1.0, 2.0]], ids=str)
 @pytest.mark.parametrize("sd", [0.0, 0.5])
 def test_degenerate_values_are_taken_without_a_warning(values: list[float], sd: float) -> None:
     """None or one: an open interval; equal ones: that value."""

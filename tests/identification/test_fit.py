@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -79,9 +78,9 @@ def finest(of: Trial, order: int) -> float:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("noise", [0.05e-3, 0.5e-3, 5e-3])
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize(("q", "p"), [SLOW, SWINGING])
+@pytest.mark.parametrize(
+    ("q", "p", "order", "noise"), [(*SLOW, 1, 5e-3), (*SLOW, 2, 0.05e-3), (*SWINGING, 2, 5e-3), (*SWINGING, 1, 0.5e-3)]
+)
 def test_a_fit_is_never_worse_than_a_fine_grid(q: float, p: float, order: int, noise: float) -> None:
     """Also when the noise is as large as the step and the sum of squares has many minima."""
     for seed in range(2):
@@ -89,10 +88,9 @@ def test_a_fit_is_never_worse_than_a_fine_grid(q: float, p: float, order: int, n
         assert fit_step(noisy, order).squares <= finest(noisy, order) * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("noise", [0.05e-3, 1e-3])
-def test_second_order_never_fits_worse_than_first(noise: float) -> None:
+def test_second_order_never_fits_worse_than_first() -> None:
     """First order is its p = 0."""
-    for first, second in fit_steps([trial(*SLOW, noise, seed) for seed in range(10)]):
+    for first, second in fit_steps([trial(*SLOW, 1e-3, seed) for seed in range(10)]):
         assert second.squares <= first.squares * (1.0 + 1e-12)
 
 
@@ -132,27 +130,16 @@ def test_flags_name_what_spoils_a_trial() -> None:
     assert flags(fit_step(trial(*SLOW, 0.01e-3), 1, 25)) == ["not settled: 84% reached"]
 
 
-def test_a_long_rest_that_is_sampled_slowly_changes_nothing() -> None:
-    """Beside a trial that is sampled evenly; the delays that are looked at are those between samples of the motion."""
-    even = trial(*SLOW)
-    rested = replace(
-        even, time=np.append(np.arange(-40.0, 0.0), TIMES), position=np.append(np.full(40, ZERO), even.position)
-    )
-    (first, _), (other, _) = fit_steps([rested, even])
-    np.testing.assert_allclose(first.shape, other.shape, rtol=0.0, atol=1e-6)
-
-
 # ---- the one search -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("order", "shape"), [(1, SLOW), (2, SWINGING)], ids=["first", "second"])
-def test_the_search_for_arms_finds_the_same_arm(order: int, shape: tuple[float, float], seed: int) -> None:
+def test_the_search_for_arms_finds_the_same_arm(order: int, shape: tuple[float, float]) -> None:
     """A trial as a run that rests and steps: delay and lag to 2e-6 s, gain to 2e-6, and never a lower sum of squares.
 
     Plain least squares from the arm that `tune` and `latency` begin with. Its derivatives are differences over 0.1 ms.
     """
-    one = trial(*shape, 1e-5, seed)
+    one = trial(*shape, 1e-5, 0)
     fit, n = fit_step(one, order), len(TIMES)
     run = Recording(
         told=np.array([-(10**9), 0]),

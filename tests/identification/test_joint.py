@@ -107,9 +107,10 @@ def unlike() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    "late", [(0.0604, 0.0551, 0.0687, 0.0313), (0.0, 0.0551, 0.0, 0.0313)], ids=["late", "at once"]
+    ("order", "plant", "late"),
+    [(*PLANTS[0], (0.0604, 0.0551, 0.0687, 0.0313)), (*PLANTS[1], (0.0, 0.0551, 0.0, 0.0313))],
+    ids=["late", "at once"],
 )
-@pytest.mark.parametrize(("order", "plant"), PLANTS)
 def test_the_least_squares_are_those_of_the_dense_problem(
     order: int, plant: tuple[float, float], late: Sequence[float]
 ) -> None:
@@ -144,11 +145,11 @@ def test_the_least_squares_are_those_of_the_dense_problem(
 # ---- errors ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("order", "plant"), [(1, FIRST), (2, SWINGING)])
-def test_influence_is_the_effect_of_leaving_a_trial_out(order: int, plant: tuple[float, float]) -> None:
+def test_influence_is_the_effect_of_leaving_a_trial_out() -> None:
     """The plant without it, of 12 alike trials: −influence √(1 − 1/n)/(n − 1)."""
+    order = 2
     n = 12
-    trials, _, _ = campaign(plant, 0.002, 9, jitter=0.0, n=n)
+    trials, _, _ = campaign(SWINGING, 0.002, 9, jitter=0.0, n=n)
     found = joined(trials, order)
     fits = fit_steps(trials)
     moved = []
@@ -196,7 +197,7 @@ def test_sds_of_delays_and_gains_are_those_of_regression(order: int, plant: tupl
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("damping", "noise"), [(0.7, 0.02), (1.4, 0.01), (2.0, 0.005), (3.0, 0.002)])
+@pytest.mark.parametrize(("damping", "noise"), [(0.7, 0.02), (3.0, 0.002)])
 def test_a_second_order_arm_is_found_to_be_one(damping: float, noise: float) -> None:
     """In 18 of 20 campaigns or more, also where its poles lie far apart; its delay is then in its interval in 15."""
     second = covered = 0

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as papq
 import pytest
 
 from pumafuse.identification.trials import StepTrials, TrialsError
@@ -46,20 +43,6 @@ def test_trials_come_in_the_order_of_the_list(tmp_path: Path) -> None:
     assert ((cut.time < 0.0).sum(), (cut.time >= 0.0).sum()) == (2, 4)
     np.testing.assert_array_equal(cut.position, first.position[:6])
     assert len(first.cut(None).time) == len(TIMES)
-
-
-def test_other_units_names_and_formats(tmp_path: Path) -> None:
-    """Milliseconds, micrometres, names of trials that are words; gzip and Parquet."""
-    text = "trial,axis,step_um\nfirst one,tip,4000\n"
-    (tmp_path / "trials.csv.gz").write_bytes(gzip.compress(text.encode()))
-    table = {"trial": ["first one"] * 12, "time_ms": np.arange(12) * 4.0, "position_m": np.arange(12) / 1e4}
-    papq.write_table(pa.table(table), tmp_path / "samples.parquet")
-    (trial,) = StepTrials.read(tmp_path).trials
-    assert (trial.name, trial.axis, trial.step) == ("first one", "tip", 0.004)
-    assert np.isnan(trial.speed)
-    assert trial.factors == {}
-    np.testing.assert_allclose(trial.time, np.arange(12) * 0.004, atol=1e-12)
-    np.testing.assert_array_equal(trial.position, np.arange(12) / 1e4)
 
 
 WHOLE = "1,radial,8,0.2857,350,a\n"

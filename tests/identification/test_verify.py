@@ -6,7 +6,6 @@ the true one, found from the run alone.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ import pumafuse as pf
 from pumafuse.arrays import FloatArray
 from pumafuse.filter.response import response
 from pumafuse.identification.verify import ModelFit, Trace
-from pumafuse.logs.frames import Rotated
 from pumafuse.model.plants import PLANTS
 from refusals import one_line
 
@@ -96,8 +94,7 @@ def test_the_error_of_a_true_model_is_exactly_the_noise(plant: PLANTS) -> None:
     assert 1.0 - 25.0 / len(SAMPLED) < (found.best_in_class.fit.rms / found.model.rms) ** 2 <= 1.0 + 1e-9
 
 
-@pytest.mark.parametrize("held", [1, 5])
-@pytest.mark.parametrize("recovery", [0.05, 0.14])
+@pytest.mark.parametrize(("recovery", "held"), [(0.05, 5), (0.14, 1)])
 def test_a_gain_that_recovers_recovers_as_the_arm_says(recovery: float, held: int) -> None:
     """With its own time constant the error is the noise, also under held commands; without recovery far more."""
     known, command = arm(recovery=recovery), BINARY[: TICKS // held]
@@ -149,15 +146,6 @@ def test_the_numbers_are_what_their_names_say() -> None:
     assert best.fit.fit == pytest.approx(100.0 * (1.0 - np.std(left) / np.std(measured)), rel=1e-6)
 
 
-def test_the_best_of_arms_whose_gain_recovers_is_one_of_them() -> None:
-    """Its own numbers make its error, also where a sensor's scale is wrong: no such arm stops beside its commands."""
-    measured = LOW + 1.05 * (moved(arm(recovery=0.1)) - LOW) + noise()
-    best = only(run_of(measured), arm(recovery=0.1), {"tip": LOW}).best_in_class
-    left = measured - moved(arm(best.plant, pf.Gain(intercept=best.gain), best.delay, 0.1))
-    assert best.fit.rms == pytest.approx(np.std(left), rel=1e-6)
-    assert best.fit.rms > 1.5 * NOISE
-
-
 # ---- the best in class ----------------------------------------------------------------------------------------------
 
 TRUE_GAIN = 0.9 + 0.1 * (HIGH - LOW) / PERIOD
@@ -175,7 +163,7 @@ def wrong(order: int, seed: int, delays: tuple[float, float]) -> pf.ArmModel:
     return arm(plant, pf.Gain(intercept=rng.uniform(0.3, 1.7)), rng.uniform(*delays))
 
 
-@pytest.mark.parametrize(("order", "seed", "delays"), [(1, 0, (0.03, 0.12)), (2, 1, (0.03, 0.12)), (2, 11, (0, 0.03))])
+@pytest.mark.parametrize(("order", "seed", "delays"), [(1, 0, (0.03, 0.12)), (2, 11, (0, 0.03))])
 def test_the_best_in_class_is_found_from_a_wrong_arm(order: int, seed: int, delays: tuple[float, float]) -> None:
     """Delay and gain of the true arm within 1 %, its plant within 3 %, wherever the search begins."""
     true, model = FIRST if order == 1 else SECOND, wrong(order, seed, delays)
@@ -226,72 +214,15 @@ def test_the_verdict_compares_with_the_best_in_class() -> None:
 # ---- the start level ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", [LOW, HIGH])
-def test_the_start_level_is_found_among_the_runs(level: float) -> None:
+def test_the_start_level_is_found_among_the_runs() -> None:
     """And that it was found, not known."""
-    found = only(run_of(moved(arm(), start=level) + noise()), arm())
-    assert found.start == level
+    found = only(run_of(moved(arm(), start=HIGH) + noise()), arm())
+    assert found.start == HIGH
     assert found.start_from == "chosen among the run's 2 levels by RMS"
     assert found.model.rms == pytest.approx(np.std(noise()), rel=1e-9)
 
 
-def test_a_start_level_that_is_given_is_believed() -> None:
-    """The run's, and before it the argument's, also where another fits better."""
-    position = moved(arm(), start=0.560) + noise()
-    own = only(run_of(position, start={"tip": 0.560}), arm())
-    argued = only(run_of(position, start={"tip": LOW}), arm(), {"tip": 0.560})
-    wrong = only(run_of(position, start={"tip": 0.560}), arm(), {"tip": HIGH})
-    assert (own.start, argued.start, wrong.start) == (0.560, 0.560, HIGH)
-    assert own.start_from == argued.start_from == wrong.start_from == "given"
-    assert own.model.rms == argued.model.rms == pytest.approx(np.std(noise()), rel=1e-9)
-    assert wrong.model.rms > 1.5 * own.model.rms
-
-
 # ---- sources --------------------------------------------------------------------------------------------------------
-
-
-def two_sensors(reference: bool) -> pf.Run:
-    position = moved(arm())
-    sensors = {"near": (SAMPLED, {"tip": position + noise(1)}), "far": (SAMPLED, {"tip": position + 3.0 * noise(2)})}
-    truth = (SAMPLED, {"tip": position + 0.1 * noise(3)}) if reference else None
-    return pf.Run.from_arrays(TIME, {"tip": BINARY}, sensors, truth)
-
-
-def test_the_reference_is_compared_with_where_there_is_one() -> None:
-    """Else every sensor, in the order of the run; those that are chosen, where some are."""
-    rms = {"near": np.std(noise(1)), "far": 3.0 * np.std(noise(2)), "reference": 0.1 * np.std(noise(3))}
-    for reference, sensors, expected in (
-        (True, None, ["reference"]),
-        (False, None, ["near", "far"]),
-        (True, ["far"], ["far"]),
-        (True, ["far", "reference"], ["far", "reference"]),
-    ):
-        found = [one for one, _ in pf.verify(two_sensors(reference), arm(), sensors=sensors)]
-        assert [one.source for one in found] == expected
-        for one in found:
-            assert one.model.rms == pytest.approx(rms[one.source], rel=1e-7)
-
-
-def test_a_log_in_world_coordinates_is_verified_in_the_arms() -> None:
-    """A rotated frame, x and y instead of axes, each axis with its own plant: the error of each is its noise."""
-    other = BINARY[::-1].copy()
-    along, across = moved(arm()) + noise(1), moved(arm(SECOND), other, other[0]) + noise(2)
-    angle = np.deg2rad(30.0)
-    turned = {
-        "x": np.cos(angle) * along - np.sin(angle) * across,
-        "y": np.sin(angle) * along + np.cos(angle) * across,
-    }
-    commands = {
-        "x": np.cos(angle) * BINARY - np.sin(angle) * other,
-        "y": np.sin(angle) * BINARY + np.cos(angle) * other,
-    }
-    run = pf.Run.from_arrays(TIME, commands, {"scope": (SAMPLED, turned)}, frame=Rotated(azimuth=math.radians(30.0)))
-    axes = {"radial": arm().axes["tip"], "tangential": arm(SECOND).axes["tip"]}
-    model = pf.ArmModel(name="turned", update_period=PERIOD, delay=DELAY, axes=axes)
-    start = {"radial": LOW, "tangential": float(other[0])}
-    found = {one.axis: one for one, _ in pf.verify(run, model, start=start)}
-    assert found["radial"].model.rms == pytest.approx(np.std(noise(1)), rel=1e-6)
-    assert found["tangential"].model.rms == pytest.approx(np.std(noise(2)), rel=1e-6)
 
 
 # ---- logs as they are -----------------------------------------------------------------------------------------------
@@ -351,6 +282,7 @@ def test_what_cannot_be_verified_is_refused_in_one_line() -> None:
 LIMITS = {"preset": (0.66e-3, 0.28e-3, 0.31e-3), "identified": (1.02e-3, 0.40e-3, 0.35e-3)}
 
 
+@pytest.mark.long
 def test_recorded_white_noise_is_met_as_well_as_promised() -> None:
     """The preset and an arm from 86 trials at 8 mm, tangential, radial, vertical: RMS within LIMITS."""
     identified = pf.identify(pf.StepTrials.read(RECORDED / "steps")).arm

@@ -144,7 +144,7 @@ def test_any_linear_axis_follows_its_differential_equation(
 NEAR_CRITICAL = [1.0 + sign * 10.0**-power for power in (6, 8, 9, 9.5, 10, 11, 12, 15.5) for sign in (-1, 1)]
 
 
-@pytest.mark.parametrize("damping", [1.0, *NEAR_CRITICAL], ids=lambda damping: f"{damping - 1.0:.1e}")
+@pytest.mark.parametrize("damping", [1.0, *NEAR_CRITICAL[::3]], ids=lambda damping: f"{damping - 1.0:.1e}")
 @pytest.mark.parametrize(("lag", "rel"), [(None, 5e-10), (1.0 / 53.9, 1e-7)], ids=["two", "three"])
 def test_poles_that_come_together_are_a_limit_and_not_a_cliff(lag: float | None, rel: float, damping: float) -> None:
     """Around critical damping, from either side, two poles agree with matrix exponentials to 5e-10, three to 1e-7."""
@@ -200,7 +200,7 @@ def play(position: Floats, width: float) -> Floats:
     return np.array(found)
 
 
-@pytest.mark.parametrize(("width", "noise"), [(0.0001, 0.0), (0.002, 0.0), (0.02, 0.0), (0.0006, 0.0005)])
+@pytest.mark.parametrize(("width", "noise"), [(0.002, 0.0), (0.0006, 0.0005)])
 def test_backlash_is_the_play_operator(width: float, noise: float) -> None:
     """The tool is where a plain loop over the motion's instants pushes it, noise included, to 1e-12 of the command."""
     command, process = random_walk(40), Process(input_noise=noise, drift=0.0)
@@ -209,8 +209,7 @@ def test_backlash_is_the_play_operator(width: float, noise: float) -> None:
     assert np.abs(loose.position - play(plain.position, width)).max() <= 1e-12 * np.abs(command).max()
 
 
-@pytest.mark.parametrize("plant", [FIRST, WEAK], ids=["first order", "second order"])
-@pytest.mark.parametrize("recovery", [None, 0.1])
+@pytest.mark.parametrize(("plant", "recovery"), [(FIRST, 0.1), (WEAK, None)], ids=["first order", "second order"])
 def test_a_limited_drive_and_a_load_are_the_responses(plant: FirstOrder | SecondOrder, recovery: float | None) -> None:
     """A fastest speed, play and sag without noise: what the core's closed forms say, to 1e-6 of a metre of motion.
 
@@ -228,15 +227,6 @@ def test_a_limited_drive_and_a_load_are_the_responses(plant: FirstOrder | Second
         assert np.abs(linear - expected).max() > 0.01
 
 
-def test_a_true_arm_may_have_no_limit_no_play_and_another_load() -> None:
-    """What is absent is as in the model; "none", 0 and a table of its own are not."""
-    model = AxisModel(plant=FIRST, max_speed=0.3, play=0.002, sag=Sag(slope=0.1))
-    same = TrueArm().over(model, 0.0, "true_arm")
-    assert (same.max_speed, same.backlash, same.sag) == (0.3, 0.002, Sag(slope=0.1))
-    other = TrueArm(max_speed="none", backlash=0.0, sag=Sag(slope=0.2)).over(model, 0.0, "true_arm")
-    assert (other.max_speed, other.backlash, other.sag) == (None, 0.0, Sag(slope=0.2))
-
-
 def test_slow_drift_is_a_sine_on_the_position() -> None:
     """A sin(2πt/P) from the first command on, whatever the plant does."""
     command, wanted = random_walk(40), grid(40, PERIOD)
@@ -245,12 +235,11 @@ def test_slow_drift_is_a_sine_on_the_position() -> None:
     assert difference == pytest.approx(0.0007 * np.sin(2.0 * np.pi * wanted / 1e9 / 0.9), abs=1e-14)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_commands_with_jittering_delays_do_not_overtake_one_another(seed: int) -> None:
+def test_commands_with_jittering_delays_do_not_overtake_one_another() -> None:
     """Even where the jitter is far beyond T the last command is where the arm ends, and a ramp never goes back."""
     axis = true_axis(FIRST, delay=0.05, delay_jitter=0.2)
     command = np.minimum(np.arange(1, 181), 60) * 0.001
-    position = motion(axis, command, rng=seed).position
+    position = motion(axis, command, rng=0).position
     assert np.diff(position).min() >= -1e-15
     assert position[-1] == pytest.approx(0.060, rel=1e-9)
 

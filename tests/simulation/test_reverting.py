@@ -33,7 +33,7 @@ def ornstein_uhlenbeck(apart: Floats, length: float) -> Floats:
     return SD**2 * np.exp(-apart / length)
 
 
-@pytest.mark.parametrize("length", [0.002, 0.3, 1e4])
+@pytest.mark.parametrize("length", [0.002, 1e4])
 @pytest.mark.parametrize(
     ("process", "expected"),
     [(reverting.smooth, matern), (reverting.rough, ornstein_uhlenbeck)],

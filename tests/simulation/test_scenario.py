@@ -34,53 +34,42 @@ def load(folder: Path, text: str) -> pf.Scenario:
 RASTER = '[trajectory]\nkind = "raster"\nwidth_mm = 100.0\nheight_mm = 1e6\npitch_mm = 1e-3\nspeed_m_s = 0.1\n'
 SCOPE = HEAD + ARM + STEPS + 'scope = "eye"\n'
 WRONG: dict[str, tuple[str, ...]] = {
-    "sped = 3\n" + WHOLE: ("'sped'", "did you mean 'seed'?", "trajectory"),
     WHOLE + "[filter.start]\noffset = 0.1\n": ("start.offset", "offset_sd_mm"),
     WHOLE + "[filter.sensor.eye]\nsd_mm = 1.0\n": ("'sensor'", "did you mean 'sensors'?"),
     WHOLE + "[filter.sensors.ear]\nsd_mm = 1.0\n": ("filter.sensors", "'ear'", "eye"),
-    WHOLE + "[filter.process.radail]\ndrift_mm_rts = 1.0\n": ("did you mean 'radial'?",),
     WHOLE.replace("0.5", "-0.5"): ("sensors.eye.sd_mm",),
-    HEAD + ARM + SENSOR: ("'trajectory' is missing",),
-    HEAD + 'arm = "arm.tml"\n' + HOLD: ("arm.tml", "puma560-internal, puma560-external"),
     WHOLE.replace('"hold"', '"rastr"'): ("trajectory.kind", "'rastr'", "did you mean 'raster'?", "white-noise"),
-    WHOLE.replace('"radial"', '"radail"'): ("'radail'", "did you mean 'radial'?"),
     HEAD + ARM + RASTER + 'along = "vertical"\n': ("across",),
     HEAD + ARM + RASTER + SENSOR: ("trajectory", "at most 200000"),
-    WHOLE + "[start]\nlevel = { radail_mm = 1.0 }\n": ("'radail'", "did you mean 'radial'?"),
     WHOLE + LEVEL.replace("500.0", "500.0, radial_m = 0.1"): ("start.level", "twice"),
-    WHOLE + 'axes = ["up"]\n': ("sensors.eye.axes", "'up'", *AXES),
     WHOLE + "bias_mm = { up = 1.0 }\n": ("sensors.eye.bias_mm", "'up'", *AXES),
-    WHOLE.replace("0.5", "{ radial = 0.5 }"): ("sensors.eye.sd_mm", "tangential"),
     HEAD + ARM + HOLD + SENSOR.replace("0.5", "{ x = 0.5 }") + LEVEL + FRAME: ("sensors.eye.sd_mm", "one number"),
     WHOLE + FRAME: ("start.level.radial_mm",),
     WHOLE + "outliers = { share = 0.1, from_mm = 5.0, to_mm = 1.0 }\n": ("sensors.eye.outliers", "to_mm"),
-    WHOLE + "outages_s = [[3.0, 2.0]]\n": ("sensors.eye.outages_s",),
     WHOLE.replace("30.0", "2143.0"): ("sensors.eye.rate_hz", "at most 2142.86", "2143"),
     WHOLE + "[reference]\nrows_per_command = 61\n": ("reference.rows_per_command", "60"),
-    WHOLE.replace("eye", "commands"): ("commands",),
     WHOLE.replace("eye", '"../eye"'): ("../eye",),
     WHOLE + "[true_arm.radial]\ndamping = 0.7\n": ("true_arm", "damping", "time_constant_ms"),
-    WHOLE + "[true_arm.radial]\nplant = 'second-order'\nnatural_frequency_rad_s = 40.0\n": ("'damping' is missing",),
     WHOLE + "[true_arm]\ngain_curve = { speed_m_s = [0.1, 0.0], gain = [1.0, 1.1] }\n": ("gain_curve", "ascend"),
     WHOLE + "[process]\ninput_noise_mm_rtHz = 1e160\n": ("process.input_noise_mm_rtHz", "size"),
     WHOLE.replace("0.2", "1e8"): ("trajectory", "at most 200000", "commands"),
-    WHOLE.replace("0.2", "1e15"): ("trajectory.duration_s", "nothing can be simulated"),
-    SCOPE.replace("eye", "ey") + SENSOR: ("trajectory.scope", "'ey'", "eye"),
     SCOPE + SENSOR + 'axes = ["radial"]\n': ("scope", "tangential"),
     SCOPE + SENSOR + LEVEL + FRAME: ("scope",),
     SCOPE + "rest_s = 0.3\nwindow_s = 0.31\n" + SENSOR: ("window_s", "rest_s"),
-    SCOPE + "replicates = 1000000\n" + SENSOR: ("trajectory.replicates", "10000"),
     WHOLE.replace('"hold"', '"path"').replace("duration_s = 0.2", 'file = "none.csv"'): ("none.csv", "no such file"),
 }
 
 
 @pytest.mark.parametrize("text", WRONG, ids=lambda text: text[-24:])
 def test_a_wrong_scenario_is_refused_in_one_line(text: str, tmp_path: Path) -> None:
-    """File, key and the accepted names; what the wrong ones are made of is right."""
+    """File, key and the accepted names."""
     message = one_line(pf.PumafuseError, lambda: load(tmp_path, text))
     assert "scenario.toml" in message and all(words in message for words in WRONG[text]), message
-    for right in (WHOLE, WHOLE + LEVEL + FRAME, SCOPE + "rest_s = 0.3\nwindow_s = 0.3\n" + SENSOR):
-        assert load(tmp_path, right).name == "test"
+
+
+@pytest.mark.parametrize("right", [WHOLE, WHOLE + LEVEL + FRAME, SCOPE + "rest_s = 0.3\nwindow_s = 0.3\n" + SENSOR])
+def test_what_the_wrong_ones_are_made_of_is_right(right: str, tmp_path: Path) -> None:
+    assert load(tmp_path, right).name == "test"
 
 
 def test_every_scenario_of_the_repository_loads_and_says_what_it_teaches() -> None:
@@ -158,8 +147,6 @@ def test_the_filter_is_configured_as_is_simulated(tmp_path: Path) -> None:
     ("override", "path", "value"),
     [
         ("[filter.sensors.eye]\nlatency_ms = 20.0\n", ("sensors", "eye", "latency_ms"), 0.020),
-        ("[filter.sensors.ear]\nsd_mm = 0.7\n", ("sensors", "ear", "sd_mm"), 7e-4),
-        ("[filter.sensors.eye]\ngate = 0.0\n", ("sensors", "eye", "gate"), 0.0),
         ("[filter.start]\noffset_sd_mm = 9.0\n", ("start", "offset_sd_mm"), 9e-3),
         ("[filter.process.radial]\ndrift_mm_rts = 3.0\n", ("process", "radial", "drift_mm_rts"), 3e-3),
     ],

@@ -101,30 +101,6 @@ def test_commands_are_given_at_their_ticks_and_logged_with_jitter(tmp_path: Path
     same_source(plain.reference, jittering.reference)
 
 
-def test_start_levels_are_in_the_run_and_in_every_measurement(tmp_path: Path) -> None:
-    """A level is where the arm rests before; with it everything is the same, that much higher."""
-    low, high = (
-        pf.simulate(load(tmp_path, BASE + more)).run
-        for more in ("", "[start]\noffset_sd_mm = 0.0\n" + "level = { radial_mm = 560.0 }\n")
-    )
-    assert low.start == {"tangential": 0.0, "radial": 0.0} and high.start == {"tangential": 0.0, "radial": 0.560}
-    for one, two in ((low.command, high.command), (low.sensors["eye"], high.sensors["eye"])):
-        assert two.values["radial"] - one.values["radial"] == pytest.approx(0.560, abs=1.1e-9)
-        assert np.array_equal(one.values["tangential"], two.values["tangential"])
-
-
-def test_a_sensor_of_axes_that_are_not_commanded_is_left_out(tmp_path: Path) -> None:
-    """Of some of them: it is there with the others; the rest of the run is as it was."""
-    plain = pf.simulate(load(tmp_path, BASE)).run
-    one = pf.simulate(load(tmp_path, BASE + EAR + 'axes = ["vertical"]\n'))
-    assert list(one.run.sensors) == ["eye"]
-    same_source(one.run.sensors["eye"], plain.sensors["eye"])
-    write(one, tmp_path / "run", force=False)
-    assert list(pf.Run.read(tmp_path / "run").sensors) == ["eye"]
-    two = pf.simulate(load(tmp_path, BASE + EAR + 'axes = ["vertical", "radial"]\n')).run
-    assert list(two.sensors["ear"].values) == ["radial"]
-
-
 ODD = """
 name = 'odd "name" \\ [x]'
 seed = 12345678901
@@ -228,8 +204,10 @@ def test_a_written_folder_is_the_run_and_makes_it_again(name: str, tmp_path: Pat
     assert all(one[f"{sensor}.csv"] != other[f"{sensor}.csv"] for sensor in run.sensors)
 
 
-@pytest.mark.parametrize("kind", ['kind = "cylindrical"', 'kind = "rotated"\nazimuth_deg = 37.0'])
-@pytest.mark.parametrize("positive", ["clockwise", "counterclockwise"])
+@pytest.mark.parametrize(
+    ("kind", "positive"),
+    [('kind = "cylindrical"', "clockwise"), ('kind = "rotated"\nazimuth_deg = 37.0', "counterclockwise")],
+)
 def test_a_log_in_x_y_z_gives_the_axes_back(kind: str, positive: str, tmp_path: Path) -> None:
     """Turned into axes, commands and reference are those of the same scenario without a frame, to rounding (2 nm)."""
     level = "[start]\noffset_sd_mm = 0.0\nlevel = { radial_mm = 560.0, tangential_mm = 0.0, vertical_mm = -100.0 }\n"
