@@ -13,7 +13,7 @@ import pumafuse as pf
 from pumafuse.fusion.consistency import consistency
 from pumafuse.fusion.verdicts import sentence
 from pumafuse.logs.frames import Cylindrical
-from pumafuse.views.figures import error_figure, fused_figure, path_figure, validation_figure
+from pumafuse.views.figures import error_figure, fused_figure, validation_figure
 
 NAMES = ("tangential", "radial", "vertical")
 
@@ -76,11 +76,10 @@ def panels(figure: Figure | None) -> float:
     [
         ({"axes": 2, "frame": True}, 2, 2),
         ({"axes": 1, "sensors": (), "reference": False}, 1, 0),
-        ({"axes": 1, "bias": -0.3, "scale": -1.0}, 1, 1),
     ],
 )
 def test_every_figure_is_drawn_for_every_kind_of_run(what: dict, rows: int, validated: int, tmp_path: Path) -> None:
-    """With and without reference, sensors, frame and bias: a whole picture each, and none where there is nothing."""
+    """With and without reference, sensors and frame: a whole picture each, and none where there is nothing."""
     est, _ = case(**what)
     drawn = [fused_figure(est), validation_figure(est)]
     if est.reference is None:
@@ -91,15 +90,6 @@ def test_every_figure_is_drawn_for_every_kind_of_run(what: dict, rows: int, vali
     assert list(map(panels, drawn)) == [2 * rows, validated, *([rows] if est.reference is not None else [])]
     for figure in filter(None, drawn):
         figure.savefig(tmp_path / "any.png")
-
-
-def test_a_path_is_drawn_where_there_are_x_y_and_z() -> None:
-    """With a frame, and of an arm with such axes; of tangential, radial, vertical, or of two axes, there is none."""
-    for what in ({"frame": True, "axes": 2}, {}):
-        assert path_figure(*case(**what)) is None
-    drawn = path_figure(*case(frame=True))
-    command, estimate = (np.array(line.get_data_3d()) for line in drawn.axes[0].lines)
-    assert np.abs(estimate[:, -1] - command[:, -1]).max() < 3.0  # mm
 
 
 def line(axes: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
@@ -129,49 +119,6 @@ def test_the_fused_figure_shows_command_estimate_measurements_and_reference() ->
             assert line(axes, label)[1] == pytest.approx(seen.values[name][~good] * 1e3)
 
 
-def test_bands_are_where_95_percent_of_errors_are() -> None:
-    """1.96 sd each way, in mm; below the estimate about 0."""
-    est, _ = case(axes=1)
-    for axes, centre in zip(fused_figure(est).axes[:4:2], (est["tangential"].position, 0.0), strict=True):
-        (band,) = [one for one in axes.collections if one.get_label() == "95 % band"]
-        edges = band.get_paths()[0].vertices
-        for sign in (-1.0, 1.0):
-            edge = 1e3 * (centre + sign * 1.959964 * est["tangential"].position_sd)
-            wanted = np.column_stack([est.time, edge])
-            apart = np.abs(wanted[:, None, :] - edges[None, :, :]).max(axis=2).min(axis=1)
-            assert apart.max() < 1e-6
-
-
-def test_below_it_is_what_each_measurement_leaves() -> None:
-    """Measurement − estimate; the band of the estimate; what the sensor's sd claims."""
-    est, _ = case(axes=1, scale=-1.0)
-    for axes in fused_figure(est).axes[2:4]:
-        _, left = line(axes, "camera")
-        measured = est.measured_positions("camera", NAMES[0])
-        expected = measured.value - np.interp(measured.time, est.time, est[NAMES[0]].position)
-        np.testing.assert_allclose(left, expected * 1e3)
-        claimed = sorted(one.get_ydata()[0] for one in axes.lines if one.get_linestyle() == ":")
-        assert claimed == pytest.approx([-1.96 * 0.5, 1.96 * 0.5], rel=1e-3)
-        assert axes.get_ylim()[1] < 5.0  # not flattened by the first sample
-
-
-def test_the_error_figure_draws_and_names_the_error() -> None:
-    """Its line is estimate − reference, its title the root mean square and the coverage that `score` finds."""
-    est, _ = case()
-    figure = error_figure(est)
-    for axes, name in zip(figure.axes, NAMES, strict=True):
-        found = pf.score(est.time, est.segment, est[name].position, est[name].position_sd, est.reference, name)
-        assert axes.get_title(loc="left") == (
-            f"{name}: RMS error {found.rmse * 1e3:.3f} mm; the 95 % band holds {found.coverage:.1%} of"
-            f" {found.rows} errors"
-        )
-        _, error = line(axes, "estimate")
-        true = np.interp(est.time, est.reference.time, est.reference.position[name])
-        known = np.isfinite(error)
-        assert known.sum() == found.rows
-        np.testing.assert_allclose(error[known], (est[name].position - true)[known] * 1e3, atol=1e-9)
-
-
 def test_the_validation_figure_draws_what_it_judges() -> None:
     """Each row: the fused components' ν/√S, their autocorrelation as bars, and the verdict above."""
     est, run = case(axes=2, outlier=True)
@@ -186,12 +133,3 @@ def test_the_validation_figure_draws_what_it_judges() -> None:
         assert len(mine.value) == len(run.sensors["camera"].stamp) - 1
         assert series.get_title(loc="left") == f"{name}, camera. {sentence(found)}"
         np.testing.assert_allclose([bar.get_height() for bar in correlation.patches[:20]], found.correlation)
-
-
-def test_the_title_names_the_sensors_that_are_fused() -> None:
-    """One that the configuration has not is in the run, and not in the title."""
-    _, run = case(sensors=("camera", "tracker"))
-    est, _ = case(sensors=("camera",))
-    with pytest.warns(pf.PumafuseWarning, match="tracker"):
-        title = fused_figure(pf.fuse(run, est.config)).get_suptitle()
-    assert "camera" in title and "tracker" not in title

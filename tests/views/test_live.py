@@ -23,9 +23,9 @@ import turning
 from pumafuse.fusion.placing import with_tool
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import Event
-from pumafuse.views import colours, live_drawer, live_viewer
+from pumafuse.views import colours, live_viewer
 from pumafuse.views import live as live_view
-from pumafuse.views.live import Frame, LiveView
+from pumafuse.views.live import LiveView
 from recordings import columns, series
 
 AXES = ("tangential", "radial", "vertical")
@@ -182,6 +182,7 @@ def newest(path: Path, entity: str, component: str, *, static: bool = False) -> 
     return np.array(found[-1].to_pylist()[-1])
 
 
+@pytest.mark.long
 def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(tmp_path: Path) -> None:
     """Its newest pose, its ellipsoid of 95 % ten times as large, the camera in the cell and its marker on the tool.
 
@@ -233,31 +234,6 @@ def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(tmp_path: Path) -> N
     assert nearest.argmin(axis=1)[red].tolist() == [200]
 
 
-def test_a_scaled_measurement_is_where_it_saw_the_tool() -> None:
-    """Z = −2 p, 8 ms late: the position at the valid time, and what it is off the estimate between two others."""
-    estimates = live_drawer.Recent(2)
-    estimates.add(np.array([[1.0, 1.1], [0.50, 0.60]]))
-    residuals = live_drawer.Residuals(pf.Sensor(sd=1e-3, scale=-2.0, latency=0.008), False, estimates)
-    residuals.add(np.array([[1.058], [-1.12], [0.0]]))
-    time_, position, residual, _ = residuals.take()
-    assert np.allclose([time_[0], position[0], residual[0]], [1.05, 0.56, 0.01])
-
-
-def test_more_than_a_plot_can_show_is_thinned_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A frame stays small however much comes between two."""
-    driven = Driven("connect")
-    frames: list[Frame] = []
-    monkeypatch.setattr(driven.view, "_write", frames.append)
-    driven.event(Event(100.0, "", dict.fromkeys(AXES, 0.5)))
-    now = driven.live.estimate(100.0)
-    for _ in range(100_000):
-        driven.view.estimate(now)
-    monkeypatch.setattr(live_view, "_FRAME", 0.0)
-    driven.tick()
-    assert 100 < len(frames[0]["estimate/radial"]) <= 1000
-    driven.view.close()
-
-
 @pytest.mark.long
 def test_a_drawing_process_that_stalls_holds_nothing_up() -> None:
     """Frames that do not fit into the pipe are left out and counted; the end is not waited for longer than 2 s."""
@@ -272,16 +248,6 @@ def test_a_drawing_process_that_stalls_holds_nothing_up() -> None:
     until(dropped)
     driven.view.close()
     assert child.returncode == -signal.SIGKILL
-
-
-def test_a_drawing_process_that_dies_is_reported_once() -> None:
-    """Once; after that events and estimates are ignored."""
-    driven = Driven("connect")
-    driven.child.kill()
-    until(lambda: driven.noticed("the drawing process ended by itself (signal 9)"))
-    driven.go(20)
-    driven.view.close()
-    assert sum("ended" in line for line in driven.notices) == 1
 
 
 def test_the_page_speaks_with_this_machine_only() -> None:
@@ -336,23 +302,3 @@ def test_nothing_is_left_when_the_estimator_is_killed() -> None:
             parent.kill()
     assert len(left) == 2
     until(lambda: not any(map(alive, left)))
-
-
-@pytest.mark.long
-def test_a_viewer_that_stalls_is_left_alone_until_it_goes_on(tmp_path: Path) -> None:
-    """Nothing piles up in the drawing process meanwhile; later measurements arrive after all."""
-    driven, path = Driven("connect"), tmp_path / "arrived.rrd"
-    with recording(path) as server:
-        until(lambda: driven.noticed("drawing into the viewer"))
-        driven.go(20)
-        server.send_signal(signal.SIGSTOP)
-        drawer, resident, begin = psutil.Process(driven.child.pid), [], time.monotonic()
-        while time.monotonic() < begin + 25.0:
-            driven.go(5)
-            time.sleep(0.02)
-            resident.append(drawer.memory_info().rss)
-        assert resident[-1] - resident[len(resident) // 2] < 20e6  # by then all the frames wait that ever will
-        server.send_signal(signal.SIGCONT)
-        later = 0.028 * driven.step
-        until(lambda: driven.go() or (len(found := series(path, "/radial/command")[0]) and found.max() > later - 1e-6))
-        driven.view.close()

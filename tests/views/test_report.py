@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,15 +69,6 @@ def test_names_are_text_and_nothing_else(tmp_path: Path) -> None:
     assert "<b>" not in text and "<i>" not in text
     outline(text)
     assert text == page_of(tmp_path / "b", trials("<b>&</b>", axis="<i>tip$x$"))
-
-
-def test_a_small_campaign_has_a_page_too(tmp_path: Path) -> None:
-    """One speed, and no factor that varies."""
-    bare = pf.StepTrials(tuple(replace(trial, factors={}) for trial in trials(speeds=1).trials), ())
-    text = page_of(tmp_path, bare)
-    outline(text)
-    assert "What the coefficients depend on" not in text
-    assert "one speed only" in text
 
 
 def test_a_verification_has_its_table_and_a_figure_for_each_run(tmp_path: Path) -> None:

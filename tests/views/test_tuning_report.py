@@ -9,19 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 import pumafuse as pf
 from outline import outline
-from pumafuse.filter.outcome import Outcome
-from pumafuse.fusion.consistency import consistency, densities_of
+from pumafuse.fusion.consistency import consistency
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.intervals import Profile
-from pumafuse.views import colours as style
-from pumafuse.views import tuning_report
 from pumafuse.views.tuning_report import page
-from tuning_runs import fitted, quietly, with_sensors
+from tuning_runs import fitted, quietly
 
 T, END = 0.02, 20.0
 STEADY = ("maneuver_noise_mm_rtHz_per_m_s", "maneuver_drift_mm_rts_per_m_s")  # fixed: the process noise is constant
@@ -92,6 +88,7 @@ def test_every_part_of_the_page_is_there_and_nothing_is_loaded() -> None:
         assert cells == [f"{one.before:.4g}", f"{one.value:.4g}", f"{low} to {high}", one.notes]
 
 
+@pytest.mark.long
 def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -> None:
     """At each closed end the curve is at −1.92, nowhere is it above 0, and it is 0 at the best value."""
     found, _ = tuned()
@@ -109,74 +106,6 @@ def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -
     assert ends == 9
     noise = curves["process.tip.input_noise_mm_rtHz"]  # its interval includes 0: on a linear scale, from 0 on
     assert not noise.log and noise.values[0] < 0.01 * noise.values[-1] and (np.diff(noise.drop) < 0.0).all()
-
-
-def test_the_profile_of_a_lone_parameter_is_the_likelihood_of_a_fusion() -> None:
-    """With all else fixed, the curve is the log density of what `fuse` reports, less the one at the best."""
-    run, config = recorded("tip", "camera", "a run"), known("tip", "camera")
-    found = quietly(lambda: pf.tune([run], config, fix=["process"], sd_prior=False, profiles=True))
-    (curve,) = drawn(found).values()
-    assert curve.key == "sensors.camera.sd_mm.tip"
-    assert curve.log
-
-    def height(sd: float) -> float:
-        est = pf.fuse(run, with_sensors(config, sd=sd))
-        return float(densities_of(est.measurements, est.config.sensors).sum())
-
-    heights = np.array([height(value * 1e-3) for value in curve.values])
-    np.testing.assert_allclose(curve.drop, heights - heights[np.argmax(curve.drop)], atol=1e-3)
-    assert curve.drop.min() < -3.0
-
-
-@pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures that were saved, kept to look into them."""
-    kept: list[Figure] = []
-    save = Figure.savefig
-
-    def keep(figure: Figure, *args: object, **more: object) -> None:
-        kept.append(figure)
-        save(figure, *args, **more)
-
-    monkeypatch.setattr(Figure, "savefig", keep)
-    return kept
-
-
-def test_panels_show_profile_interval_and_the_number_before(figures: list[Figure]) -> None:
-    """A panel for each: a curve through the profile, the interval shaded, a tick at what it was or an arrow to it."""
-    found, _ = tuned()
-    tuning_report.profile_figure(list(drawn(found).values()), fitted(found))
-    panels = {axes.get_title(loc="left").replace("\n", "."): axes for axes in figures[0].axes if axes.get_visible()}
-    assert panels.keys() == fitted(found).keys()
-    for key, axes in panels.items():
-        one, profile = fitted(found)[key], drawn(found)[key]
-        (curve,) = (line for line in axes.lines if len(line.get_xdata()) > 2)
-        at, drop = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
-        np.testing.assert_allclose(np.interp(profile.values, at, drop), profile.drop, atol=0.02)
-        (shaded,) = axes.patches
-        box = shaded.get_extents().transformed(axes.transData.inverted())
-        np.testing.assert_allclose((box.x0, box.x1), one.ci95, rtol=1e-6, atol=0.01 * at[-1])
-        ticks = [line.get_xdata()[0] for line in axes.lines if line.get_color() == style.REJECTED]
-        arrows = [text.get_text() for text in axes.texts]
-        within = one.before < profile.values[-1]
-        assert (ticks, arrows) == (([one.before], []) if within else ([], [f"{one.before:.4g} →"]))
-
-
-def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figure]) -> None:
-    """Those that were fused, over their standard deviations; and the autocorrelations of both."""
-    found, run = tuned()
-    pair = [pf.fuse(run, config) for config in (found.before, found.config)]
-    tests = tuple(consistency(est, "camera", "tip") for est in pair)
-    tuning_report.innovation_figure(*pair, "camera", "tip", tests)
-    *series, correlation = figures[0].axes
-    for axes, est in zip(series, pair, strict=True):
-        fused = est.measurements.where(est.measurements.outcome == Outcome.FUSED)
-        (dots,) = axes.lines
-        np.testing.assert_array_equal(dots.get_xdata(), fused.time)
-        np.testing.assert_array_equal(dots.get_ydata(), fused.innovation / fused.innovation_sd)
-    assert series[0].get_ylim() == series[1].get_ylim()
-    bars = [bar.get_height() for bars in correlation.containers for bar in bars]
-    np.testing.assert_array_equal(bars, np.concatenate([one.correlation for one in tests if one is not None]))
 
 
 def test_the_page_has_the_numbers_of_fusions_and_the_files_as_they_are_written(tmp_path: Path) -> None:
@@ -205,23 +134,12 @@ def test_the_page_has_the_numbers_of_fusions_and_the_files_as_they_are_written(t
 
 
 @pytest.mark.long
-def test_names_are_text_and_nothing_else() -> None:
-    """Runs, sensors and axes named like markup or mathematics are shown as they are written."""
-    found, run = tuned("<i>tip$x^$", "<b>&</b>", "<u>run</u>")
-    text = page(found, [run])
-    outline(text)
-    assert "sensors.&lt;b&gt;&amp;&lt;/b&gt;.sd_mm.&lt;i&gt;tip$x^$" in text
-    assert "Tuning: &lt;u&gt;run&lt;/u&gt;" in text
-    assert not re.search("<[biu]>", text)
-
-
-@pytest.mark.parametrize("after", ["searching", "validating"])
-def test_an_interrupted_tuning_has_a_page_too(after: str) -> None:
+def test_an_interrupted_tuning_has_a_page_too() -> None:
     """With what was fitted until then, and without profiles, as it is no maximum."""
     run = recorded("tip", "camera", "a run")
 
     def interrupt(what: str, _: object) -> None:
-        if what == after:
+        if what == "searching":
             raise KeyboardInterrupt
 
     found = quietly(lambda: pf.tune([run], known("tip", "camera"), fit=["noise"], progress=interrupt))
