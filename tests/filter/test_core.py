@@ -100,7 +100,7 @@ def test_what_a_measurement_does_not_see_keeps_its_bits() -> None:
     assert not outputs[Output.OFFSET].any() and (outputs[Output.OFFSET_SD] == FINEST).all()
 
 
-@pytest.mark.parametrize("beside", [1, 3, 6, 13, 30, 58])
+@pytest.mark.parametrize("beside", [1, 13, 58])
 @every_axis
 def test_an_axis_beside_one_with_more_states_gives_the_same_bits(axis: str, beside: int) -> None:
     """Whatever size the core takes for the two: outputs, innovations and their derivatives."""

@@ -136,7 +136,7 @@ def test_any_transition_is_that_of_the_plant(made: tuple[float, float, float]) -
     check(found(*made), wanted(*made), 2e-15 * blurred(*made), 1e-13)
 
 
-@pytest.mark.parametrize("zeta", DAMPINGS)
+@pytest.mark.parametrize("zeta", DAMPINGS[::2])
 @pytest.mark.parametrize("omega", [1e-3, 53.9])
 def test_a_transition_over_any_interval(omega: float, zeta: float) -> None:
     """From 1 ns to 1e5 s, densely where the plant answers: the same digits everywhere."""
@@ -158,7 +158,7 @@ def test_process_noise_is_a_covariance(made: tuple[float, float, float]) -> None
 
 
 @pytest.mark.parametrize("turn", [0.1, 0.5])
-@pytest.mark.parametrize("zeta", DAMPINGS)
+@pytest.mark.parametrize("zeta", DAMPINGS[1::2])
 def test_nothing_jumps_where_one_form_takes_over_from_another(zeta: float, turn: float) -> None:
     """On either side of the intervals where series end, and are lengthened, a transition is the same to 1e-13."""
     omega = 53.9

@@ -168,46 +168,26 @@ def test_presets_are_table_ii(preset: str, delay: float) -> None:
 
 
 REFUSED = {
-    "unknown key": ("[validity]", "colour = 3\n[validity]", "'colour'", TOP),
     "unknown key below": ("max_speed_m_s", "speed_m_s", "'validity.speed_m_s'", "max_speed_deg_s, max_radius_mm"),
-    "unknown gain key": ("slope_s_m", "slope", "'axes.radial.gain.slope'; did you mean 'slope_s_m'", "intercept_ci95"),
     "missing unit of a plant": ("natural_frequency_rad_s", "natural_frequency", "'axes.tangential.natural_frequency'",
                                 "natural_frequency_rad_s"),
-    "key of the other plant": ("0.864", "0.864\ntime_constant_ms = 3.0", "'axes.tangential.time_constant_ms'",
-                               "natural_frequency_rad_s, damping"),
     "text for a number": ("28.0", '"28"', "update_period_ms", "float"),
-    "number for a table": ("{ slope_s_m = 0.0818, intercept = 0.933 }", "0.9", "axes.radial.gain", "object"),
     "number for an axis": ("[axes.tangential]", "[axes]\nvertical = 3\n[axes.tangential]", "axes.vertical", "table"),
     "interval backwards": ("42.5", "42.5\nlag_ms_ci95 = [110.0, 95.0]", "axes.radial.lag_ms_ci95", "lower end first"),
-    "interval of a gain": ("0.933 }", "0.933, intercept_ci95 = [1, 0] }", "axes.radial.gain.intercept_ci95", "lower"),
-    "interval of one": ("60.45", "60.45\ndelay_ms_ci95 = [60.0]", "delay_ms_ci95", "length 2"),
-    "missing key": ("update_period_ms = 28.0", "", "'update_period_ms' is missing", ""),
     "missing key of a plant": ("damping = 0.864", "", "'axes.tangential.damping' is missing", ""),
     "not a number": ("0.864", "nan", "damping", "not a finite number"),
-    "beyond a float": ("0.933", "1e400", "intercept", "not a finite number"),
     "unknown plant": ('"first-order"', '"third-order"', "axes.radial.plant", "first-order, second-order"),
-    "plant of a wrong type": ('"first-order"', '["first-order"]', "axes.radial.plant", "first-order, second-order"),
-    "no plant": ('plant = "first-order"', "", "axes.radial.plant", "first-order, second-order"),
     "no axis": (ARM[ARM.index("[axes.t") : ARM.index("[prov")], "", "'axes' is missing", TOP),
-    "axes that are none": (ARM[ARM.index("[axes.t") : ARM.index("[prov")], "[axes]\n", "axes", "length >= 1"),
-    "integer beyond a float": ("28.0", "1" + "0" * 400, "update_period_ms", "not a finite number"),
     "exponent beyond decimal": ("28.0", "1e99999999999999999999", "number", "out of range"),
     "key with a newline": ("42.5", '42.5\n"a\\nb" = 1', "axes.radial", ""),
     "axis named like a unit": ("axes.radial", "axes.rail_mm", "axis 'rail_mm'", "must not end in a unit"),
-    "zero": ("42.5", "0.0", "axes.radial.time_constant_ms", "> 0"),
     "a period of nothing": ("28.0", "1e-160", "update_period_ms", ">= 0.001"),
-    "a frequency of nothing": ("natural_frequency_rad_s = 53.9", "natural_frequency_rad_s = 1e-160",
-                               "axes.tangential.natural_frequency_rad_s", ">= 1e-06"),
-    "a recovery of nothing": ("100.0", "1e-160", "axes.radial.gain_recovery_ms", ">= 0.001"),
     "negative": ("60.45", "-1.0", "delay_ms", ">= 0"),
-    "a speed of nothing": ("42.5", "42.5\nmax_speed_mm_s = 0.0", "axes.radial.max_speed_mm_s", "> 0"),
     "a speed of an angle": ("42.5", "42.5\nmax_speed_deg_s = 9.0", "axes.radial.max_speed_deg_s: for a length",
                             "max_speed_mm_s"),
     "a speed in m/s": ("42.5", "42.5\nmax_speed_m_s = 0.3", "'axes.radial.max_speed_m_s'", "max_speed_mm_s"),
     "play below nothing": ("42.5", "42.5\nplay_mm = -0.1", "axes.radial.play_mm", ">= 0"),
-    "play that is no number": ("42.5", "42.5\nplay_mm = nan", "axes.radial.play_mm", "not a finite number"),
     "unknown key of a sag": ("42.5", "42.5\nsag = { knee = 3.0 }", "'axes.radial.sag.knee'", "knee_mm"),
-    "a tool that goes backwards": ("42.5", "42.5\nsag = { slope = -1.0 }", "axes.radial.sag.slope", "> -1"),
     "a slope without a knee": ("42.5", "42.5\nsag = { slope_below = 0.1 }", "sag: knee_below", "slope_below"),
     "knees that have changed places": (
         "42.5",
@@ -216,7 +196,6 @@ REFUSED = {
         "above the knee",
     ),
     "a knee without a slope": ("42.5", "42.5\nsag = { knee_mm = 3.0 }", "sag: a knee", "slope_beyond"),
-    "not TOML": ("name = ", "name = = ", "not valid TOML", ""),
 }  # fmt: skip
 
 
@@ -237,10 +216,9 @@ def test_a_wrong_file_is_refused_in_one_line(load, tmp_path: Path, old: str, new
     ("source", "message"),
     [
         ("puma650-internal", r"puma650-internal: .*puma560-internal, puma560-external"),
-        (".", r"\.: cannot be read"),
         ("x" * 300, "no such arm file"),
     ],
-    ids=["misspelled preset", "folder", "name too long for a file"],
+    ids=["misspelled preset", "name too long for a file"],
 )
 def test_a_source_that_is_no_arm_is_refused(source: str, message: str) -> None:
     """Neither a file nor a preset; the presets are named."""

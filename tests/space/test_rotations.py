@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from pumafuse.space import rotations
 
-UP_TO_PI = 3.14
 vectors = arrays(np.float64, (5, 3), elements=st.floats(-1.8, 1.8))
 letters = st.sampled_from(["ZYX", "xyz", "XYZ", "ZXZ", "zyz", "yxz"])
 
