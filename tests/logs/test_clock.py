@@ -210,15 +210,6 @@ def test_a_clock_that_is_set_back_for_the_commands_only_is_refused(reference_sta
         assert words in text
 
 
-def test_stamps_as_far_apart_as_they_may_be_are_a_jump() -> None:
-    """From one end of what is read to the other the clock is set back by 292 years: no difference overflows."""
-    last = 4_599_999_999 * SECOND
-    run = Run.from_arrays([last, -last], {"radial": [0.0, 1.0]})
-    parts, (note,) = segments(run)
-    assert [part.command.stamp.tolist() for part in parts] == [[last], [-last]]
-    assert "9199999998.000 s" in note
-
-
 def test_stamps_that_are_no_clock_are_refused() -> None:
     nonsense = np.random.default_rng(0).integers(0, 1000 * SECOND, 1000).tolist()
     assert "host.csv" in refusal(lambda: segments(recorded(nonsense, {"tracker": nonsense})))

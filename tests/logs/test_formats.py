@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import struct
 import sys
 from collections.abc import Callable
 from datetime import datetime, timedelta
@@ -19,10 +18,9 @@ from scipy.io import savemat
 import pumafuse as pf
 from discovery.test_survey import written
 from pumafuse.arrays import FloatArray
-from pumafuse.discovery.contents import parts_of
 from pumafuse.discovery.survey import survey
 from pumafuse.errors import PumafuseError, RunError
-from pumafuse.logs import formats, tables
+from pumafuse.logs import tables
 from px4_files import write_ulg
 from refusals import one_line
 
@@ -111,17 +109,6 @@ def test_a_log_of_several_tables_is_found_and_read_again(write: Callable[[Path],
         assert np.allclose(read.command.values[axis], told, atol=1e-6)
 
 
-def test_a_damaged_log_of_px4_is_said_to_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What its reader prints is a warning, and does not get among what a command prints."""
-    file = ulg(tmp_path)
-    content = bytearray(file.read_bytes())
-    content[-21:] = struct.pack("<HBHQff", 18, ord("D"), 77, 0, 0.0, 0.0)  # the last row, of no topic
-    file.write_bytes(content)
-    with pytest.warns(pf.PumafuseWarning, match=r"log\.ulg: damaged, and read as far as it goes; pyulog says: "):
-        assert len(formats.names(file)) == 2
-    assert capsys.readouterr().out == ""
-
-
 @pytest.mark.parametrize("ending", ["npy", "npz", "mat", "json", "lines", "split", "xlsx"])
 def test_a_single_table_needs_no_name(ending: str, tmp_path: Path) -> None:
     """A structured array, arrays, a struct, records, lines of them, pandas' split, a sheet: a run in one table."""
@@ -157,16 +144,6 @@ def test_a_single_table_needs_no_name(ending: str, tmp_path: Path) -> None:
     assert np.array_equal(found.sensors["laser"].values["z"], plain.sensors["laser"].values["z"])
 
 
-def test_an_array_without_names_is_a_table_without_a_header(tmp_path: Path) -> None:
-    """Its columns are numbered, whichever way it lies."""
-    np.save(tmp_path / "a.npy", np.column_stack([TIME, TOLD]))
-    np.save(tmp_path / "b.npy", np.column_stack([TIME, TOLD]).T)
-    for name in ("a.npy", "b.npy"):
-        found = tables.read(tmp_path / name)
-        assert list(found.columns) == ["column 1", "column 2", "column 3"]
-        assert np.array_equal(found.plain("column 3")[0], TOLD[:, 1])
-
-
 def test_what_cannot_be_read_says_how_to_convert_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pickled objects are never loaded; HDF5, torn and empty files, other formats, and a missing library."""
 
@@ -196,21 +173,6 @@ def test_what_cannot_be_read_says_how_to_convert_it(tmp_path: Path, monkeypatch:
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     (tmp_path / "later.xlsx").write_bytes(b"PK")
     assert "pip install 'pumafuse[formats]'" in refusal("later.xlsx")
-
-
-def test_each_of_a_list_of_trials_is_a_table(tmp_path: Path) -> None:
-    """Records with longer lists than there are records are runs; with the joints of an arm they are rows."""
-    told = np.sin(0.3 * np.arange(60))
-    trials = [{"kind": "prbs", "actions": told.tolist(), "sensor": (0.9 * told).tolist(), "notes": []}] * 20
-    trials[7] = {key: value[:12] if isinstance(value, list) else value for key, value in trials[7].items()}
-    path = tmp_path / "log.json"
-    path.write_text(json.dumps({"config": {"limits": [-1.0, 1.0]}, "data": trials}))
-    assert formats.names(path)[:20] == [f"data[{place}]" for place in range(20)]
-    assert tables.read(path, topic="data[3]").plain("sensor")[0].tolist() == (0.9 * told).tolist()
-    first = next(part for part in parts_of(path, 50.0) if part.signals)
-    assert first.notes == ("19 other tables, a run each, left out: data[1] …",)
-    path.write_text(json.dumps([{"t": 0.1 * place, "q": told[:26].tolist()} for place in range(300)]))
-    assert formats.names(path) == [""] and tables.read(path).rows == 300
 
 
 def test_arrays_of_a_folder_are_columns_beside_the_one_that_is_their_clock(tmp_path: Path) -> None:
@@ -263,14 +225,6 @@ def test_rows_that_are_signals_are_columns(kind: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(run.command.stamp / 1e9, TIME, atol=1e-9)
     for axis, value in found.run.command.values.items():
         assert np.array_equal(run.command.values[axis], value)
-
-
-def test_rows_of_a_wide_table_are_rows(tmp_path: Path) -> None:
-    """Scans of a range finder: smooth along a row, and as smooth from one to the next."""
-    bearing = np.linspace(0.0, 3.0, 720)
-    scans = [3.0 + np.sin(bearing + 0.01 * n) + 0.2 * np.cos(5.0 * bearing) for n in range(30)]
-    np.savetxt(tmp_path / "scans.csv", scans, delimiter=",")
-    assert len(tables.read(tmp_path / "scans.csv").names) == 720
 
 
 @pytest.mark.parametrize("name", ["arm", "arm.xls"])

@@ -123,16 +123,6 @@ def test_sensors_are_placed_by_the_command_of_their_own_time() -> None:
     np.testing.assert_allclose(found, [0.5 * 4.0 * math.pi, 0.0], atol=EXACT)
 
 
-def test_the_start_level_places_the_frame() -> None:
-    """R0, θ0 and the turn are those of [command.start]: from 179°, 0.4 m out, to −179° are 2° on, not 358° back."""
-    start = {"x": 0.4 * math.cos(math.radians(179.0)), "y": 0.4 * math.sin(math.radians(179.0)), "z": 0.1}
-    to = {"x": [0.6 * math.cos(math.radians(-179.0))], "y": [0.6 * math.sin(math.radians(-179.0))], "z": [0.2]}
-    found = in_axes(pf.Run.from_arrays(stamps(1), to, start=start, frame=Cylindrical()), None)[0]
-    assert found.command.values["tangential"] == pytest.approx(0.4 * math.radians(2.0))
-    assert found.command.values["radial"] == pytest.approx(0.6)
-    assert dict(found.start) == pytest.approx({"tangential": 0.0, "radial": 0.4, "vertical": 0.1})
-
-
 def test_without_a_start_level_the_first_command_places_the_frame() -> None:
     """First by its stamp, not by its row, and only if it has both x and y."""
     time = stamps(4)[[2, 1, 0, 3]]

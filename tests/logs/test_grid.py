@@ -186,15 +186,6 @@ def test_of_all_rows_of_ticks_the_cheapest_is_found(places: list[float]) -> None
     assert cost(place - ticks).sum() == pytest.approx(least, abs=1e-9)
 
 
-def test_more_stamps_than_ticks_about_them_are_no_row() -> None:
-    text = refusal(
-        lambda: regular_grid(
-            np.sort(np.append(grid_of(np.arange(300)), grid_of(np.arange(50, 51)) + np.arange(1, 13))), PERIOD, "host"
-        )
-    )
-    assert "of 312 are stamped nearest to the tick of the one before" in text
-
-
 @pytest.mark.parametrize(("period", "jitter"), [(0.0033367, 0.02), (0.101, 0.15)])
 def test_the_ticks_of_a_sensor_are_found_in_its_stamps(period: float, jitter: float) -> None:
     """With one row in ten missing, as well as the jitter lets a straight line through the stamps tell it."""

@@ -12,7 +12,6 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.axes import in_axes
-from pumafuse.space.kinematics import Joints
 
 RECORDED = Path(__file__).parents[1] / "space" / "commands.csv"  # joints and the poses that they are, of a PUMA 560
 URDF = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"
@@ -89,38 +88,6 @@ def test_an_arm_whose_joints_lag_apart_says_where_they_are_not_heeded(tmp_path: 
     np.testing.assert_array_equal(heeded.command.values["x"], run.command.delayed({"j2": 0.03}).values["x"])
     assert [note for note in posed.notes if "j2 30 ms" in note and "not heeded" in note]
     np.testing.assert_array_equal(posed.command.values["x"], run.command.values["x"])
-
-
-def test_a_clock_that_is_set_back_begins_anew(tmp_path: Path) -> None:
-    """What is told after it is later by what was told after it."""
-    command = read(tmp_path, ROBOT + HEAD + JOINTS).command
-    half = len(command.stamp) // 2
-    stamp = command.stamp - np.where(np.arange(len(command.stamp)) < half, 0, 100_000_000_000)
-    whole = replace(command, stamp=stamp).delayed({"j2": 0.05}).joints
-    parts = [command.rows(rows).delayed({"j2": 0.05}).joints for rows in (slice(None, half), slice(half, None))]
-    np.testing.assert_allclose(whole.values, np.concatenate([part.values for part in parts if part]), atol=1e-12)
-
-
-def test_rows_in_any_order_and_rows_without_a_value_are_told_later_all_the_same(tmp_path: Path) -> None:
-    """Two neighbours that are exchanged have what they have in order; a row without a joint is as if it were not."""
-    command = read(tmp_path, ROBOT + HEAD + JOINTS).command
-    rows = np.arange(len(command.stamp))
-    exchanged, others, late = rows.copy(), np.delete(rows, 60), {"j2": 0.05, "j5": 0.01}
-    exchanged[[40, 41]] = 41, 40
-    values = command.joints.values.copy()
-    values[60, 3] = np.nan
-    whole, mixed, lacking, without = (
-        one.delayed(late).joints
-        for one in (
-            command,
-            command.rows(exchanged),
-            command.posed(Joints(command.joints.chain, values)),
-            command.rows(others),
-        )
-    )
-    np.testing.assert_array_equal(mixed.values, whole.values[exchanged])
-    np.testing.assert_array_equal(lacking.values[others], without.values)
-    assert np.isnan(lacking.values[60, 3])
 
 
 def test_commands_between_commands_are_on_the_line_of_joints(tmp_path: Path) -> None:

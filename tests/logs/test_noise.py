@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.errors import ConfigError, RunError
+from pumafuse.errors import ConfigError
 from pumafuse.logs.save import save
 
 ARM = pf.ArmModel(
@@ -97,18 +97,3 @@ def test_it_is_saved_with_the_run(tmp_path: Path) -> None:
 def test_what_says_too_much_or_too_little_is_refused(noise: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=words):
         pf.Run.read(written(tmp_path, noise, FACTOR))
-
-
-def test_commands_and_references_have_none(tmp_path: Path) -> None:
-    folder = written(tmp_path, "{ sd = 'told', typical = 1.0 }", FACTOR)
-    text = (folder / "run.toml").read_text()
-    (folder / "run.toml").write_text(text.replace('x = "x_mm"', 'x = "x_mm"\nnoise = { sd = "t_s", typical = 1 }', 1))
-    with pytest.raises(ConfigError, match=r"command\.noise: only rows of sensors"):
-        pf.Run.read(folder)
-
-
-def test_arrays_of_no_positive_numbers_are_refused() -> None:
-    with pytest.raises(RunError, match="only rows of sensors"):
-        pf.Run.from_arrays(GIVEN, COMMAND | {"noise": np.ones(len(GIVEN))})
-    with pytest.raises(RunError, match="noise is by what"):
-        pf.Run.from_arrays(GIVEN, COMMAND, {"camera": (SEEN, {"x": MEASURED, "noise": FACTOR - 0.5})})

@@ -47,7 +47,11 @@ def expected(config: pf.FusionConfig, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.mark.parametrize(
-    "kind", ["mcap-lz4", "json", "protobuf", "db3-zstd", "mcap-folder", "bag-bz2", "bag-lz4", "rrd"]
+    "kind",
+    [
+        *("mcap-lz4", "json", "protobuf", "db3-zstd", "mcap-folder", "bag-bz2", "bag-lz4", "rrd"),
+        *(pytest.param(kind, marks=pytest.mark.long) for kind in ("mcap", "mcap-plain", "db3", "bag")),
+    ],
 )
 def test_a_recording_fuses_bit_for_bit_like_the_same_data_in_csv(
     kind: str, config: pf.FusionConfig, expected: pf.Estimates, tmp_path: Path
@@ -86,14 +90,6 @@ def test_topics_are_listed_with_type_number_and_numeric_fields(kind: str, tmp_pa
         }
 
 
-def test_only_fields_that_are_asked_for_are_kept(tmp_path: Path) -> None:
-    """A field path keeps the field at its beginning, and the names of the others, for those who err."""
-    path = written(tmp_path, KINDS["mcap"], motion(5))
-    table = recordings.read(path, "/command", ["pose.position.x"])
-    assert set(table.columns) == {"pose", "log_time"}
-    assert set(table.names) == {"header", "pose", "log_time"}
-
-
 def test_rows_are_in_the_order_of_recording(tmp_path: Path) -> None:
     """Chunks of a file and files of a folder may overlap in time; what was recorded first comes first."""
     samples = motion(40)
@@ -104,15 +100,6 @@ def test_rows_are_in_the_order_of_recording(tmp_path: Path) -> None:
     mine = [sample for sample in samples if sample.topic == "/level"]
     assert table.columns["data"].to_pylist() == [sample.numbers[0] for sample in mine]
     assert table.columns["log_time"].cast(pa.int64()).to_pylist() == [sample.logged for sample in mine]
-
-
-def test_rows_can_be_chosen_in_a_recording(tmp_path: Path) -> None:
-    path = written(tmp_path, KINDS["mcap"], motion(5))
-    number = motion(5)[-1].numbers[0]
-    table = tables.read(path, topic="/level", fields=["data"], where={"data": number})
-    assert table.columns["data"].to_pylist() == [number]
-    text = one_line(RunError, lambda: tables.read(path, topic="/level", fields=["data"], where={"data": 77.0}))
-    assert "no row has data = 77.0" in text
 
 
 @pytest.mark.parametrize(
@@ -472,14 +459,6 @@ def test_paths_that_are_no_recordings_say_why(tmp_path: Path) -> None:
     path = next(written(tmp_path, KINDS["db3"], motion(5)).glob("*.db3"))
     path.with_name(f"{path.name}-wal").write_bytes(b"123")
     assert "wal_checkpoint" in one_line(RunError, lambda: recordings.read(path, "/level"))
-
-
-def test_a_library_that_is_missing_is_named_by_what_installs_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    path = written(tmp_path, KINDS["mcap"], motion(5))
-    monkeypatch.setitem(sys.modules, "mcap.stream_reader", None)
-    assert "pip install 'pumafuse[bags]'" in one_line(RunError, lambda: recordings.read(path, "/level"))
 
 
 def test_tables_cost_no_library_of_recordings(tmp_path: Path) -> None:

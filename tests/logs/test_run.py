@@ -92,16 +92,6 @@ def test_a_manifest_says_where_everything_stands(folder: Path) -> None:
     assert (run.start, run.clock, run.notes) == ({"radial": 0.5605}, "stamps", ())
 
 
-def test_notes_of_a_table_are_noted_once(folder: Path) -> None:
-    """A torn line and a word are noted once each, though command and sensor read the same file and column."""
-    (folder / "host.csv").write_text("t_ms,nominal_mm,correction_um,z_m\n0,560,500,0\n28,bad,0,1\n56,562\n")
-    sensor = '[sensors.own]\nfile = "host.csv"\ntime = "t_ms"\nradial = "nominal_mm"\n'
-    run = read(folder, COMMAND + sensor)
-    torn, word = run.notes
-    assert "line 4" in torn
-    assert "'bad' in row 2" in word
-
-
 MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     # what the manifest says: what the one line must name
     "no command at all": ("", ("run.toml", "'command'")),
@@ -160,20 +150,6 @@ def test_a_wrong_single_table_is_refused_in_one_line(tmp_path: Path, header: str
     row = ",".join(["1"] * len(header.split(",")))
     text = refusal(lambda: single(tmp_path, f"{header}\n{row}\n"))
     assert all(words in text for words in named), text
-
-
-def test_arrays_are_copied() -> None:
-    time, value = np.array([0, 28_000_000]), np.array([1.0, 2.0])
-    command, start = {"radial": value}, {"radial": 0.5}
-    run = Run.from_arrays(time, command, {"tracker": (time, {"radial": value})}, (time, {"radial": value}), start=start)
-    time += 1
-    value += 1.0
-    command.clear()
-    start["radial"] = 7.0
-    assert run.reference is not None
-    for source in (run.command, run.sensors["tracker"], run.reference):
-        check_source(source, [0, 28_000_000], radial=[1.0, 2.0])
-    assert run.start == {"radial": 0.5}
 
 
 def test_stamps_of_arrays_are_seconds_or_whole_nanoseconds() -> None:

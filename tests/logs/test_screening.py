@@ -9,7 +9,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.arrays import FloatArray
-from pumafuse.logs.screening import Habit, lost
+from pumafuse.logs.screening import lost
 
 PERIOD, LAG = 0.025, 0.075  # s
 TIME = PERIOD * np.arange(2400)
@@ -124,19 +124,6 @@ def test_a_sensor_without_noise_at_rest_is_not_held() -> None:
         assert "held" not in est.counts["rule"], notes
 
 
-def test_a_habit_is_of_values_that_are_held_not_of_rests_and_coarse_steps() -> None:
-    """Long rests are few rows of equal values; a slow motion through coarse steps changes by one step at a time."""
-    rng = np.random.default_rng(1)
-
-    def times(value: FloatArray) -> int:
-        begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)
-        return Habit.of(np.abs(np.diff(value[begin])), np.diff(begin)).times
-
-    moves = np.concatenate([np.zeros(900), np.cumsum(rng.uniform(0.0, 20.0, 100)), np.full(500, 1e3)])
-    assert times(np.rint(moves)) == times(np.rint(0.2 * np.arange(1000))) == 1
-    assert times(np.repeat(rng.standard_normal(300), 3)) == 3
-
-
 def live(command: FloatArray, value: FloatArray) -> tuple[FloatArray, pf.LiveEstimator, list[str]]:
     said = list[str]()
     found, estimator = np.empty(len(command)), pf.LiveEstimator(CONFIG, on_notice=said.append)
@@ -165,7 +152,7 @@ def test_live_a_doubtful_command_waits_for_the_next() -> None:
 def test_live_a_sensor_that_froze_is_held() -> None:
     """The estimate goes on with the commands, and the axis is stale; said once, and counted."""
     value = VALUE.copy()
-    value[700:1100] = value[699] if None is None else None
+    value[700:1100] = value[699]
     found, estimator, said = live(PATH, value)
     clean, _, _ = live(PATH, VALUE)
     assert np.abs(found - clean).max() < 5e-3

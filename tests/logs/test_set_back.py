@@ -166,14 +166,3 @@ def test_a_long_run_is_to_be_cut_there(tmp_path: Path, monkeypatch: pytest.Monke
         fusing.fuse_to(tmp_path, tmp_path / "out", CONFIG)
     whole = pf.Run.read(tmp_path)
     assert np.abs(going_on(whole)[0].command.stamp - logged().command.stamp).max() <= 1
-
-
-def test_rows_without_a_stamp_are_skipped() -> None:
-    run, right = logged({8.0: 0.3}), logged()
-    stamp = run.command.stamp.copy()
-    stamp[[100, 290, 500]] = np.iinfo(np.int64).min
-    found, notes = going_on(replace(run, command=replace(run.command, stamp=stamp)))
-    known = stamp != np.iinfo(np.int64).min
-    assert len(notes) == 1
-    assert np.abs(found.command.stamp - right.command.stamp)[known].max() <= 1
-    assert (found.command.stamp[~known] == stamp[~known]).all()

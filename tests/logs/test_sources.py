@@ -315,19 +315,6 @@ def test_when_rows_came_is_a_column_of_any_unit(tmp_path: Path) -> None:
     )
 
 
-def test_axes_with_stamps_of_their_own_are_interpolated_each(tmp_path: Path) -> None:
-    """Each has the values that it has alone, whatever lies between its rows."""
-    time, joint = np.arange(200) * 0.05 + 1e-3 * (np.arange(200) % 2), np.tile(["elbow", "wrist"], 100)
-    columns = {"t_s": time, "joint": joint, "goal": np.sin(time)}
-    axis = '{0} = {{ column = "goal", unit = "rad", where = {{ joint = "{0}" }} }}'.format
-    both = read(tmp_path, f'time = "t_s"\ninterpolation_ms = 10\n{axis("elbow")}\n{axis("wrist")}', columns).command
-    for one in ("elbow", "wrist"):
-        alone = read(tmp_path, f'time = "t_s"\ninterpolation_ms = 10\n{axis(one)}', columns).command
-        assert len(alone.stamp) == 991
-        known = np.isfinite(both.values[one])
-        same(alone, both.stamp[known], **{one: both.values[one][known]})
-
-
 def test_a_value_of_where_is_in_the_unit_of_its_column(tmp_path: Path) -> None:
     """``height_mm = 250`` finds the rows with 250 in them, though Python is in metres."""
     run = read(tmp_path, f"{AXIS}\nwhere = {{ height_mm = 250 }}", episodes(height_mm=np.arange(ROWS) // 50 * 50))
@@ -374,19 +361,6 @@ def test_only_what_is_asked_for_is_read_of_parquet(tmp_path: Path) -> None:
     same(Run.read(tmp_path).command, STAMP[192:256], x=X[192:256])
     (tmp_path / "run.toml").write_text(f'[command]\nfile = "log.parquet"\n{AXIS}', encoding="utf-8")
     assert "log.parquet" in refusal(lambda: Run.read(tmp_path))
-
-
-def test_dates_with_and_without_a_zone_are_told_of_two_sources_and_refused_in_one(tmp_path: Path) -> None:
-    """Without a zone is UTC: beside another clock that says its zone it may be an error of hours."""
-    sensor = '[sensors.s]\nfile = "log.parquet"\ntime = "other"\nx = "x_m"'
-    columns = {"t": texts(""), "other": texts("Z"), "x_m": X}
-    run = read(tmp_path, f'time = "t"\nx = "x_m"\n{sensor}', columns)
-    same(run.sensors["s"], STAMP, x=X)
-    same(run.command, STAMP, x=X)
-    assert run.notes == ("command: dates without a time zone, beside sensor s with one: taken as UTC",)
-    columns["t"] = [*texts("")[:-1], texts("Z")[-1]]
-    text = refusal(lambda: read(tmp_path, 'time = "t"\nx = "x_m"', columns))
-    assert f"a date with a time zone in row {ROWS}" in text and "a date without one in row 1" in text
 
 
 def moving(ticks: npt.NDArray[np.float64], rows: int = 7500, rate: float = 125.0) -> tuple[Any, Any]:

@@ -310,19 +310,6 @@ def test_a_text_without_sense_is_a_table_or_one_line(tmp_path: Path, text: str) 
         assert table.names == ("t_s", "q") or text in NO_HEADER
 
 
-def test_a_mark_of_inches_opens_no_cell(tmp_path: Path) -> None:
-    """Of a quote that does not begin a cell nothing goes on in the next line."""
-    table = csv(tmp_path, 't_s,Length ("),x_mm\n0,1,2\n1,3",4\n2,5,6\n')
-    assert table.names == ("t_s", 'Length (")', "x_mm")
-    assert table.plain("x_mm")[0].tolist() == [2.0, 4.0, 6.0]
-
-
-def test_a_header_may_be_longer_than_what_is_looked_at(tmp_path: Path) -> None:
-    names = [f"sensor{n}.position_mm" for n in range(10_000)]
-    text = f"{';'.join(names)}\n" + f"{';'.join(['0,5'] * len(names))}\n" * 3
-    assert list(csv(tmp_path, text).columns) == names
-
-
 @pytest.mark.parametrize("ending", ["csv", "jsonl"])
 def test_of_a_wide_text_what_is_asked_for_is_read(tmp_path: Path, ending: str) -> None:
     """Its columns are those of a reading of all, also the second of a name; and an absent one is told among all."""
@@ -444,14 +431,6 @@ def test_cells_may_be_separated_otherwise(tmp_path: Path, text: str, separator: 
     assert np.isnan(table.numbers("y_mm")[0][0])
 
 
-def test_a_comma_in_a_text_is_no_decimal(tmp_path: Path) -> None:
-    """Nor does one in the header separate cells where semicolons do."""
-    table = csv(tmp_path, "t_s;x_mm;what, if anything\n0.5;1.25;at rest, cold\n1;2,5;1,2 or 3\n")
-    assert table.stamps("t_s")[0].tolist() == [500_000_000, 1_000_000_000]
-    values, note = table.numbers("x_mm")
-    assert values[0] == 1.25e-3 and np.isnan(values[1]) and note is not None
-
-
 def test_a_text_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small file of gzip may hold any amount, and a device file has no end."""
     monkeypatch.setattr(tables, "_MOST_TEXT", 32 << 20)
@@ -501,12 +480,6 @@ def test_a_column_of_another_kind_is_refused(tmp_path: Path, cell: str) -> None:
     assert "not numbers" in refusal(lambda: column(tmp_path, "x_mm", [cell, cell]).numbers("x_mm"))
     if ":" not in cell:
         assert "not numbers" in refusal(lambda: column(tmp_path, "t_s", [cell, cell]).stamps("t_s"))
-
-
-def test_times_of_day_in_whole_seconds_are_stamps(tmp_path: Path) -> None:
-    """Of which the reader of CSV makes a type of its own."""
-    stamps, note = column(tmp_path, "t", ["10:00:00", "", "23:59:58"]).stamps("t")
-    assert stamps.tolist() == [36_000 * 10**9, NO_STAMP, 86_398 * 10**9] and note is None
 
 
 @pytest.mark.parametrize(
