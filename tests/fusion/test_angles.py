@@ -19,7 +19,6 @@ import pumafuse as pf
 from executable import pumafuse
 from pumafuse.cli.tables import outcome_table
 from pumafuse.fusion import results
-from pumafuse.live.stream import Stream
 from pumafuse.units import of_kind, unwrapped, wraps
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -180,17 +179,6 @@ def test_files_and_screens_have_the_units_of_the_axis(folders: dict[str, Path], 
     assert compared[0]["axes"]["a"]["rmse_deg"] == pytest.approx(compared[1]["axes"]["a"]["rmse_mm"], rel=1e-8)
 
 
-def test_the_wire_is_in_degrees_and_a_record_reads_back(folders: dict[str, Path]) -> None:
-    """Lines give and get degrees; the estimates are those of the recorded run."""
-    config, lines = pf.FusionConfig.load(folders["deg"] / "fusion.toml"), list[bytes]()
-    stream = Stream(pf.LiveEstimator(config), lines.extend, print)
-    stream.take([json.dumps({"t": n * T, "command": {"a": 3.0 * n, "b": 1.0}}).encode() for n in range(60)])
-    last = json.loads(lines[-1])
-    assert set(last["a"]) == {"position_deg", "sd_deg", "velocity_deg_s"}
-    assert last["a"]["velocity_deg_s"] == pytest.approx(3.0 / T, rel=0.2)
-    assert last["a"]["position_deg"] == pytest.approx(stream.live.estimate(59 * T)["a"].position / DEG, rel=1e-14)
-
-
 BOTH = {
     "arm": {
         "name": "both",
@@ -341,24 +329,6 @@ def test_columns_within_a_turn_go_on_beside_the_commands(tmp_path: Path) -> None
     first, second = (pf.fuse(run, config) for run in (whole, made))
     np.testing.assert_allclose(first["yaw"].position, second["yaw"].position, atol=1e-9)
     assert np.ptp(first["yaw"].position) > 600.0 * DEG
-
-
-def test_columns_within_a_turn_are_said(tmp_path: Path) -> None:
-    """Without ``turn_deg`` the model goes back by a turn: commands and sensor are named, with how often."""
-    notes = pf.fuse(turned(tmp_path / "run", "within"), turning()).notes
-    assert any(
-        note.startswith("the commands: an angle that begins anew on yaw after each turn, 3 times: ") for note in notes
-    ), notes
-    assert any(
-        note.startswith("sensor 'eye': an angle that begins anew on yaw after each turn, 2 times: ") for note in notes
-    )
-    notes = pf.fuse(turned(tmp_path / "other", "within"), turning(360.0)).notes
-    assert not any("sensor 'eye': an angle" in note for note in notes)
-    turned(tmp_path / "mm", "whole")
-    lengths = (tmp_path / "mm" / "run.toml").read_text().replace('"yaw_deg"', '"yaw_deg", unit = "mm", turn_deg = 360')
-    (tmp_path / "mm" / "run.toml").write_text(lengths)
-    with pytest.raises(pf.ConfigError, match=r"run\.toml: command\.yaw\.turn_deg: the column is no angle"):
-        pf.Run.read(tmp_path / "mm")
 
 
 def test_two_rejected_measurements_on_both_sides_of_the_turn_agree() -> None:

@@ -128,16 +128,3 @@ def test_a_part_that_cannot_be_used_is_one_line() -> None:
     back = sim.run.each(lambda _, one: replace(one, stamp=one.stamp - (one.stamp > 2e9) * 3_600_000_000_000))
     assert len(pf.fuse(back, sim.config).segments) == 2
     assert "set back" in one_line(pf.RunError, lambda: pf.fuse(back.between(1.0), sim.config))
-
-
-@quiet
-def test_faults_outside_of_a_part_are_not_told() -> None:
-    """A value that is not finite, with its row in the log, where it is in the part; nothing otherwise."""
-    sim = outage(1)
-    row = int(np.searchsorted(sim.run.sensors["vision"].stamp, sim.run.command.stamp[0] + 1_500_000_000))
-    sim.run.sensors["vision"].values["tangential"][row] = np.nan
-    told = [
-        [note for note in pf.fuse(sim.run.between(since), sim.config).notes if "no finite" in note]
-        for since in (1.0, 2.0)
-    ]
-    assert f"(first: row {row + 1})" in told[0][0] and not told[1]

@@ -67,17 +67,6 @@ def test_a_clock_that_is_set_is_named_with_when_and_by_how_much(sensor: str, by:
     assert abs((fault.at - run.command.stamp[0]) / 1e9 - AT - max(by, 0.0)) < 0.1
 
 
-def test_what_is_said_has_time_amount_and_what_to_do() -> None:
-    run, config = scan()
-    (note,) = [one for one in pf.fuse(clock_set(run, "tracker", 0.2), config).notes if "was its clock set" in one]
-    assert note.startswith(
-        "sensor 'tracker': its stamps leap ahead by 0.200 s at 30.21 s, and from there on it follows"
-    )
-    assert note.endswith("with 200 more latency_ms in the later one")
-    (note,) = [one for one in pf.fuse(clock_set(run, "tracker", -0.1), config).notes if "was its clock set" in one]
-    assert "step back by 0.100 s at 30.01 s" in note and "with 100 less latency_ms" in note
-
-
 def test_a_clock_that_is_set_twice_is_named_twice() -> None:
     run, config = scan()
     faults = named(clock_set(clock_set(run, "vision", 0.3, 20.0), "vision", -0.1, 40.0), config)
@@ -116,28 +105,6 @@ def test_outages_are_no_clock(name: str) -> None:
     run, config = logged(name)
     for seed in range(1, 6):
         assert named(with_outages(run, seed), config) == []
-
-
-def test_a_sensor_that_comes_back_with_another_zero_has_its_clock() -> None:
-    run, config = scan()
-    tracker, when = run.sensors["tracker"], run.command.stamp[0] + round(AT * 1e9)
-    found = lost(tracker, when / 1e9, when / 1e9 + 0.3)
-    values = {axis: value + 0.01 * (found.stamp > when) for axis, value in found.values.items()}
-    moved = replace(run, sensors={**run.sensors, "tracker": replace(found, values=values)})
-    assert named(moved, config) == []
-
-
-def test_at_rest_no_clock_is_named() -> None:
-    """Nothing tells a clock from an outage there."""
-    period, rng = 0.028, np.random.default_rng(2)
-    given, seen = np.arange(0.0, 60.0, period), np.arange(0.1, 60.0, 0.01)
-    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05))
-    arm = pf.ArmModel(name="an arm", update_period=period, delay=0.06, axes={"x": axis})
-    config = pf.FusionConfig(arm=arm, process={"x": pf.Process(drift=1e-4)}, sensors={"tracker": pf.Sensor(sd=2e-4)})
-    measured = {"x": 0.5 + 2e-4 * rng.standard_normal(len(seen))}
-    run = pf.Run.from_arrays(given, {"x": np.full(len(given), 0.5)}, {"tracker": (seen, measured)})
-    assert len(leaps(clock_set(run, "tracker", 0.3).sensors["tracker"].stamp)) == 1
-    assert named(clock_set(run, "tracker", 0.3), config) == []
 
 
 def test_leaps_are_as_long_as_time_went_by_without_rows() -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -157,19 +156,6 @@ def test_a_verdict_on_what_a_gate_has_left_says_so(moving: pf.Run) -> None:
     """With a third of the noise and a gate of 2 the rest fits by selection: the verdict is how many were rejected."""
     for axis, found in judged(moving, config(moving, sd=SD / 3.0, gate=2.0)).items():
         assert re.search(r"but \d\d% were rejected", sentence(found)), (axis, sentence(found))
-
-
-def test_innovations_are_looked_at_beyond_the_next_one(moving: pf.Run) -> None:
-    """Each like the third before it (w + 0.5 w₋₃ has a correlation of 0.4 there): not white, and the lag is named."""
-    est = pf.fuse(moving, config(moving))
-    noise = np.random.default_rng(3).standard_normal(len(est.measurements.value) + 3)
-    coloured = (noise[3:] + 0.5 * noise[:-3]) / math.sqrt(1.25)
-    order = np.lexsort((est.measurements.time, est.measurements.axis))
-    innovation = np.empty(len(order))
-    innovation[order] = coloured * est.measurements.innovation_sd[order]
-    spoilt = replace(est, measurements=replace(est.measurements, innovation=innovation))
-    found = [consistency(spoilt, "camera", axis) for axis in est.axes]
-    assert found and all(re.search(r"not white \(lag 3: \+0\.[345]", sentence(one)) for one in found if one)
 
 
 def test_the_verdict_on_smoothed_estimates_needs_no_velocity_of_theirs(moving: pf.Run) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import msgspec
@@ -16,7 +15,6 @@ from executable import FUSION, SCAN
 from fusion.test_segments import MS, ORIGIN, SECOND, TICK, A, config, crowded_runs, measurements, nan, properties
 from pumafuse.arrays import NO_STAMP
 from pumafuse.fusion.summary import summarise
-from pumafuse.logs.run import Source
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 WORDS = {"fused", "rejected", "reacquired", "duplicate", "before_start", "too_late", "invalid", "unknown"} | {
@@ -94,22 +92,6 @@ def test_a_row_of_several_axes_counts_by_the_best_of_them() -> None:
     seen = [ORIGIN + 10 * MS, ORIGIN + 20 * MS], {"radial": [nan, nan], "vertical": [0.5, nan]}
     run = pf.Run.from_arrays([ORIGIN, ORIGIN + TICK], {"radial": [0.5, 0.5], "vertical": [0.5, 0.5]}, {"a": seen})
     assert pf.fuse(run, config(a=A)).counts["a"] == {"fused": 1, "invalid": 1}
-
-
-def test_rows_of_all_segments_are_added() -> None:
-    """A clock that was set back cuts a run in two: no row falls between."""
-    scan, conf = pf.Run.read(SCAN), pf.FusionConfig.load(FUSION)
-
-    def set_back(_: str, source: Source) -> Source:
-        late = np.arange(len(source.stamp)) >= len(source.stamp) // 2
-        return replace(source, stamp=source.stamp - 10 * SECOND * late)
-
-    run = scan.each(set_back)
-    est = pf.fuse(run, conf)
-    assert len(est.segments) == 2
-    totals: Mapping[str, int] = {name: sum(counts.values()) for name, counts in est.counts.items()}
-    assert totals == {name: len(source.stamp) for name, source in run.sensors.items()}
-    assert sum(est.command_counts.values()) == len(run.command.stamp)
 
 
 @pytest.mark.parametrize("how", [{"mode": "as-live"}, {"engine": "filterpy"}], ids=str)

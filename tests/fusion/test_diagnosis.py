@@ -215,18 +215,6 @@ def test_of_a_clock_that_leaves_little_within_the_commands_nothing_else_is_told(
     assert not [note for note in said if note.startswith("sensor 'vision'") and "contradicts" not in note]
 
 
-@pytest.mark.parametrize(("until", "searched"), [(20.0, 16), (None, 30)])
-def test_the_shifts_that_were_searched_are_told(until: float | None, searched: int) -> None:
-    """At most 30 s, and three quarters of the commands with the second after them."""
-    walk = np.cumsum(np.random.default_rng(5).normal(0.0, 2e-3, 1704))
-    run = of_sensor("scan1", "vision", lambda one: replace(one, values=dict.fromkeys(one.values, walk)))
-    if until is not None:
-        kept = np.flatnonzero(run.command.stamp <= run.command.stamp[0] + round(until * 1e9))
-        run = replace(run, command=run.command.rows(kept)).between(0.0, until)
-    (note,) = [note for note in notes(run, "scan1") if "does not follow the commands" in note]
-    assert f"nor those of other axes or of up to {searched} s before or after:" in note
-
-
 @pytest.mark.parametrize(
     ("log", "factor", "taken"), [("scan1", 1e3, "ms that are called s"), ("trunk-servo", 1e-3, "s that are called ms")]
 )
@@ -284,22 +272,6 @@ def test_a_sensor_that_moves_while_its_commands_rest_is_told() -> None:
         of_commands(log, lambda one: replace(one, values={**one.values, axis: 0.0 * one.values[axis]})), log
     )
     assert f" on {axis}, whose commands rest: is it the right column" in note
-
-
-def test_a_sensor_that_measures_within_a_turn_is_no_other_zero_and_may_have_a_sign() -> None:
-    """An angle that goes round, by a sensor that begins in another turn; the same the other way round."""
-    period, plant = 0.01, pf.FirstOrder(time_constant=0.05)
-    time, rng = np.arange(0.0, 20.0, period), np.random.default_rng(1)
-    u = 4.0 * np.sin(0.7 * time) + 3.0 * np.sin(0.31 * time)
-    axis = pf.AxisModel(kind="angle", plant=plant)
-    stamp = np.rint(time * 1e9).astype(np.int64)
-    position = response(axis, period, 0.02, stamp, u, 0.0, stamp) + rng.normal(0.0, 1e-3, len(time))
-    turn = 2.0 * np.pi
-    arm = pf.ArmModel(name="a turntable", update_period=period, delay=0.02, axes={"yaw": axis})
-    config = pf.FusionConfig(arm=arm, sensors={"imu": pf.Sensor(sd=1e-3, turn=turn, bias_sd=0.2)})
-    for sign, words in ((1.0, []), (-1.0, ["sensor 'imu' moves against the commands of yaw"])):
-        run = pf.Run.from_arrays(time, {"yaw": u}, {"imu": (time, {"yaw": (sign * position - 0.1) % turn})})
-        assert [fault.sentence.split(" (")[0] for fault in sensor_faults(build(run, config), config)] == words
 
 
 def test_a_misspelt_sensor_is_named_with_the_other_name() -> None:
@@ -448,14 +420,3 @@ def test_a_log_without_most_commands_is_told_or_refused(every: int) -> None:
     line = refusal(some, "scan1")
     assert "commands come every" in line and f"{every} times the arm's update_period_ms = 28" in line
     assert line.endswith("Log every command, or correct update_period_ms in arm.toml")
-
-
-def test_commands_of_rounded_stamps_are_told_and_those_of_changes_alone_are_not_refused() -> None:
-    """With stamps of 0.1 s all rows are there; and who sends what changes sends a staircase every two seconds."""
-    run, config = logged("scan1")
-    rounded = replace(run, command=replace(run.command, stamp=run.command.stamp // 100_000_000 * 100_000_000))
-    assert "commands come every 100 ms" in " ".join(clock_faults(rounded, config.arm.update_period, []))
-    time = np.cumsum(np.random.default_rng(1).uniform(1e9, 3e9, 60)).astype(np.int64)
-    level = 0.5 + 0.01 * (np.arange(60) % 2)
-    steps = replace(run, command=Source(time, dict.fromkeys(run.axes, level), "commands"))
-    assert "are most of them lost" in " ".join(clock_faults(steps, config.arm.update_period, []))

@@ -55,22 +55,6 @@ def test_a_sensor_in_x_y_without_a_frame_is_refused():
     assert "give a [frame]" in one_line(pf.RunError, lambda: pf.fuse(run, config()))
 
 
-def test_compare_takes_the_reference_of_a_framed_run(tmp_path):
-    """From the log itself or from the result folder."""
-    (tmp_path / "log.csv").write_text(
-        "time_s,command.x_mm,command.y_mm,reference.x_mm,reference.y_mm\n"
-        "0,100,500,100,500\n0.028,100,500,100,500\n0.056,100,500,100,500\n"
-    )
-    source = '[{0}]\nfile = "log.csv"\ntime = "time_s"\nx = "{0}.x_mm"\ny = "{0}.y_mm"\n'
-    text = source.format("command") + source.format("reference") + '[frame]\nkind = "cylindrical"\n'
-    (tmp_path / "run.toml").write_text(text)
-    results.write(pf.fuse(pf.Run.read(tmp_path), pf.FusionConfig(arm=ARM)), tmp_path / "out", False)
-    result = results.read(tmp_path / "out")
-    of_log = results.read_reference(tmp_path / "run.toml", result.summary.origin_ns, result.config)
-    for reference in (result.reference, of_log):
-        assert set(result.scores(reference)) == {"tangential", "radial"}
-
-
 def test_a_second_segment_keeps_the_frame_of_the_run():
     """R0 and θ0 are the run's: a clock that is set back moves nothing."""
     n = 60

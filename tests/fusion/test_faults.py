@@ -54,31 +54,11 @@ def test_another_zero_is_said_where_nothing_told_is_as_uncertain() -> None:
         assert not elsewhere(run, told)
 
 
-def test_a_distance_is_one_of_the_arm_whatever_the_scale_of_a_sensor() -> None:
-    """All that a sensor says and is not sure of times -2: the same notes, to the letter."""
-    plain = with_vision(lambda one: moved(0.05, one))
-    scaled = with_vision(lambda one: changed(moved(0.05, one), lambda value: -2.0 * value))
-    told, of_scaled = ({"sd": k * 0.5e-3, "bias_sd": k * 5e-3, "bias_drift_sd": k * 2e-3} for k in (1.0, 2.0))
-    wanted = elsewhere(plain, with_sensors(CONFIG, "vision", **told))
-    assert len(wanted) == 1 and wanted[0].count("noise and priors: 5.8 mm") == 2
-    assert elsewhere(scaled, with_sensors(CONFIG, "vision", scale=-2.0, **of_scaled)) == wanted
-
-
 def test_what_scatters_that_far_has_no_other_zero() -> None:
     """20 mm in 30 mm of scatter, of a sensor that claims 0.5 mm."""
     rng = np.random.default_rng(1)
     run = with_vision(lambda one: changed(one, lambda value: value + rng.normal(0.02, 0.03, len(value))))
     assert not elsewhere(run)
-
-
-def test_where_a_sensor_is_after_the_run_does_not_count() -> None:
-    """Taken away 2 s after the last command, and logged for longer than the run."""
-    run = outage(1).run
-    seen, count = run.sensors["vision"], 300
-    stamp = run.command.stamp[-1] + 2_000_000_000 + 33_000_000 * np.arange(count)
-    values = {axis: np.append(value, np.full(count, value[-1] + 0.05)) for axis, value in seen.values.items()}
-    longer = replace(seen, stamp=np.append(seen.stamp, stamp), values=values)
-    assert not elsewhere(with_vision(lambda _: longer))
 
 
 def test_a_negative_latency_is_questioned() -> None:
@@ -110,29 +90,6 @@ def test_a_log_that_was_cut_in_mid_motion_says_so(name: str) -> None:
     assert 0.2 < since < 0.3 and not begun(file.between(since), sim.config)
     (fitted,) = [one for one in Likelihood([file], sim.config).notes if "begins in motion" in one]
     assert fitted == f"run '{file.name}': {note}"
-
-
-def moving(**start: float) -> tuple[pf.Run, pf.FusionConfig]:
-    """Two axes at 60 mm/s since long ago, one with twice the lag of the other; the log says where it rests, or not."""
-    delay, lags = 0.06, {"tangential": 0.06, "vertical": 0.03}
-    time, seen, rng = np.arange(0.0, 3.0, 0.028), np.arange(0.01, 3.0, 0.01), np.random.default_rng(1)
-    command = dict.fromkeys(lags, 0.5 + 0.06 * time)
-    values = {axis: 0.5 + 0.06 * (seen - delay - lag) + rng.normal(0.0, 1e-4, len(seen)) for axis, lag in lags.items()}
-    axes = {axis: pf.AxisModel(plant=pf.FirstOrder(time_constant=lag)) for axis, lag in lags.items()}
-    arm = pf.ArmModel(name="an arm", update_period=0.028, delay=delay, axes=axes)
-    config = pf.FusionConfig(arm=arm, sensors={"tracker": pf.Sensor(sd=1e-4)})
-    return pf.Run.from_arrays(time, command, {"tracker": (seen, values)}, start=start), config
-
-
-def test_a_log_in_mid_motion_is_good_from_when_its_slowest_axis_has_settled() -> None:
-    """After the delay and five lags, 0.06 s + 5 · 0.06 s, not 0.21 s as of the other axis."""
-    (note,) = begun(*moving())
-    assert "use --from 0.36 or later" in note
-
-
-def test_a_log_that_says_where_the_arm_rested_does_not_begin_in_motion() -> None:
-    """Somewhere else than the first command: then the model is told, and its first step is another than the next."""
-    assert not begun(*moving(tangential=0.495, vertical=0.499))
 
 
 def test_runs_that_begin_at_rest_are_not_told_to_be_in_motion() -> None:
@@ -203,11 +160,3 @@ def test_noise_a_gain_and_a_straight_line_are_no_turn() -> None:
     line = by_camera(run, **{axis: draw.normal(0.0, 5e-4, 1000) for axis in "xy"})
     line = replace(line, command=replace(line.command, values={**line.command.values, "x": still, "y": still}))
     assert not looks_turned(line, late_arm())
-
-
-def test_two_wrong_signs_are_no_turn() -> None:
-    """Half a turn about y is what x and z with a wrong sign are: that is said, as before."""
-    run = seen_turned(0.0)
-    seen = run.sensors["camera"].values
-    found = notes(by_camera(run, x=-seen["x"], z=-seen["z"]), late_arm())
-    assert len(found) == 1 and "moves against the commands of x, z" in found[0]

@@ -5,11 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 import pumafuse as pf
-from pumafuse.fusion import results
 from pumafuse.fusion.summary import summarise
 from pumafuse.logs.frames import Cylindrical
 
@@ -78,18 +76,6 @@ def test_a_framed_reference_scores_the_axes(cylindrical: pf.Estimates, by_axes: 
     assert min(score.coverage for score in scores.values()) > 0.9
 
 
-def test_the_result_folder_holds_x_y_z(cylindrical: pf.Estimates, tmp_path: Path) -> None:
-    """estimates.parquet ends in x_mm, y_mm, z_mm, which are the axes laid out about the base by plain trigonometry."""
-    results.write(cylindrical, tmp_path / "out", force=False)
-    table = pq.read_table(tmp_path / "out" / "estimates.parquet")
-    assert table.column_names[-3:] == ["x_mm", "y_mm", "z_mm"]
-    column = {name: table[name].to_numpy() for name in table.column_names}
-    turn = np.arctan2(560.0, -150.0) - column["tangential.position_mm"] / np.hypot(150.0, 560.0)
-    np.testing.assert_allclose(column["x_mm"], column["radial.position_mm"] * np.cos(turn), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(column["y_mm"], column["radial.position_mm"] * np.sin(turn), rtol=0, atol=1e-9)
-    assert column["z_mm"].tolist() == column["vertical.position_mm"].tolist()
-
-
 def about_the_base(positive: str = "counterclockwise") -> pf.FusionConfig:
     frame = Cylindrical(base=(0.1, -0.2), positive=positive)
     return pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"), frame=frame)
@@ -106,14 +92,3 @@ def test_a_commanded_circle_stays_a_circle() -> None:
     rate = 1.5 / 99 / 0.028
     assert behind[0] == pytest.approx(0.0, abs=1e-12)
     assert 0.06045 * rate < behind[50] < 0.15 * rate
-
-
-@pytest.mark.parametrize(("reach", "reported"), [(0.701, ["701.0 mm"]), (0.699, [])])
-def test_the_radius_is_the_largest_of_the_run_and_not_that_of_its_start(
-    reach: float, reported: list[str], recwarn: pytest.WarningsRecorder
-) -> None:
-    """A stroke outward from 500 to 701 mm is reported although it starts well inside; up to 699 mm nothing is."""
-    values = {"x": 0.1 + np.linspace(0.5, reach, 60), "y": np.full(60, -0.2), "z": np.zeros(60)}
-    est = pf.fuse(pf.Run.from_arrays(0.028 * np.arange(60), values), about_the_base())
-    assert est.radius == pytest.approx(reach)
-    assert [str(warning.message).split(" reach ")[1][:8] for warning in recwarn] == reported

@@ -56,27 +56,6 @@ def test_commands_beyond_the_fastest_speed_are_named() -> None:
     assert not beyond(pf.fuse(run_of(np.cumsum(STEP)), config(slow)).notes)
 
 
-@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
-def test_the_first_command_is_a_step_from_where_the_arm_stood() -> None:
-    """5 mm in one period of 20 ms are 250 mm/s."""
-    camera = (TIME[::2] + 0.001, {"x": np.cumsum(STEP)[::2]})
-    run = pf.Run.from_arrays(TIME, {"x": np.cumsum(STEP)}, {"camera": camera}, start={"x": -0.005})
-    (note,) = beyond(pf.fuse(run, config(arm(max_speed=LIMIT))).notes)
-    assert "1 of 200 commands" in note and "for 250, from 0.00 s to 0.00 s" in note
-
-
-@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
-def test_the_segments_of_a_run_are_counted_together() -> None:
-    """Of a log whose clock was set back by a minute each part begins at rest: it jumps from none to the other."""
-    step = STEP.copy()
-    step[[60, 150]] = 2.0 * LIMIT * PERIOD
-    time = 100.0 + np.where(np.arange(200) < 100, TIME, TIME - 60.0)
-    est = pf.fuse(run_of(np.cumsum(step), time), config(arm(max_speed=LIMIT)))
-    assert len(est.segments) == 2
-    (said,) = beyond(est.notes)
-    assert said.startswith("x: 2 of 200 commands") and "from -57.00 s to 1.20 s" in said
-
-
 @pytest.mark.parametrize(
     ("scenario", "said"),
     [

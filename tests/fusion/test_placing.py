@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import msgspec
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as papq
 import pytest
 from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
 from pumafuse.fusion.placing import in_base
-from pumafuse.pieces.fusing import fuse_to
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 PERIOD, DELAY, LAG = 0.02, 0.05, 0.04  # s
@@ -235,45 +231,6 @@ def test_the_noise_of_a_marker_far_from_the_tool_point_counts_how_it_is_turned()
     told = [float(given.sensors["camera"].sd_of(axis) or 0.0) * np.mean(camera.spread[axis]) for axis in "xyz"]
     found = [np.std(camera.values[axis]) for axis in "xyz"]
     assert np.sum(np.square(found)) == pytest.approx(np.sum(np.square(told)), rel=0.02)  # of 40,000: 0.7 %
-
-
-def test_a_row_without_one_of_its_coordinates_is_invalid() -> None:
-    """A frame mixes x, y and z, so that a row without y has none of them."""
-    run, _, _ = pose_run()
-    camera = run.sensors["camera"]
-    y = camera.values["y"].copy()
-    y[::10] = np.nan
-    run = replace(run, sensors={"camera": replace(camera, values={**camera.values, "y": y})})
-    with pytest.warns(pf.PumafuseWarning, match="have no finite [xyz] value: invalid"):
-        est = pf.fuse(run, config(camera=CAMERA | PLACE))
-    assert all(np.isnan(in_base(run, est.config)[0].sensors["camera"].values[axis][::10]).all() for axis in "xyz")
-
-
-def test_pieces_equal_the_whole_to_the_bit(tmp_path: Path) -> None:
-    """A run in Parquet with orientations gives the same estimates piece by piece as in memory."""
-    run, _, _ = pose_run()
-    est = pf.fuse(run, config(camera=CAMERA | PLACE))
-    (tmp_path / "run").mkdir()
-    for name, source in (("command", run.command), ("camera", run.sensors["camera"])):
-        assert source.orientation is not None
-        table = {f"{axis}_m": value for axis, value in source.values.items()}
-        table |= {f"q{one}": source.orientation[:, place] for place, one in enumerate("xyzw")}
-        papq.write_table(pa.table({"t_ns": source.stamp, **table}), tmp_path / "run" / f"{name}.parquet")
-    entry = (
-        '\ntime = "t_ns"\nx = "x_m"\ny = "y_m"\nz = "z_m"\norientation = { quaternion = ["qx", "qy", "qz", "qw"] }\n'
-    )
-    text = "".join(
-        f'[{title}]\nfile = "{name}.parquet"{entry}'
-        for title, name in (("command", "command"), ("sensors.camera", "camera"))
-    )
-    (tmp_path / "run" / "run.toml").write_text(text)
-    summary = fuse_to(tmp_path / "run", tmp_path / "out", est.config)
-    whole = pf.fuse(pf.Run.read(tmp_path / "run"), est.config)
-    assert summary.estimates == len(whole.time)
-    table = papq.read_table(tmp_path / "out" / "estimates.parquet")
-    for axis in AXES:
-        unit, scale = ("deg", 180.0 / np.pi) if axis.startswith("r") else ("mm", 1e3)
-        np.testing.assert_array_equal(table[f"{axis}.position_{unit}"].to_numpy(), whole[axis].position * scale)
 
 
 @pytest.mark.parametrize(("far", "refused"), [(175.0, True), (130.0, False)])

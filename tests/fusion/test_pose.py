@@ -14,11 +14,9 @@ from scipy.spatial.transform import Rotation
 import pumafuse as pf
 import turning
 from executable import pumafuse
-from pumafuse.errors import RunError
 from pumafuse.fusion import results
 from pumafuse.fusion.config import Tool
 from pumafuse.logs.frames import Cylindrical, Frame, Rotated
-from refusals import one_line
 
 TURNING = ("rx", "ry", "rz")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -164,27 +162,3 @@ def test_results_about_other_reference_orientations_are_compared_as_one(
     assert all(second["difference"][axis]["rms_deg"] < 0.02 for axis in TURNING)
     assert second["orientation"]["rms_deg"] == pytest.approx(first["orientation"]["rms_deg"], abs=0.01)
     assert all(second["axes"][axis]["rmse_deg"] < 0.5 for axis in TURNING)
-
-
-def test_the_command_says_the_angle(tmp_path: Path) -> None:
-    """`fuse` and `compare` print it beside what is expected, and `summary.json` has it."""
-    said = pumafuse(
-        "fuse", turning.written(tmp_path), "-c", turning.configured(tmp_path), "-o", tmp_path / "fused"
-    ).stdout
-    found = msgspec.json.decode((tmp_path / "fused" / "summary.json").read_bytes())["orientation"]
-    assert found.keys() == {"rms_deg", "expected_deg", "rows", "left_out"}
-    wanted = [f"{found['rms_deg']:.3f}", f"{found['expected_deg']:.3f}", str(found["rows"]), str(found["left_out"])]
-    for text in (said, pumafuse("compare", tmp_path / "fused").stdout):
-        assert wanted in [line.split()[1:] for line in text.splitlines()]
-
-
-def test_what_has_no_pose_says_so(est: pf.Estimates) -> None:
-    """Without x, y, z, or without an orientation, one line; and no columns of a quaternion."""
-    still = replace(est, axes={axis: est[axis] for axis in "xyz"})
-    said = one_line(RunError, lambda: still.pose)
-    assert said == (
-        "run 'run': a pose needs an orientation: commands that have one, and axes rx, ry, rz of the arm; it has x, y, z"
-    )
-    assert not set(QUATERNION) & set(still.to_arrow().column_names)
-    flat = replace(est, axes={axis: est[axis] for axis in ("x", *TURNING)})
-    assert "a pose needs x, y and z" in one_line(RunError, lambda: flat.pose)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 import pumafuse as pf
@@ -70,15 +69,6 @@ def test_error_bars_that_hold_have_95_percent_coverage() -> None:
     assert found.nees == pytest.approx(1.0, abs=0.04)
 
 
-def test_without_velocity_or_reference_there_is_no_score() -> None:
-    """Smoothed estimates have no velocity; a reference of another axis or another time has none to compare with."""
-    time, nothing = PERIOD * np.arange(10), np.zeros(10, dtype=np.int64)
-    reference = track(time, path(time))
-    assert score(time, np.full(10, np.nan), np.nan, reference) is None
-    assert score(time + 100.0, mean_velocity(time), 1e-3, reference) is None
-    assert score_velocity(time, nothing, path(time), path(time), reference, "vertical", PERIOD) is None
-
-
 def estimates(*, smoothed: bool) -> pf.Estimates:
     """Exact positions, and mean velocities with an error of 2 mm/s where there are any."""
     time = PERIOD * np.arange(50)
@@ -102,17 +92,3 @@ def test_summary_table_and_compare_show_the_velocity(tmp_path: Path) -> None:
         line for line in pumafuse("compare", tmp_path / "out").stdout.splitlines() if line.split()[-1:] == ["0.0%"]
     ]
     assert row.split()[-2:] == ["2.000", "0.0%"]
-
-
-def test_smoothed_estimates_show_no_velocity(tmp_path: Path) -> None:
-    """Null in files, no score, and no column in the table."""
-    summary = results.write(estimates(smoothed=True), tmp_path / "out", force=False)
-    found = summary.axes["radial"].score
-    assert (found.velocity_rmse_mm_s, found.velocity_coverage) == (None, None)
-    table = pq.read_table(tmp_path / "out" / "estimates.parquet")
-    for column in ("radial.velocity_mm_s", "radial.velocity_sd_mm_s"):
-        assert table[column].null_count == 50
-    assert np.isnan(results.read(tmp_path / "out").axes["radial"].velocity).all()
-    out = pumafuse("compare", tmp_path / "out").stdout
-    assert "RMSE, mm" in out
-    assert "velocity" not in out

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pumafuse.arrays import NO_STAMP
-from pumafuse.errors import RunError, UnknownNameError
+from pumafuse.errors import RunError
 from pumafuse.filter.events import COMMAND
 from pumafuse.filter.outcome import ABSENT, Outcome
 from pumafuse.fusion.config import FusionConfig, Sensor
@@ -168,13 +168,6 @@ def test_a_measurement_is_left_out_only_for_a_reason_it_has(case: tuple[Run, Fus
             if source != COMMAND and events.codes[at, number] != ABSENT:
                 wanted = reasons(run, conf, segment.sensors[source], row, axis) or {"fused"}
                 assert Outcome(events.codes[at, number]).word in wanted
-
-
-def test_an_axis_that_the_arm_has_not_is_refused() -> None:
-    """A run that commands an axis without a model is refused with the arm's axes."""
-    with pytest.raises(UnknownNameError) as caught:
-        build(recorded(axes=["yaw"]), config())
-    assert (caught.value.name, caught.value.accepted) == ("yaw", ("radial", "vertical"))
 
 
 # ---- outcomes

@@ -6,17 +6,13 @@ superposition of closed-form responses.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pumafuse as pf
-from executable import pumafuse
 from fusion_oracle import Response, commands
-from pumafuse.fusion import results
 from pumafuse.fusion.skill import PredictionError, Skill, skill
 from pumafuse.fusion.summary import beaten
 
@@ -185,31 +181,6 @@ def test_nothing_to_predict():
     assert skill_of(first(30), config()) is None  # unknown
     assert skill_of(first(30, -100.0), config(camera=camera)) is None  # before the start
     assert skill_of(one_after_the_other(first(1), replace(first(1, -8.0), name="x")), config(camera=camera)) is None
-
-
-def test_values_that_do_not_change():
-    """A frozen sensor is predicted exactly by its last value; no ratio is made of it."""
-    time = 10.0 + PERIOD * np.arange(50)
-    still = {axis: np.full(50, 0.3) for axis in ARM.axes}
-    run = pf.Run.from_arrays(time, still, {"camera": (time + 0.03, still)})
-    got = found(pf.fuse(run, config(camera=SENSORS["camera"])), "camera", "radial")
-    assert got.last_held == PredictionError(rms=0.0, median=0.0)
-    assert got.of_best_other is None
-
-
-def test_files_and_screens_have_it(est: pf.Estimates, tmp_path: Path) -> None:
-    """`summary.json` read back is the summary; measurements have segments; `compare` prints."""
-    results.write(est, tmp_path / "set-back", force=False)
-    read = results.read(tmp_path / "set-back").summary
-    assert read.axes["radial"].sensors["range"].skill == found(est, "range", "radial")
-    table = results.tables.read(tmp_path / "set-back" / "measurements.parquet")
-    assert table.columns["segment"].to_pylist() == est.measurements.segment.tolist()
-
-    text, found_again = (pumafuse("compare", tmp_path / "set-back", *more).stdout for more in ((), ("--json",)))
-    one = json.loads(found_again)[0]["skill"]["radial"]["range"]
-    row = next(line for line in text.splitlines() if " range " in line and " / " in line)
-    cells = [f"{one[key]['rms_mm']:.3f} / {one[key]['median_mm']:.3f}" for key in list(one)[1:]]
-    assert row.split(maxsplit=5)[0] and all(cell in row for cell in cells)
 
 
 def test_a_simpler_way_that_predicts_better_is_said() -> None:

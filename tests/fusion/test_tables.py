@@ -77,19 +77,6 @@ def test_a_saved_folder_is_read_again(est: pf.Estimates, tmp_path: Path) -> None
     est.save(str(tmp_path / "out"), force=True)
 
 
-def test_everything_says_in_a_line_what_it_is(run: pf.Run, est: pf.Estimates) -> None:
-    """No array, no page of defaults."""
-    arm = est.config.arm
-    things = [est, est["x"], est.measurements, run, run.command, est.config, arm, pf.summarise(est)]
-    things += [pf.discretize(arm.axes["x"], 0.02, 0.03), pf.LiveEstimator(est.config)]
-    for one in things:
-        assert len(repr(one)) < 120, repr(one)
-        assert "\n" not in repr(one)
-    assert repr(est) == "Estimates('a run', filtered: 100 of x, yaw; 0 to 1.98 s)"
-    assert repr(run) == "Run('a run' of x, yaw: 100 commands, 100 camera)"
-    assert repr(arm) == "ArmModel('arm', T 20 ms; lags: x 70 ms, yaw 50 ms)"
-
-
 def test_a_configuration_is_made_of_a_dict_or_a_text() -> None:
     """With the keys and units of the files; what is wrong is said as of a file."""
     config = pf.FusionConfig.parse(CONFIG)
@@ -123,11 +110,3 @@ def test_numbers_of_numpy_are_numbers(number: Any) -> None:
     config = pf.FusionConfig.parse({"arm": arm, "sensors": {"camera": {"sd_mm": number, "sd_deg": number}}})
     assert config.sensors["camera"].sd_of("x") == pytest.approx(1e-3 * float(number), rel=1e-15)
     assert pf.ArmModel.parse(config.arm.to_toml()) == config.arm
-
-
-def test_one_sensor_needs_no_list(run: pf.Run) -> None:
-    """A name is a name, not its letters."""
-    config = pf.FusionConfig.parse(CONFIG)
-    assert pf.fuse(run, config, sensors="camera").measurements.sensors == ("camera",)
-    with pytest.raises(pf.UnknownNameError, match="'cam'"):
-        pf.fuse(run, config, sensors="cam")

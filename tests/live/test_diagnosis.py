@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -17,7 +16,7 @@ from pumafuse.filter.response import response
 from pumafuse.fusion.consistency import consistency
 from pumafuse.fusion.verdicts import sentence
 from pumafuse.logs.run import Source
-from streams import Both, events_of, feed
+from streams import events_of, feed
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 ROOT = Path(__file__).parents[2]
@@ -186,18 +185,6 @@ def test_what_is_wrong_by_little_is_named_as_fuse_names_it(
     assert (axis in live.estimate().doubtful) is spoils
 
 
-def test_innovations_are_judged_by_the_noise_of_each_row() -> None:
-    """Rows whose noise is three times as large, and which say so."""
-    rng = np.random.default_rng(3)
-
-    def noisier(one: Source) -> Source:
-        values = {axis: v + np.sqrt(8.0) * 5e-5 * rng.standard_normal(len(v)) for axis, v in one.values.items()}
-        return replace(one, values=values, noise=np.full(len(one.stamp), 3.0))
-
-    run, config = tracked()
-    assert said(slipped(run, noisier), config)[0] == []
-
-
 def test_what_the_gate_keeps_out_makes_no_estimate_doubtful() -> None:
     """Two other sensors contradict it: it is named, and harms nothing."""
     run, config = scan()
@@ -272,20 +259,6 @@ def test_a_sensor_that_is_taken_again_is_said_and_doubted_at_once() -> None:
     assert any("is believed again since" in one for one in notices)
     assert sum(far) > 10 and np.array(doubted)[far].all()
     assert not all(doubted)
-
-
-def test_the_wire_says_which_axes_are_doubtful() -> None:
-    """Beside the stale ones; a good stream has no such word."""
-    run, config = tracked()
-    for slip, expected in ((larger(1.0), set[str]()), (exchanged, {"x", "y"})):
-        both = Both(config)
-        for event in events_of(slipped(run, slip)):
-            values = {axis: 1e3 * value for axis, value in event.values.items()}
-            body = {"sensor": event.sensor, **values} if event.sensor else {"command": values}
-            both.feed(json.dumps({"t_ns": event.stamp, **body}).encode() + b"\n")
-        told = [one.get("doubtful") for one in both.estimates]
-        assert set(told[-1] or ()) >= expected
-        assert expected or told == [None] * len(told)
 
 
 GOOD = ("panel-tracker-outage", "tool-with-play")

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 
-import msgspec
 import numpy as np
 import pytest
 
 import pumafuse as pf
 from pumafuse.logs.clock import clock_faults
-from pumafuse.logs.frames import Cylindrical
 
 ARM = pf.ArmModel.load("puma560-internal")
 CONFIG = pf.FusionConfig(
@@ -174,24 +172,6 @@ def test_what_is_wrong_at_the_start_is_refused(wrong: dict) -> None:
         pf.LiveEstimator(CONFIG, **wrong)
 
 
-def test_commands_beyond_the_models_limits_are_said() -> None:
-    """Faster than the model is valid for, or farther out: once, and the tenth time; within them nothing is said.
-
-    Each with the command's stamp, which tells a fast motion from the first command after a pause.
-    """
-    said: list[str] = []
-    config = msgspec.structs.replace(CONFIG, frame=Cylindrical())
-    live = pf.LiveEstimator(config, on_notice=said.append)
-    for step in range(20):
-        live.command(step * PERIOD, x=0.0, y=0.56 + 0.001 * step)
-    assert said == []
-    for step in range(20, 40):
-        live.command(step * PERIOD, x=0.0, y=0.56 + 0.02 * (step - 20))
-    assert [text.split(" ")[0] for text in said] == ["commanded", "commands", "commanded", "commands"]
-    assert f"0.5 m/s that the arm model is valid for, at {20 * PERIOD:.3f} s" in said[0]
-    assert f"700 mm that the arm model is valid for, at {27 * PERIOD:.3f} s" in said[1]
-
-
 @pytest.mark.parametrize(
     ("interval", "said"),
     [
@@ -213,23 +193,6 @@ def test_commands_at_another_interval_are_said_once(interval: float, said: str) 
     of_interval = [text for text in notices if "commands come" in text]
     assert len(of_interval) == bool(said)
     assert said in "".join(of_interval)
-
-
-def test_who_contradicts_whom_is_said_with_axes_and_sizes() -> None:
-    """The camera is 50 mm off beside the tracker, on radial alone: once it is told, with its number."""
-    notices: list[str] = []
-    live = running(on_notice=notices.append)
-    for step in range(20):
-        t = 1.0 + (step + 1) * PERIOD
-        live.command(t, radial=0.57, vertical=0.1)
-        live.measurement(t, "tracker", radial=0.57, vertical=0.1)
-        live.measurement(t, "camera", radial=0.62)
-    (said,) = [text for text in notices if "contradicts" in text]
-    assert said.startswith("sensor 'camera' contradicts 'tracker' since 1.")
-    assert said.endswith("s (radial by +50 mm): its measurements are rejected")
-    assert live.health().faults == ("sensor 'camera' contradicts 'tracker': its measurements are rejected",)
-    live.measurement(t + PERIOD / 2, "camera", radial=0.57)
-    assert live.health().faults == ()
 
 
 @pytest.mark.parametrize(("lost", "said"), [(0, False), (10, True), (50, False)])

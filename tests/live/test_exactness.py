@@ -113,20 +113,6 @@ def test_a_clock_set_back_begins_a_segment_as_offline() -> None:
     assert counts["too_late"] == 0
 
 
-def test_an_axis_of_known_start_level_that_is_commanded_late_keeps_what_was_measured() -> None:
-    """Its first command comes when its first measurements have long left the window: as offline."""
-    config, start = recorded("panel-vision")[1], {"radial": 0.5, "vertical": 0.1}
-    given, seen = np.arange(300) * 28_000_000, np.arange(400) * 20_000_000
-    vertical = np.where(np.arange(300) < 200, np.nan, 0.1 + 1e-4 * np.arange(300))
-    values = {axis: level + 1e-3 + 1e-4 * np.sin(np.arange(400)) for axis, level in start.items()}
-    values["vertical"][50:] = np.nan
-    run = pf.Run.from_arrays(
-        given, {"radial": np.full(300, 0.5), "vertical": vertical}, {"vision": (seen, values)}, start=start
-    )
-    live = pf.LiveEstimator(config, start=start)
-    assert differences(live, events_of(run), pf.fuse(run, config), 0.25) == []
-
-
 def test_late_by_nearly_the_window_and_by_its_latency_too() -> None:
     """Measurements that come 1.9 s late, of a sensor that sees the past besides: nothing was let go too soon."""
     config = pf.FusionConfig(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -108,56 +106,6 @@ def test_what_counts_is_what_became_of_a_row_in_the_end(drawn: tuple[pf.FusionCo
             nis = float(np.mean((found.innovation[ours] / found.innovation_sd[ours]) ** 2))
             assert health.sensors[name].nis == pytest.approx(nis, rel=1e-9)
             assert health.sensors[name].outcomes["fused"] == np.sum(found.outcome[ours] == pf.Outcome.FUSED)
-
-
-def test_what_leaves_at_once_is_counted_all_the_same() -> None:
-    """A thousand rows a second, and pauses after which the whole window is of the past: not one row is missing."""
-    live, rng = pf.LiveEstimator(CONFIG), np.random.default_rng(5)
-    for begin in (0.0, 10.0, 20.0):
-        for row in range(3000):
-            t = begin + row * 1e-3
-            if row % 28 == 0:
-                live.command(t, radial=0.57)
-            live.measurement(t, "camera", radial=0.57 + rng.normal(0.0, 5e-4))
-    for row in range(100):  # all that came before has left, and nobody has asked since
-        live.measurement(40.0 + row * 1e-3, "camera", radial=0.57)
-    camera = live.health().sensors["camera"]
-    assert camera.rows == camera.outcomes["fused"] == 9100
-    assert camera.dropouts == 3
-    assert camera.nis == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 9000.0))
-
-
-def test_what_is_taken_back_is_invalid_and_nothing_else_remains_of_it() -> None:
-    """A sensor runs half a minute ahead for ten rows: they came, and all else is as without them."""
-    live, clean = pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)
-    for step in range(300):
-        for one in (live, clean):
-            one.command(step * 0.01, radial=0.57)
-            one.measurement(step * 0.01, "camera", radial=0.57 + 1e-5 * (step % 7))
-        if step == 200:
-            for row in range(10):
-                told = live.measurement(32.0 + row * 0.01, "camera", radial=0.57)
-                assert told.outcome is pf.Outcome.FUSED
-            assert live.health().sensors["camera"].outcomes["fused"] == 211
-    found, expected = (one.health().sensors["camera"] for one in (live, clean))
-    outcomes = expected.outcomes | {"invalid": 10}
-    assert found == replace(expected, rows=310, outcomes=outcomes)
-
-
-def test_a_restart_keeps_what_was_counted() -> None:
-    """After the commands' clock was reset: rows, outcomes and dropouts go on, and the usual interval is still known.
-
-    What was behind all at first, and is fed again when three commands have shown the new clock, counts once.
-    """
-    live = pf.LiveEstimator(CONFIG)
-    for begin in (100.0, 0.0):
-        for row in range(400):
-            live.command(begin + row * 0.01, radial=0.57)
-            if row not in (100, 200):
-                live.measurement(begin + row * 0.01, "tracker", radial=0.57)
-    tracker = live.health().sensors["tracker"]
-    assert live.segment == 1 and live.health().segments == 2
-    assert (tracker.rows, tracker.outcomes["fused"], tracker.outcomes["too_late"], tracker.dropouts) == (796, 796, 0, 4)
 
 
 def test_all_outcomes_are_counted() -> None:

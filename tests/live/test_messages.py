@@ -241,11 +241,3 @@ def test_stamps_in_ns_with_a_shift(time: dict[str, Any], message: dict[str, Any]
     reader = Reader("", manifest.of_tables({"command": entry}).command, {})
     (event,) = reader.events(SimpleNamespace(x=0.1, **message), 1_000_000_000)
     assert event.t == ns
-
-
-def test_fields_that_a_type_has_not_are_named() -> None:
-    """All of them; elements of lists may come later."""
-    entry = {"file": "f", "topic": "/t", "time": "header.stamp", "x": {"column": "point.w", "unit": "m"}}
-    entry |= {"y": {"column": "list[2].y", "unit": "m"}, "z": {"column": "point.z", "unit": "m"}}
-    reader = Reader("", manifest.of_tables({"command": entry}).command, {})
-    assert reader.lacks(SimpleNamespace(point=SimpleNamespace(z=0.0), list=[])) == ["header.stamp", "point.w"]

@@ -118,12 +118,6 @@ def test_every_form_of_a_pose(sent: bytes, config: pf.FusionConfig) -> None:
     assert off.magnitude() < 1e-6
 
 
-def test_points_have_no_orientation(config: pf.FusionConfig) -> None:
-    """A message of three numbers."""
-    [event], _ = taken(message("POSITION", struct.pack(">3f", *POINT)), config)
-    assert event.values == dict(zip("xyz", POINT / 1e3, strict=True))
-
-
 def test_several_devices_and_commands(config: pf.FusionConfig) -> None:
     """A list is an event each, in its order; the device ``command`` is the commands."""
     sent = transform("command") + message("TDATA", listed("left", COLUMNS) + listed("right", COLUMNS))
@@ -156,14 +150,6 @@ def test_times_of_receipt(config: pf.FusionConfig) -> None:
     unstamped[34:42] = bytes(8)
     stamps.append(taken(bytes(unstamped), config)[0][0].t)
     assert all(before <= stamp <= time.time_ns() for stamp in stamps)
-
-
-def test_images_are_passed_over(config: pf.FusionConfig) -> None:
-    """However large they are, and a type that nobody knows."""
-    image = pyigtl.ImageMessage(np.zeros((40, 300, 300), np.uint8), device_name="camera", timestamp=STAMP).pack()
-    events, notices = taken(image + message("NEWTYPE", b"x" * 99) + transform(), config)
-    assert len(events) == 1
-    assert not any("no OpenIGTLink" in notice for notice in notices)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ import pumafuse as pf
 from pumafuse.live import record
 from pumafuse.live.record import Recorder
 from pumafuse.live.stream import Stream
-from pumafuse.logs.frames import Cylindrical
 from streams import FIELDS, TRACKED, Event, T, any_stream, delayed, events_of, record_is_as_live
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -225,29 +224,6 @@ def test_a_reset_clock_begins_another_record(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "record.2" / "commands.csv").read_text() == "mine"
 
 
-def test_rows_that_a_run_may_not_have_are_left_out_and_counted(recorded: Recorded) -> None:
-    """A command 1.5 s behind its predecessors is fused live, but would be a new segment of a recorded run."""
-    recorded.go(100)
-    recorded.live.command(99 * T - 1_500_000_000 - 5_000_000, radial=0.57)
-    recorded.go(10, begin=100)
-    pf.fuse(recorded.close(), TRACKED)
-    assert "1 left out" in recorded.recorder.summary()
-
-
-def test_a_cylindrical_stream_is_recorded_with_its_frame(tmp_path: Path) -> None:
-    """Rows in x, y, z, and a run.toml that says where they are."""
-    frame = Cylindrical(base=(0.1, 0.0), positive="clockwise")
-    config = pf.FusionConfig(arm=TRACKED.arm, sensors=TRACKED.sensors, frame=frame)
-    recorded = Recorded(tmp_path / "record", config)
-    for step in range(50):
-        recorded.live.command(step * T, x=0.66, y=step / 1e3, z=-0.1)
-        recorded.live.measurement(step * T + 1, "tracker", x=0.66, y=step / 1e3, z=-0.1)
-    found = recorded.close()
-    assert found.frame == frame
-    offline = pf.fuse(found, config)
-    assert offline["tangential"].position[-1] == recorded.live.estimate(49 * T)["tangential"].position
-
-
 def test_a_full_disk_is_reported_and_nothing_is_written_twice(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,22 +287,6 @@ def test_a_folder_that_goes_is_made_anew(recorded: Recorded) -> None:
     pf.fuse(found, TRACKED)
 
 
-def test_a_parent_that_goes_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A disk that was unmounted is not replaced by a folder of the same name on another one."""
-    monkeypatch.setattr(record, "_TRIED_AGAIN", 0.01)
-    disk = tmp_path / "disk"
-    recorded = Recorded(disk / "record")
-    recorded.go(10)
-    recorded.written(20)
-    disk.rename(tmp_path / "away")
-    recorded.go(10, begin=10)
-    recorded.noticed("cannot be written")
-    assert not disk.exists()
-    (tmp_path / "away").rename(disk)
-    recorded.written(40)
-    assert recorded.close().command.stamp.tolist() == [step * T for step in range(20)]
-
-
 def test_only_an_empty_folder_is_recorded_into(tmp_path: Path) -> None:
     """What is there already is never mixed with what comes."""
     (tmp_path / "notes.txt").write_text("mine")
@@ -336,19 +296,3 @@ def test_only_an_empty_folder_is_recorded_into(tmp_path: Path) -> None:
     with pytest.raises(pf.RunError, match=r"\.\./tracker"):
         Recorder(tmp_path / "new", pf.FusionConfig(arm=TRACKED.arm, sensors=sensors), {}, print)
     assert not (tmp_path / "new").exists()
-
-
-def test_a_clock_that_is_reset_for_ever_fills_few_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Folders are bounded in number, each is said, every row is in one of them, and the last one fuses, too."""
-    monkeypatch.setattr("pumafuse.live.record._MOST_FOLDERS", 3)
-    recorded = Recorded(tmp_path / "record")
-    for segment in range(8):
-        recorded.go(10, begin=(8 - segment) * 1000)
-    recorded.close()
-    runs = [pf.Run.read(folder) for folder in sorted(tmp_path.iterdir())]
-    assert [len(run.command.stamp) for run in runs] == [10, 10, 60]
-    assert len(pf.fuse(runs[-1], TRACKED).segments) == 6
-    assert sum("folders are enough" in text for text in recorded.notices) == 1
-    said = [text for text in recorded.notices if "another clock" in text]
-    assert [text.rpartition("/")[2] for text in said] == ["record.2", "record.3"]
-    assert recorded.recorder.summary().startswith(f"{tmp_path / 'record'} to record.3, 3 folders: ")

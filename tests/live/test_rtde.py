@@ -201,25 +201,6 @@ def test_what_a_robot_refuses_is_said(
     assert sum(words in notice for notice in notices) == 1
 
 
-def test_registers_are_no_vectors_and_stamps_may_be_those_of_receipt(robot: Callable[..., Robot]) -> None:
-    """``output_int_register_0`` is a variable of this name."""
-    run = """
-[command]
-file = "robot.csv"
-time = "log_time"
-x = { column = "output_int_register_0", unit = "mm" }
-elbow = { column = "target_q_2", unit = "rad" }
-"""
-    found = source(robot(), run, [])
-    found.start()
-    begin = time.time_ns()
-    came = until(found, lambda taken: len(taken) >= 10)
-    found.stop()
-    assert [round(1e3 * event.values["x"]) for event in came[:10]] == list(range(10))
-    assert [event.values["elbow"] for event in came[:10]] == [state(k)["target_q"][2] for k in range(10)]
-    assert all(abs(event.t - begin) < 10e9 for event in came)
-
-
 BODIES = st.sampled_from([b"", b"\x01", b"\x01DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D", bytes(160)]) | st.binary(max_size=60)
 
 

@@ -140,12 +140,6 @@ def test_a_long_pause_is_not_filled() -> None:
     assert times == sorted(times)
 
 
-def test_a_rate_beyond_reason_is_refused() -> None:
-    """More than 10 kHz."""
-    with pytest.raises(pf.ConfigError, match="10000"):
-        Both(rate=1e6)
-
-
 def test_a_line_without_end_is_not_kept() -> None:
     """A megabyte without a line end is one bad line, held nowhere."""
     both = Both()
@@ -155,33 +149,6 @@ def test_a_line_without_end_is_not_kept() -> None:
     both.feed(b"\n" + lines(0.1))
     assert both.stream.bad == 1
     assert len(both.estimates) == 4
-
-
-def test_a_reset_clock_begins_the_grid_anew() -> None:
-    """After a restart the grid begins at the new first command."""
-    both = Both(rate=100.0)
-    both.feed(lines(1.0, begin=1000.0) + lines(1.0, begin=10.0))
-    both.end()
-    times = [found["t"] for found in both.estimates]
-    second = times.index(10.0)
-    assert max(times[:second]) > 1000.9
-    assert times[second:] == [round(10.0 + step / 100, 2) for step in range(len(times) - second)]
-    assert max(times[second:]) > 10.9
-
-
-def test_a_replay_follows_the_controllers_grid() -> None:
-    """A run whose commands are to be fitted by a grid is replayed on that grid, as offline fuses it."""
-    rng = np.random.default_rng(2)
-    given = np.arange(200) * 0.028 + rng.uniform(0.0, 0.004, 200)
-    run = pf.Run.from_arrays(
-        given,
-        {"radial": 0.57 + 1e-4 * np.arange(200)},
-        {"tracker": (np.arange(0.0, 5.5, 0.01), {"radial": np.full(550, 0.57)})},
-        clock="regular",
-    )
-    offline, both = pf.fuse(run, TRACKED, mode="as-live"), Both()
-    both.replay(run)
-    assert [found["radial"]["position_mm"] for found in both.estimates] == (offline["radial"].position * 1e3).tolist()
 
 
 def test_a_replay_brings_rows_when_they_came() -> None:
@@ -216,14 +183,3 @@ def test_the_grid_goes_on_over_a_pause(pause: float, commands_first: bool, rate:
     assert len(both.estimates) >= len(offline.time)
     found = [(one["t"], one["radial"]["position_mm"]) for one in both.estimates[: len(offline.time)]]
     assert found == list(zip(offline.time.tolist(), (offline.axes["radial"].position * 1e3).tolist(), strict=True))
-
-
-def test_a_command_without_a_value_counts_as_in_a_table() -> None:
-    """``invalid``, as ``fuse`` calls it."""
-    stamp, level = np.arange(30) * 0.028, np.full(30, 0.57)
-    hollow = np.where(np.arange(30) == 9, np.nan, level)
-    run = pf.Run.from_arrays(stamp, {"radial": hollow}, {"tracker": (stamp, {"radial": level})})
-    both = Both()
-    both.replay(run)
-    counts, offline = both.live.health().commands, pf.fuse(run, TRACKED).command_counts
-    assert (counts["fused"], counts["invalid"]) == (offline["used"], offline["invalid"]) == (29, 1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 import pumafuse as pf
 from pumafuse.fusion.config import Placement
 from pumafuse.fusion.placing import with_tool
-from pumafuse.live.stream import Stream
 from pumafuse.live.wire import BadLine, Event, LineDecoder
 from pumafuse.logs.frames import Rotated
 from streams import (
@@ -25,7 +23,6 @@ from streams import (
     fused_in_any_order,
     record_is_as_live,
     replay_is_as_live,
-    wired,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -151,20 +148,6 @@ def test_estimates_at_the_time_are_as_live() -> None:
     replay_is_as_live(run, KNOWN)
 
 
-def test_a_live_view_sees_the_tool_along_the_bases_axes() -> None:
-    """Of each sensor, wherever it stands: within what an arm that lags is off the motion that it measured."""
-    watcher = Mock()
-    Stream(pf.LiveEstimator(KNOWN), lambda _: None, lambda _: None, watchers=[watcher]).take(wired(RUN))
-    seen_events: list[Event] = [call.args[0] for call in watcher.event.call_args_list]
-    for sensor, latency in (("mocap", 0.012), ("tracker", 0.005), ("camera", 0.03)):
-        events = [event for event in seen_events if event.sensor == sensor and event.t > 1e9]
-        measured = np.array([[event.values[axis] for axis in "xyz"] for event in events])
-        expected = pose(np.array([event.t for event in events]) / 1e9 - latency - 0.086)[0]
-        assert np.abs(measured - expected).max() < 3e-3
-        if sensor != "tracker":
-            assert {"rx", "ry", "rz"} <= events[0].values.keys()
-
-
 DECODER = LineDecoder(ARM.kind_of, framed=False)
 Q = Rotation.from_rotvec(KNOWN.tool.reference).as_quat().tolist()
 
@@ -212,20 +195,6 @@ def test_what_is_no_orientation_is_refused(orientation: object) -> None:
         assert "no quaternion x, y, z, w of norm 1" in result.reason
         assert {"x", "rx", "ry", "rz"} <= set(result.axes)
     assert live.health().sensors["mocap"].outcomes["invalid"] == 6
-
-
-def test_without_a_reference_orientation_a_row_with_q_says_what_to_write() -> None:
-    """Neither half used nor silently dropped; and a marker needs it from the beginning."""
-    sensors = {"camera": CONFIG.sensors["camera"]}
-    live = pf.LiveEstimator(pf.FusionConfig(arm=ARM, sensors=sensors))
-    live.command(0.0, x=0.5)
-    result = live.measurement(0.1, "camera", x=0.5, orientation=Q)
-    assert result.outcome is pf.Outcome.INVALID
-    assert "[tool] reference_rotation_vector_deg in fusion.toml" in result.reason
-    with pytest.raises(pf.ConfigError, match=r"sensors.mocap.marker: .*\[tool\]"):
-        pf.LiveEstimator(CONFIG)
-    with pytest.raises(pf.ConfigError, match="start: rx"):
-        pf.LiveEstimator(KNOWN, start={"rx": 0.1})
 
 
 @pytest.mark.parametrize("seen", [{"x": 1.0, "y": 0.2}, {"x": 0.0, "y": 0.0, "z": 0.0}])

@@ -80,35 +80,7 @@ def test_a_flood_of_measurements_shortens_the_window_alone(monkeypatch: pytest.M
     assert sum(sum(sensor.outcomes.values()) for sensor in live.health().sensors.values()) == 20_002
 
 
-def test_a_frozen_stamp_ends_in_a_shorter_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A sensor whose stamp stands still: its rows are taken as far as they fit, then refused with the reason."""
-    monkeypatch.setattr(window, "MOST_ROWS", 4096)
-    live = pf.LiveEstimator(config_of())
-    live.command(0, radial=0.5)
-    told = [live.measurement(100 * MS, "slow", radial=0.5 + 1e-9 * row) for row in range(5000)]
-    assert told[3800].outcome is pf.Outcome.FUSED  # one place in sixteen is for rows that have left
-    assert told[-1].outcome is pf.Outcome.TOO_LATE
-    assert "the window holds no more" in told[-1].reason
-    assert live.command(100 * MS + 10 * MS + T + 1, radial=0.5).outcome is pf.Outcome.FUSED  # after latency and T
-
-
 # ---- time -----------------------------------------------------------------------------------------------------------
-
-
-def test_long_decays_and_long_silence() -> None:
-    """A gain error that recovers slowly decays on over a minute of silence, and far ahead, as it does offline."""
-    config = config_of(recovery=20.0)
-    given = np.concatenate((np.arange(0.0, 2.0, 0.028), [60.0, 60.028, 60.5]))
-    run = pf.Run.from_arrays(
-        given, {"radial": 0.5 + 0.001 * given}, {"fast": ([0.5, 30.0, 61.0], {"radial": [0.5] * 3})}
-    )
-    live, events = pf.LiveEstimator(config, window=100.0), events_of(run)
-    assert live.estimate(90.0).outcome is pf.Outcome.BEFORE_START
-    for event in events[:50]:
-        feed(live, event)
-        assert live.estimate(event.stamp + 120_000 * MS).outcome is pf.Outcome.FUSED
-    assert live.estimate(events[49].stamp + 3600 * 1000 * MS).outcome is pf.Outcome.FUSED
-    assert differences(live, events[50:], pf.fuse(run, config), 1e9) == []
 
 
 @pytest.mark.parametrize("stamp", [10**18, -4_599_990_000 * 10**9])

@@ -97,16 +97,6 @@ def test_the_best_gain_is_that_of_generalised_least_squares() -> None:
     assert log[0] == pytest.approx(again[0], rel=1e-9)
 
 
-def test_a_measurement_that_does_not_count_is_as_if_it_were_not_there() -> None:
-    one, rest = recording(4), RESTS[2]
-    weight = (np.arange(60) % 7 > 0).astype(np.float64)
-    without = Measured([one.of(weight > 0.0)], T, ["a"])
-    wild = one._replace(weight=weight, value=np.where(weight > 0.0, one.value, 1e3))
-    masked = Measured([wild], T, ["a"])
-    masked._offset = without._offset  # the range is that of what counts
-    assert masked.weighed(ARMS, rest)[0] == pytest.approx(without.weighed(ARMS, rest)[0], rel=1e-9)
-
-
 @pytest.mark.parametrize(("rows", "period"), [(30_000, 0.02), (10_000, 0.001)])
 def test_a_long_recording_is_known_by_where_each_quarter_of_it_moves_most(rows: int, period: float) -> None:
     """What moved the arm before a part is not seen in it; the noise of neighbours is still that of neighbours."""
@@ -207,14 +197,3 @@ def test_jitter_is_told_where_the_arm_is_calm() -> None:
     value = path + rng.normal(0.0, np.where(moving, 0.02, 2e-3))
     seen = swing._replace(value=value, weight=np.ones(len(time)))
     assert Measured([seen], T, ["a"]).jitter(arm)[0] == pytest.approx(2e-3, rel=0.15)
-
-
-def test_jitter_is_white_noise_beside_a_smooth_motion() -> None:
-    """Two sensors, one ten times as noisy, and a swing that no arm explains: each to a tenth of itself."""
-    rng, count = np.random.default_rng(9), 4000
-    time, source = np.arange(count) * 5_000_000, np.arange(count) // 2000
-    swing = 0.05 * np.sin(2.0 * np.pi * time / 3e9)
-    value = swing + rng.normal(0.0, np.array([1e-4, 1e-3])[source])
-    still = recording(1)._replace(time=time, value=value, source=source, weight=np.ones(count))
-    still = still._replace(command=np.full(100, 0.3))
-    assert Measured([still], T, ["a", "b"]).jitter(Arm(0.0, 0.1)) == pytest.approx([1e-4, 1e-3], rel=0.1)

@@ -180,16 +180,6 @@ def test_a_gain_that_is_not_free_is_no_sag() -> None:
     assert bent is None or bent.arm.beyond == bent.arm.below == 0.0
 
 
-def test_a_load_that_is_known_is_not_looked_for() -> None:
-    """Its knee is in the responses already."""
-    true = arm_of(5, knee=0.2 * RANGE, beyond=-0.5)
-    recorded = measured(5, true)
-    knowing = Measured(recorded.recordings, T, ["camera"], true.model)
-    plain = plain_arm(knowing)
-    assert plain is not None and bent_arm(plain, Arm(0.0, 0.1), FREE) is None
-    assert plain.arm.gain == pytest.approx(true.gain, abs=0.01)
-
-
 def test_what_is_fixed_is_not_tried() -> None:
     """Neither play nor a speed is found where it may not vary."""
     true = arm_of(2, play=0.15 * RANGE)

@@ -7,16 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import pumafuse as pf
 from pumafuse.logs.run import Source
-from pumafuse.tuning.identifiability import excited_axes
 from pumafuse.tuning.parameters import Fit
-from pumafuse.tuning.stage import Plan, likelihood_of
-from tuning_runs import fit_stage, later, outage, quietly, replaced, scenario, spoiled
-
-Floats = NDArray[np.float64]
+from tuning_runs import fit_stage, later, outage, quietly, scenario, spoiled
 
 
 def changed(name: str, change: Callable[[Source], Source]) -> pf.Run:
@@ -201,35 +196,3 @@ def test_an_axis_that_rests_most_of_the_time_is_followed() -> None:
     run = pf.Run.from_arrays(time, {"radial": command}, {"tracker": (stamp, {"radial": measured})})
     best = fit_stage(run, pf.FusionConfig(arm=arm, sensors={"tracker": pf.Sensor(sd=5e-5)})).best.config
     assert best.sensors["tracker"].sd_of("radial") == pytest.approx(5e-5, rel=0.15)
-
-
-def test_a_wrong_delay_is_no_reason_to_refuse_a_run_that_is_mostly_rest() -> None:
-    """One move in a minute of rest, later than the arm model says: only while it moves does anything differ."""
-    sim, count, rng = outage(1), 2000, np.random.default_rng(1)
-    time, moved = 0.028 * np.arange(count), np.clip(np.arange(count) - 1600, 0, 40)
-    command = 0.012 * (10.0 - np.abs(np.minimum(moved, 20) - 10.0))  # there and back without a stop
-    arm = sim.config.arm
-    true = pf.FusionConfig(arm=replaced(arm, delay=arm.delay + 0.1))
-    position = pf.fuse(pf.Run.from_arrays(time, {"radial": command}), true, rate=100.0)["radial"].position
-    measured = position + 5e-5 * rng.standard_normal(len(position))
-    tracker = (0.01 * np.arange(len(measured)), {"radial": measured})
-    config = pf.FusionConfig(arm=arm, sensors={"tracker": pf.Sensor(sd=5e-5)})
-
-    def moving(sensor: tuple[Floats, dict[str, Floats]]) -> list[str]:
-        run = pf.Run.from_arrays(time, {"radial": command}, {"tracker": sensor})
-        return excited_axes(likelihood_of([run], config, Plan(["noise"], [])), config)
-
-    assert moving(tracker) == ["radial"]
-    for factor in (-1.0, 100.0):
-        with pytest.raises(pf.PumafuseError, match=r"^sensor 'tracker' "):
-            moving((tracker[0], {"radial": factor * measured}))
-
-
-def test_an_axis_without_measurements_is_left_as_it_is() -> None:
-    """Its numbers stay, and none of them is reported."""
-    run, config = outage(1).run, spoiled(outage(1).config)
-    sensors = {name: replace(one, values={"tangential": one.values["tangential"]}) for name, one in run.sensors.items()}
-    found = quietly(lambda: pf.tune([replace(run, sensors=sensors)], config))
-    assert not [one.key for one in found.details.parameters if "vertical" in one.key]
-    assert found.config.process["vertical"] == config.process["vertical"]
-    assert found.config.arm.axes["vertical"] == config.arm.axes["vertical"]

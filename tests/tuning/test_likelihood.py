@@ -201,22 +201,6 @@ def test_of_more_measurements_than_a_fit_needs_those_count_during_which_an_axis_
         assert np.isin(np.round(1e9 * t[moving]), recording.time).mean() > 0.99
 
 
-def test_how_well_the_arm_is_known_is_no_part_of_it() -> None:
-    """Intervals of lag and gain change neither the likelihood nor its derivatives, but what a fusion says."""
-    sim = two_sensors()
-    gain = pf.Gain(intercept=0.98, intercept_ci95=(0.5, 1.5))
-    doubted = with_axis(sim.config, "vertical", gain=gain, gain_recovery=None, lag_ci95=(0.0, 0.4))
-    certain = with_axis(sim.config, "vertical", gain=pf.Gain(intercept=0.98), gain_recovery=None)
-    likelihood = Likelihood([sim.run], certain)
-    free = free_of(likelihood, certain, ALL)
-    one, other = (likelihood.evaluate(config) for config in (certain, doubted))
-    np.testing.assert_array_equal(one.axes, other.axes)
-    scores = [likelihood.derivatives(config, free, one.outcomes).score for config in (certain, doubted)]
-    np.testing.assert_array_equal(*scores)
-    narrow, wide = (pf.fuse(sim.run, config)["vertical"].position_sd for config in (certain, doubted))
-    assert (wide >= narrow).all() and (wide > narrow).any()
-
-
 def test_another_configuration_is_as_if_built_with_it() -> None:
     """Delays, gains, plants and latencies moved afterwards, past each other: as anew, row by row.
 
@@ -364,22 +348,6 @@ def test_scatter_is_the_noise_whatever_the_motion(share: float) -> None:
     likelihood = Likelihood([run], pf.FusionConfig(arm=arm, sensors={name: pf.Sensor(sd=7.0) for name in noise}))
     wanted = {(name, "radial"): sd for name, sd in noise.items()}
     assert likelihood.scatter == pytest.approx(wanted, rel=0.2 if share else 0.08)
-
-
-def at_rest(seed: int, sds: dict[str, float]) -> tuple[pf.Run, pf.FusionConfig]:
-    """An axis that is commanded to stay, and sensors with noises of ``sds`` [m] on it."""
-    time, rng = np.arange(300) * 0.01, np.random.default_rng(seed)
-    read = {name: (time, {"radial": sd * rng.standard_normal(len(time))}) for name, sd in sds.items()}
-    run = pf.Run.from_arrays(time, {"radial": np.zeros(len(time))}, read)
-    arm = pf.ArmModel.load("puma560-internal")
-    return run, pf.FusionConfig(arm=arm, sensors={name: pf.Sensor(sd=1e-3) for name in sds})
-
-
-def test_misfit_is_the_distance_from_the_best_sensor() -> None:
-    """An arm that does what it is told, beside sensors of 0.1 and 5 mm: 0.1 mm, whichever comes first."""
-    for sds in ({"tracker": 1e-4, "camera": 5e-3}, {"camera": 5e-3, "tracker": 1e-4}):
-        run, config = at_rest(1, sds)
-        assert Likelihood([run], config).misfit(config) == {"radial": pytest.approx(1e-4, rel=0.15)}
 
 
 def test_measurements_are_as_far_from_the_noiseless_arm_as_from_the_oracles() -> None:

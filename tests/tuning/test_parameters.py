@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Callable
 from functools import reduce
@@ -22,12 +21,11 @@ from pumafuse.tuning.parameters import (
     kinds_of,
     parameters,
     with_arm,
-    with_axis_of,
     with_disturbance,
     with_drifts,
     with_own_delays,
 )
-from tuning_runs import replaced, with_order, with_process
+from tuning_runs import replaced, with_process
 
 ARM = pf.ArmModel.load("puma560-internal")  # tangential is second order, radial and vertical are first
 TRACKER, CAMERA = pf.Sensor(sd=5e-5, latency=0.008), pf.Sensor(sd={"radial": 4e-4, "vertical": 3e-4}, latency=0.045)
@@ -136,18 +134,6 @@ def test_what_may_be_none() -> None:
     assert none == {*walk, "disturbance_sd", "bias_drift_sd"}
 
 
-def test_what_was_not_configured_has_no_value_before() -> None:
-    """A recovery that the arm does not have, and a parameter of a plant of the other order."""
-    arm = replaced(ARM, axes={**ARM.axes, "radial": replaced(ARM.axes["radial"], gain_recovery=None)})
-    config = replaced(CONFIG, arm=arm)
-    assert of("axes.radial.gain_recovery_ms").configured(CONFIG) == 0.1
-    assert of("axes.radial.gain_recovery_ms").configured(config) is None
-    assert 0.02 < of("axes.radial.gain_recovery_ms").get(config) < 0.5
-    second = with_order(CONFIG, "radial", 2)
-    assert of("axes.radial.damping", second).configured(CONFIG) is None
-    assert of("axes.radial.damping", second).configured(second) == 1.0
-
-
 # ---- fixing ---------------------------------------------------------------------------------------------------------
 
 FIXED: dict[str, Callable[[str], bool]] = {
@@ -204,17 +190,6 @@ def test_an_arm_has_the_lag_that_its_plant_shows(axis: str) -> None:
         plant = config.arm.axes[axis].plant
         assert type(plant) is type(ARM.axes[axis].plant)
         assert np.trapezoid(1.0 - plant.step_response(time), time) == pytest.approx(lag, rel=1e-6)
-
-
-def test_an_axis_is_copied_with_all_its_numbers() -> None:
-    """Model, noise and sds of that axis are the other's, everything else stays: latencies too."""
-    other = CONFIG
-    for one in everything():
-        other = one.move(other, 0.4 * one.range[0] + 0.6 * one.range[1])
-    mixed, before, after = snapshot(with_axis_of(CONFIG, other, "radial")), snapshot(CONFIG), snapshot(other)
-    for key in names():
-        assert mixed[key] == (after if "radial" in key else before)[key], key
-    assert all(not math.isclose(before[key], after[key]) for key in names())
 
 
 @pytest.mark.parametrize("gain", [0.25, 1.0, 2.0])

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pumafuse.tuning.arm_search import chosen_arms
 from pumafuse.tuning.arms import Arm
 from pumafuse.tuning.posterior import (
     MODELS,
@@ -56,13 +53,6 @@ def test_quantiles_over_models_are_those_of_the_mixture() -> None:
     assert below == pytest.approx([0.025, 0.975], abs=2e-3)
 
 
-def test_maxima_of_one_model_that_meet_do_not_count_twice() -> None:
-    """The same maximum found from two starts is one."""
-    once, twice = (AxisPosterior([branch(0.08, 2e-3)] * times) for times in (1, 2))
-    delays = np.linspace(0.07, 0.09, 50)
-    assert twice.log_density(delays) == pytest.approx(once.log_density(delays))
-
-
 def test_axes_that_agree_share_a_delay_and_others_do_not() -> None:
     """Delays 1 ms apart, known to 2 ms, are one; one that is 20 ms away is another; at most one is told apart."""
     near = {name: AxisPosterior([branch(at, 2e-3)]) for name, at in (("a", 0.080), ("b", 0.081), ("c", 0.1))}
@@ -76,11 +66,6 @@ def test_an_own_delay_is_worth_what_the_evidence_gains() -> None:
     pair = {name: AxisPosterior([branch(at, 1e-3)]) for name, at in (("a", 0.080), ("b", 0.081))}
     shared = norm.logpdf(1e-3, 0.0, math.sqrt(2.0) * 1e-3) + math.log(0.05) + 2.3
     assert own_worth(pair, ["a", "b"]) == pytest.approx({"a": -shared, "b": -shared}, abs=0.05)
-
-
-def test_odds_are_those_of_the_weights() -> None:
-    posterior = AxisPosterior([branch(0.08, 2e-3, math.log(3.0)), branch(0.09, 2e-3, 0.0, SECOND)])
-    assert posterior.mixture().log_odds(lambda one: one.order == 1) == pytest.approx(math.log(3.0), abs=0.02)
 
 
 def test_a_shared_delay_weighs_the_axes_by_what_they_know() -> None:
@@ -98,18 +83,6 @@ def test_a_dead_time_that_may_be_shared_is_a_mixture() -> None:
     middle, sd = (0.083 / 16.0 + 0.080) / (1.0 / 16.0 + 1.0), 1e-3 / math.sqrt(1.0 + 1.0 / 16.0)
     below = [0.75 * norm.cdf(end, middle, sd) + 0.25 * norm.cdf(end, 0.083, 4e-3) for end in ends]
     assert below == pytest.approx([0.025, 0.975], abs=3e-3)
-
-
-def test_an_axis_that_knows_little_has_the_interval_of_those_it_shares_with() -> None:
-    """Log-odds of sharing of 3.9: a fiftieth that the dead time is its own moves the ends by little."""
-    known = {"a": AxisPosterior([branch(0.080, 1e-4)]), "b": AxisPosterior([branch(0.0805, 4e-3)])}
-    searched: dict[str, Any] = {
-        axis: SimpleNamespace(posterior=one, arm=lambda *_: Arm(0.08, 0.02)) for axis, one in known.items()
-    }
-    found, _ = chosen_arms(searched, known)
-    low, high = found["b"].mixture.quantiles("delay", lambda _: True)
-    assert own_worth(known, ["a", "b"])["b"] == pytest.approx(-3.9, abs=0.1)
-    assert 2.0 * 1.96e-4 < high - low + 1e-5 < 2.0 * 3e-4
 
 
 def test_the_simplest_of_the_likely_models_is_taken() -> None:

@@ -199,14 +199,6 @@ def test_a_gain_that_recovers_is_kept() -> None:
     assert model.gain.intercept - 1.0 == pytest.approx(0.2, rel=0.2)
 
 
-def test_a_fixed_gain_stays_of_its_kind() -> None:
-    """With its intercept fixed it gets no recovery."""
-    config, command, path = moving()
-    found = fit_stage(measured(command, path, 1), config, ("noise", "delay", "gain"), "gain")
-    assert found.best.config.arm.axes["tip"].gain == config.arm.axes["tip"].gain
-    assert found.best.config.arm.axes["tip"].gain_recovery is None
-
-
 def test_the_scale_of_a_sensor_is_found() -> None:
     """4 % off, by the arm that is known: within 0.3 %, inside its interval."""
     config, command, path = moving()
@@ -251,19 +243,6 @@ def test_the_configured_noise_changes_nothing() -> None:
         start = replaced(with_sensors(config, sd=times * 3e-4), process=process)
         found.append(dict(quietly(lambda start=start: pf.tune([run], start, fit=["noise", "delay", "plant"])).params))
     assert found[0] == pytest.approx(found[1], rel=1e-3) and found[2] == pytest.approx(found[1], rel=1e-3)
-
-
-def test_a_verdict_tells_a_noise_at_its_bound() -> None:
-    """Measurements without any noise of their own, the prior off: the verdict does not say better and nothing else."""
-    config, command, path = moving()
-    run = measured(command, path, 1, sd=0.0)
-    found = quietly(lambda: pf.tune([run], config, sd_prior=False))
-    assert found.config.sensors["camera"].sd_of("tip") == 1e-7
-    (check,) = found.details.validation or []
-    assert check.verdict.startswith("better, but its error bars do not hold (sd_mm of camera is at its bound")
-    assert not check.holds
-    verdict = pf.summarise(quietly(lambda: pf.fuse(run, found.config))).axes["tip"].sensors["camera"].verdict
-    assert verdict is not None and "consistent" not in verdict
 
 
 def lever(command: np.ndarray, period: float) -> np.ndarray:

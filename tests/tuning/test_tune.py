@@ -220,14 +220,6 @@ def test_a_run_to_validate_on_is_compared_whole() -> None:
     assert not [note for note in found.details.notes if "fitted on" in note]
 
 
-def test_a_run_that_was_fitted_on_is_no_validation() -> None:
-    """It is compared as asked for, with a note."""
-    one = outage(1)
-    found = sds_alone([one.run], one.config, validate=replace(one.run, name="another name"))
-    (note,) = [note for note in found.details.notes if note.startswith("validated on a run that was fitted on")]
-    assert note.endswith("whether the numbers hold elsewhere is not known") and found.details.validation
-
-
 # ---- a trusted sensor -----------------------------------------------------------------------------------------------
 
 

@@ -57,15 +57,6 @@ def test_error_bars_that_do_not_hold_are_no_plain_improvement() -> None:
         assert one.holds and one.verdict.startswith("better: ")
 
 
-def test_a_simpler_way_that_predicts_better_is_named() -> None:
-    """An arm whose commands count for nothing beside a drift that follows the camera: the command alone is better."""
-    config = with_process(run().config, drift=10.0, input_noise=0.0)
-    for one in check(run().run, config, config):
-        skill = one.after.sensors["vision"].skill
-        assert skill is not None and skill > 1.02
-        assert f"a simpler way predicts the next measurement better (error over its: vision {skill:.2f})" in one.verdict
-
-
 def test_numbers_are_those_of_a_fusion() -> None:
     """Likelihood, rejections, NIS, whiteness, RMSE and coverage, from measurements and estimates since then only.
 
@@ -178,28 +169,3 @@ def test_error_bars_hold_while_the_nis_is_within_chance() -> None:
     found = with_nis(1.6, since=3.4)
     assert 8 <= found.components <= 12
     assert found.holds
-
-
-def test_components_of_one_instant_are_counted_by_sensor() -> None:
-    """Two cameras whose stamps are the same: the components of both are compared, each with itself."""
-    camera, sensor = run().run.sensors["vision"], run().config.sensors["vision"]
-    twice = replace(run().run, sensors={"vision": camera, "other": camera})
-    config = replaced(run().config, sensors={"vision": sensor, "other": sensor})
-    for one in check(twice, config, config):
-        assert one.components == sum(sensor.count for sensor in one.after.sensors.values()) + one.after.rejected
-        assert one.verdict.startswith("no different: log-likelihood +0.0 (chance: ± 0.0)")
-
-
-def test_without_a_reference_the_likelihood_decides() -> None:
-    """No RMSE, no coverage, and none in the verdict; an axis without measurements is left out."""
-    truth, wrong = run().config, spoiled(run().config)
-    bare = replace(run().run, reference=None)
-    for one, known in zip(check(bare, truth, wrong), check(run().run, truth, wrong), strict=True):
-        assert one.before.rmse_mm is one.before.coverage is one.after.rmse_mm is None
-        assert "RMSE" not in one.verdict
-        assert one.before.log_likelihood == known.before.log_likelihood
-        assert one.worse
-    camera = bare.sensors["vision"]
-    half = replace(bare, sensors={"vision": replace(camera, values={"vertical": camera.values["vertical"]})})
-    assert [one.axis for one in check(half, truth, truth)] == ["vertical"]
-    assert check(bare, truth, truth, since=1e4) == []
