@@ -6,7 +6,7 @@ import pytest
 from pumafuse.arrays import median
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 10, 11, 1000])
+@pytest.mark.parametrize("count", [1, 2, 11, 1000])
 def test_the_median_is_that_of_numpy(count: int) -> None:
     """To the bit, of few and of many, also where some are the same."""
     values = np.random.default_rng(count).normal(size=count)

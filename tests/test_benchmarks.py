@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +13,6 @@ from scipy.integrate import solve_ivp
 from scipy.stats import multivariate_normal
 
 from pages import ROOT
-from pumafuse.tuning.arm_search import ArmSearch
 
 
 @pytest.fixture
@@ -146,32 +144,9 @@ def test_intervals_of_lags_hold_on_arms_of_all_kinds(benchmark: Callable[[str], 
 
 
 @pytest.mark.long
-def test_delays_a_period_away_are_looked_at(
-    benchmark: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In one run a model has two maxima a period of 8 ms apart, in another the first one found is a period off."""
-    searches, latency = list[ArmSearch](), importlib.import_module("pumafuse.tuning.latency")
-
-    def kept(*given: object) -> ArmSearch:
-        searches.append(ArmSearch(*given))
-        return searches[-1]
-
-    monkeypatch.setattr(latency, "ArmSearch", kept)
-    benchmark("lag").examined((323, 2, 0.0))
-    tops = defaultdict[tuple[int, str], list[float]](list)
-    for number, search in enumerate(searches):
-        for one in search.posterior.branches:
-            tops[number, str(one.model)].append(one.delays[np.argmax(one.log_density)] / 0.008)
-    assert any(0.6 < max(each) - min(each) < 1.4 for each in tops.values()), tops
-    found, _, _ = benchmark("lag").examined((306, 2, 0.0))
-    assert len(found) == 8
-    assert all(one.low <= one.truth <= one.high for one in found), found
-
-
-@pytest.mark.long
 def test_a_drift_of_20_ms_is_named(benchmark: Callable[[str], ModuleType]) -> None:
-    """In all of six runs: of such runs 95 % are named."""
-    for seed in range(500, 506):
+    """In all of three runs: of such runs 95 % are named."""
+    for seed in range(500, 503):
         _, _, named = benchmark("lag").examined((seed, 2, 0.02))
         assert any("drifts" in one for one in named), seed
 
