@@ -60,20 +60,6 @@ def test_json_has_the_numbers_of_python(run: Path, found: list[dict[str, object]
         assert (one["recovery_ms"], one["amplitude_mm"]) == pytest.approx((100.0, 8.0))
 
 
-@pytest.mark.long
-def test_runs_presets_and_start_levels(run: Path) -> None:
-    """Each run is there, compared with its reference; levels are by axis, in millimetres; no number is usage."""
-    found = json.loads(pumafuse("verify", run, run, "--arm", "puma560-internal", "--json").stdout)
-    assert [(one["axis"], one["source"]) for one in found] == [("radial", "reference"), ("vertical", "reference")] * 2
-    assert all(one["model"]["rms_mm"] < 0.001 for one in found)
-    arguments = ("verify", run, "--arm", run / "arm.toml", "--sensors", "scope", "--json", "--start")
-    found = json.loads(pumafuse(*arguments, "radial=555.5", "--start", "vertical=3").stdout)
-    assert [one["start_mm"] for one in found] == pytest.approx([555.5, 3.0])
-    assert [one["start_from"] for one in found] == ["given", "given"]
-    pumafuse(*arguments, "radial=far", code=2)
-    assert "elbow" in refused(*arguments, "elbow=3")
-
-
 def test_what_is_not_there_is_one_line(run: Path, tmp_path: Path) -> None:
     """A missing arm or sensor, another arm's axes."""
     arm, elbow = run / "arm.toml", tmp_path / "elbow.toml"

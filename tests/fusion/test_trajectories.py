@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
 
@@ -10,10 +9,8 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from executable import pumafuse, refused
-from pumafuse.errors import RunError
+from executable import pumafuse
 from pumafuse.fusion import results
-from refusals import one_line
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 START_NS = 1_700_000_000_123_456_789
@@ -60,19 +57,3 @@ def test_with_a_frame_the_trajectories_are_in_the_coordinates_of_the_log(tmp_pat
     assert np.abs(numbers[:, :3] - truth).max() < 1e-12
     _, estimated = _read(tmp_path / "out" / "fused.tum")
     assert np.abs(estimated[:, :3] - truth).max() < 0.1
-
-
-def test_runs_without_a_trajectory_say_what_they_have_instead(tmp_path: Path) -> None:
-    """Axes that are no x, y, z, and clocks that were set back, are one line and no file."""
-    est = pf.fuse(_recorded("x lift"), _configured("x lift"))
-    said = one_line(RunError, lambda: est.to_tum(tmp_path / "fused.tum"))
-    assert said == (
-        "run 'run': a trajectory needs x, y and z, as axes of the arm or by a [frame]; there are only x, lift"
-    )
-    results.write(est, tmp_path / "fused", force=False)
-    assert "a trajectory needs x, y and z" in refused("compare", tmp_path / "fused", "--tum", tmp_path / "out")
-    est = pf.fuse(_recorded(), _configured("x y z"))
-    twice = replace(est, segment=np.arange(len(est.time)) // 50)
-    assert "the log's clock was set back" in one_line(RunError, lambda: twice.to_tum(tmp_path / "fused.tum"))
-    assert not (tmp_path / "fused.tum").exists()
-    assert not (tmp_path / "out").exists()

@@ -228,34 +228,6 @@ def test_the_start_level_is_found_among_the_runs() -> None:
 # ---- logs as they are -----------------------------------------------------------------------------------------------
 
 
-def test_a_messy_log_gives_what_the_clean_one_gives() -> None:
-    """Rows without a number, before the first command, out of order, repeated; commands out of order, repeated."""
-    position = moved(arm()) + noise()
-    lost = np.zeros(len(SAMPLED), bool)
-    lost[RNG.choice(len(SAMPLED), 150, replace=False)] = True
-    kept = ~lost
-    clean = pf.Run.from_arrays(TIME, {"tip": BINARY}, {"scope": (SAMPLED[kept], {"tip": position[kept]})})
-    rows = np.arange(len(SAMPLED))
-    rows[100:130] = rows[100:130][::-1]
-    rows = np.concatenate((rows[:600], rows[590:600], rows[600:]))  # ten rows again
-    spoilt = np.where(lost, np.nan, position)
-    spoilt[np.flatnonzero(lost)[:3]] = [np.inf, -np.inf, 3.4e38]
-    stamp = np.concatenate(([-0.5, -0.1], SAMPLED[rows]))
-    values = np.concatenate(([9.0, 9.0], spoilt[rows]))
-    ticks = np.arange(TICKS)
-    ticks[50:53] = [52, 50, 51]
-    ticks = np.concatenate((ticks, ticks[-1:]))
-    messy = pf.Run.from_arrays(TIME[ticks], {"tip": BINARY[ticks]}, {"scope": (stamp, {"tip": values})})
-    expected, found = only(clean, arm()), only(messy, arm())
-    assert found.measurements == int(kept.sum())
-    assert found.notes and not expected.notes
-    assert msgspec.structs.replace(found, notes=[], commands=expected.commands, rows=expected.rows) == expected
-    again = int(kept[590:600].sum())
-    assert found.rows == {"used": kept.sum(), "before_start": 2, "duplicate": again, "invalid": 160 - again}
-    assert found.commands == {"used": TICKS, "duplicate": 1}
-    assert found.model.rms == pytest.approx(np.std(noise()[kept]), rel=1e-9)
-
-
 def test_what_cannot_be_verified_is_refused_in_one_line() -> None:
     """Too few measurements, no sensor at all, one that is unknown, an axis that the arm or the run has not."""
     run, no_source = run_of(moved(arm()) + noise()), "no source has 20 measurements of a commanded axis"

@@ -301,22 +301,6 @@ def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, t
         assert total(sim.run, found.config) == pytest.approx(stop.calls[-1][1], abs=0.05)
 
 
-@pytest.mark.long
-def test_what_is_as_likely_at_first_is_kept() -> None:
-    """A search that chose other orders and ended lower: the configuration is the one as given, with a note."""
-    sim = outage(1)
-    given = with_order(with_order(sim.config, "tangential", 1), "vertical", 2)
-    pipeline = Pipeline([sim.run], given, [Plan(ARM, [])], lambda _, __: None)
-    pipeline.fit()
-    chosen = pipeline.best.arm.axes
-    assert isinstance(chosen["tangential"].plant, pf.SecondOrder)
-    assert isinstance(chosen["vertical"].plant, pf.FirstOrder)
-    pipeline.best = with_sensors(pipeline.best, sd=0.1)
-    pipeline.keep_the_better()
-    assert pipeline.result() == given and pipeline.stages == []
-    assert pipeline.notes[-1].startswith("nothing more likely was found than the configuration as given")
-
-
 # ---- the shipped scan -----------------------------------------------------------------------------------------------
 
 
