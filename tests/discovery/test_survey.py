@@ -611,6 +611,7 @@ def test_units_without_a_name_are_those_in_which_both_move_alike(unit: str, log:
         ("ASPos.{}", "AIPos.{}"),
         ("act_{}", "obs_{}"),
         ("first_{}_mm", "second_{}_mm"),
+        ("{}d_mm", "{}_mm"),
     ],
 )
 def test_a_single_table_is_taken_apart_by_the_names_of_its_columns(
