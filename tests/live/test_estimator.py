@@ -195,6 +195,23 @@ def test_commands_at_another_interval_are_said_once(interval: float, said: str) 
     assert said in "".join(of_interval)
 
 
+def test_who_contradicts_whom_is_said_with_axes_and_sizes() -> None:
+    """The camera is 50 mm off beside the tracker, on radial alone: once it is told, with its number."""
+    notices: list[str] = []
+    live = running(on_notice=notices.append)
+    for step in range(20):
+        t = 1.0 + (step + 1) * PERIOD
+        live.command(t, radial=0.57, vertical=0.1)
+        live.measurement(t, "tracker", radial=0.57, vertical=0.1)
+        live.measurement(t, "camera", radial=0.62)
+    (said,) = [text for text in notices if "contradicts" in text]
+    assert said.startswith("sensor 'camera' contradicts 'tracker' since 1.")
+    assert said.endswith("s (radial by +50 mm): its measurements are rejected")
+    assert live.health().faults == ("sensor 'camera' contradicts 'tracker': its measurements are rejected",)
+    live.measurement(t + PERIOD / 2, "camera", radial=0.57)
+    assert live.health().faults == ()
+
+
 @pytest.mark.parametrize(("lost", "said"), [(0, False), (10, True), (50, False)])
 def test_missing_commands_are_counted(lost: int, said: bool) -> None:
     """One in ten lost in motion: said with its number after a thousand; none, or one in fifty: nothing.
