@@ -107,15 +107,19 @@ def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")
     return found
 
 
-@pytest.mark.long
-def test_among_thousands_of_columns_names_tell_who_is_who(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["csv", later("parquet"), later("json")])
+def test_among_thousands_of_columns_names_tell_who_is_who(tmp_path: Path, kind: str) -> None:
     t, u, z = (one[:300] for one in recorded_at_once())
     told = {"cmd_x": u[:, 0], "meas_x": z[:, 0], "time": t}
     others = {f"c{n}": np.full(len(t), n % 7) + t for n in range(2_100)}
     found = list[Survey]()
     for name, columns in (("few", told), ("many", {**others, **told})):
-        write(tmp_path / f"{name}.csv", columns)
-        found.append(survey(tmp_path / f"{name}.csv"))
+        file = tmp_path / f"{name}.{kind}"
+        if kind == "json":
+            file.write_text(json.dumps({key: value.tolist() for key, value in columns.items()}))
+        else:
+            write(file, columns) if kind == "csv" else papq.write_table(pa.table(columns), file)
+        found.append(survey(file))
     few, many = found
     assert many.relations == few.relations
     assert (many.run.command.values["x"] == few.run.command.values["x"]).all()
@@ -126,9 +130,19 @@ def test_among_thousands_of_columns_names_tell_who_is_who(tmp_path: Path) -> Non
     ("name", "stamps", "unit"),
     [
         ("time_s", lambda t: [repr(float(one)) for one in t], ""),
+        ("t", lambda t: [repr(float(one)) for one in t], "s"),
+        ("t", lambda t: [repr(float(1e3 * one)) for one in t], "ms"),
         ("timestamp", lambda t: [round(1e6 * (START + one)) for one in t], "us"),
+        ("stamp", lambda t: [START * 10**9 + round(1e9 * one) for one in t], "ns"),
         ("Time [ms]", lambda t: [repr(float(1e3 * (START + one))) for one in t], "ms"),
+        ("uptime_s", lambda t: [repr(float(one)) for one in t], ""),
+        ("uptime_ms", lambda t: [repr(float(1e3 * one)) for one in t], ""),
+        ("date", lambda t: [str(np.datetime64(START * 10**9 + round(1e9 * one), "ns")) for one in t], ""),
+        ("asctime", lambda t: [f"2026-11-25 10:00:{one:06.3f}".replace(".", ",") for one in t], ""),
         ("Zeit", lambda t: [f"25.11.2026 10:00:{one:06.3f}" for one in t], ""),
+        ("Time", lambda t: [f"{one:g} sec" for one in t], ""),
+        ("time", lambda t: [f"12:00:{one:06.3f}" for one in t], ""),
+        ("", lambda t: [f"0 days 00:00:{one:09.6f}" for one in t], ""),
         ("", lambda t: [repr(float(one)) for one in t], "s"),
     ],
 )
@@ -143,7 +157,8 @@ def test_clocks_are_known_by_name_by_date_and_by_interval(
     assert {part.clock.time.unit for part in found.parts if part.clock} == {unit}
 
 
-@pytest.mark.parametrize(("unit", "scale", "all_within"), [("_deg", 180.0 / np.pi, True), ("", 1.0, False)])
+@pytest.mark.parametrize(("unit", "scale"), [("_deg", 180.0 / np.pi), ("_rad", 1.0), ("", 1.0)])
+@pytest.mark.parametrize("all_within", [False, True])
 def test_angles_that_begin_anew_after_a_turn(
     unit: str, scale: float, all_within: bool, log: Path, tmp_path: Path
 ) -> None:
@@ -169,8 +184,9 @@ def test_angles_that_begin_anew_after_a_turn(
     assert np.std(est["yaw"].position[50:] - yaw(est.time - est.time[0] - LAG)[50:]) < 2e-3
 
 
-def test_a_trajectory_of_tum_is_a_sensor(log: Path) -> None:
-    """With its header in a comment; other texts beside it are none.
+@pytest.mark.parametrize("file", ["poses.csv", "poses.txt", "groundtruth.txt"])
+def test_a_trajectory_of_tum_is_a_sensor(file: str, log: Path) -> None:
+    """With its header in a comment, or without; other texts beside it are none.
 
     z moves as x does: names decide. What is called the truth is a sensor where there is no other.
     """
@@ -181,13 +197,13 @@ def test_a_trajectory_of_tum_is_a_sensor(log: Path) -> None:
     text = "".join(
         f"{START + at:.4f} {x:.7f} {y:.7f} {z:.7f} 0 0 {np.sin(at):.4f} {np.cos(at):.4f}\n" for at, x, y, z in rows
     )
-    (log / "groundtruth.txt").write_text(f"# tracker\n# timestamp tx ty tz qx qy qz qw\n{text}")
+    (log / file).write_text(f"# tracker\n# timestamp tx ty tz qx qy qz qw\n{text}")
     (log / "README.txt").write_text("A table that was moved\nby hand, 1 m at a time.\n")
     (log / "notes.dat").write_bytes(b"\x00\x01\x02")
     found = survey(log)
     (sensor,) = found.roles.sensors
     assert {axis: one[0].column for axis, one in sensor.axes.items()} == {"x": "tx", "y": "ty", "z": "tz"}
-    assert {part.label for part in found.parts} == {"commands.csv", "groundtruth.txt"}
+    assert {part.label for part in found.parts} == {"commands.csv", file}
 
 
 def test_tables_without_a_header(log: Path, tmp_path: Path) -> None:
@@ -212,13 +228,13 @@ def test_columns_of_a_turned_sensor_are_in_their_order(log: Path) -> None:
     assert [sensor.axes[axis][0].column for axis in "xyz"] == ["column 2", "column 3", "column 4"]
 
 
-@pytest.mark.parametrize("stamps", ["frames", "seconds"])
+@pytest.mark.parametrize("stamps", ["none", "frames", "seconds"])
 def test_tables_without_stamps_need_a_rate(stamps: str, log: Path, tmp_path: Path) -> None:
-    """With a number of frames, of which some are lost, and with stamps of whole seconds."""
+    """Without any column of time, with a number of frames, of which some are lost, and with stamps of whole seconds."""
     t, u, z = recorded_at_once()
     kept = np.ones(len(t), dtype=np.bool_)
     kept[300:302] = stamps != "frames"
-    clock = {"frames": {"Frame": np.arange(len(t))[kept]}, "seconds": {"pc_ts": START + t.astype(np.int64)}}
+    clock = {"none": {}, "frames": {"Frame": np.arange(len(t))[kept]}, "seconds": {"pc_ts": START + t.astype(np.int64)}}
     for name, value in (("goal", u), ("camera", z)):
         write(log / f"{name}.csv", {**clock[stamps], **xyz(value[kept])})
     said = one_line(RunError, lambda: survey(log))
@@ -231,14 +247,19 @@ def test_tables_without_stamps_need_a_rate(stamps: str, log: Path, tmp_path: Pat
 
 
 LISTS: dict[str, Callable[[FloatArray], str]] = {
+    "python": lambda row: f'"[{row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f}]"',
+    "tuple": lambda row: f'"({row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f})"',
+    "array": lambda row: f"\"array('d', [{row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f}])\"",
+    "numpy": lambda row: f'"array([{row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f}], dtype=float32)"',
     "numpy over lines": lambda row: f'"[{row[0]:.7e} {row[1]:.7e}\n {row[2]:.7e}]"',
+    "without quotes": lambda row: f"[{row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f}]",
     "numpy without quotes": lambda row: f"[{row[0]:.7f} {row[1]:.7f} {row[2]:.7f}]",
 }
 
 
 @pytest.mark.parametrize("form", LISTS)
 def test_cells_that_hold_lists_as_text(form: str, log: Path) -> None:
-    """As numpy writes them, also over several lines; names beside them are those of the elements."""
+    """As Python, pandas and numpy write them, also over several lines; names beside them are those of the elements."""
     t, u, s, z = recorded()
     for name, time, value in (("cmd", t, u), ("joint_states", s, z)):
         names_of = "\"['x', 'y', 'z']\""
@@ -265,7 +286,7 @@ def long_rows(kind: str) -> list[list[str]]:
             if kind == "tags":
                 rows += [(at, [f"root.{axis}.{what}", f"{x:.7f}"]) for what, x in (("SetPos", goal), ("ActPos", state))]
             else:
-                rows.append((at, [axis, f"{goal:.7f}", f"{state:.7f}"]))
+                rows.append((at, [str(11 + number) if kind == "numbers" else axis, f"{goal:.7f}", f"{state:.7f}"]))
     if kind == "sources":
         rows = [(at, ["goal", *map("{:.7f}".format, row)]) for at, row in zip(t, u, strict=True)]
         rows += [(at + 1e-6, ["camera", *map("{:.7f}".format, row)]) for at, row in zip(t, z, strict=True)]
@@ -275,7 +296,9 @@ def long_rows(kind: str) -> list[list[str]]:
 @pytest.mark.parametrize(
     ("kind", "header", "axes"),
     [
+        ("names", "time_s,joint,desired_position_m,actual_position_m", "xyz"),
         ("stamps of their own", "time_s,joint,desired_position_m,actual_position_m", "xyz"),
+        ("numbers", "time_s,id,goal_position_m,present_position_m", ["joint_11", "joint_12", "joint_13"]),
         ("tags", "time_s,tag,value_m", ["root_x", "root_y", "root_z"]),
         ("sources", "time_s,source,x_m,y_m,z_m", "xyz"),
     ],
@@ -287,7 +310,7 @@ def test_axes_and_sources_in_rows_of_their_own(kind: str, header: str, axes: Seq
     check_fuses(tmp_path / "log.csv", tmp_path / "out", tuple(axes))
 
 
-@pytest.mark.parametrize("kind", ["joints", "words in front, no header"])
+@pytest.mark.parametrize("kind", ["signals", "joints", "words behind, no header", "words in front, no header", "dates"])
 def test_signals_one_below_another(kind: str, tmp_path: Path) -> None:
     """As pandas melts a table: a column tells which signal a row is of, and the clock begins anew with each."""
     t, u, z = recorded_at_once()
@@ -297,11 +320,11 @@ def test_signals_one_below_another(kind: str, tmp_path: Path) -> None:
         rows += [[f"{a:.4f}", f"{told:.7f}", f"{seen:.7f}", axis] for a, told, seen in both]
     for time, value, role in ((t, u, "demand"), (t[::2], z[::2], "vicon")) if kind != "joints" else ():
         for number, axis in enumerate("xyz"):
-            rows += [
-                [f"{a:.4f}", f"{one:.7f}", f"{role}_{axis}"] for a, one in zip(time, value[:, number], strict=True)
-            ]
+            cells = [f"{a:.4f}" if kind != "dates" else f"2026-02-03T04:05:{a:07.4f}" for a in time]
+            rows += [[a, f"{one:.7f}", f"{role}_{axis}"] for a, one in zip(cells, value[:, number], strict=True)]
     rows = [row[::-1] for row in rows] if "front" in kind else rows
-    lines = ["t_s,target_m,reached_m,axis"] if kind == "joints" else []
+    header = {"joints": "t_s,target_m,reached_m,axis", "signals": "t_s,val_m,variable", "dates": "when,number,tag"}
+    lines = [header[kind]] if kind in header else []
     (tmp_path / "log.csv").write_text("\n".join([*lines, *map(",".join, rows), ""]))
     found = survey(tmp_path / "log.csv")
     run, _ = written(found, tmp_path / "out")
@@ -317,8 +340,11 @@ def test_signals_one_below_another(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("told", "seen", "roles"),
     [
+        ("goal{}", "measured{}", ("command", "sensor")),
         ("{}soll", "{}ist", ("command", "sensor")),
+        ("setpoint{}", "actual{}", ("command", "sensor")),
         ("reference{}", "{}", ("reference", None)),
+        ("target{}2", "real{}2", ("command", "sensor")),
     ],
 )
 def test_words_of_roles_need_no_separator(told: str, seen: str, roles: tuple[str | None, ...], tmp_path: Path) -> None:
@@ -344,11 +370,12 @@ def test_words_that_only_look_so_are_one(word: str) -> None:
     assert not names.role_words(word)
 
 
-def test_columns_beside_the_commands_are_called_by_what_stands_before_their_axes(tmp_path: Path) -> None:
-    """Where all of them have it; what is called measured keeps its name."""
+@pytest.mark.parametrize("first", ["beacon", "measured"])
+def test_columns_beside_the_commands_are_called_by_what_stands_before_their_axes(first: str, tmp_path: Path) -> None:
+    """In whatever order they stand, and where all of them have it; what is called measured keeps its name."""
     t, u, z = recorded_at_once()
     seen = {"beacon": path(t - 0.14), "measured": z}
-    columns = [xyz(value, f"{name}_{{}}_m") for name, value in seen.items()]
+    columns = [xyz(seen[name], f"{name}_{{}}_m") for name in sorted(seen, key=lambda name: name != first)]
     write(tmp_path / "log.csv", {"t_s": t, **xyz(u, "goal_{}_m"), **columns[0], **columns[1]})
     lags = {name: one.lag for (name, _), one in survey(tmp_path / "log.csv").relations.items()}
     assert lags == {"beacon": pytest.approx(0.14, abs=5e-3), "measured": pytest.approx(LAG, abs=5e-3)}
@@ -359,7 +386,11 @@ def test_columns_beside_the_commands_are_called_by_what_stands_before_their_axes
 @pytest.mark.parametrize(
     ("raw", "filtered"),
     [
+        ("{}", "{}_lowpass"),
+        ("{}_raw", "{}_smoothed"),
+        ("encoder_{}", "encoder_{}_filt"),
         ("measured_{}", "ekf_{}"),
+        ("pv_{}", "estimated_{}"),
         ("pose_raw.csv", "pose_filtered.csv"),
     ],
 )
@@ -594,20 +625,34 @@ def test_rows_that_a_sensor_calls_invalid_are_left_out(yes: Any, no: Any, key: s
     assert "200 of 1000 rows are not is_valid: left out" in camera.notes
 
 
-@pytest.mark.parametrize("unit", ["", "_um"])
+@pytest.mark.parametrize("unit", ["", "_m", "_mm", "_um"])
 def test_units_without_a_name_are_those_in_which_both_move_alike(unit: str, log: Path, tmp_path: Path) -> None:
     """Commands in m by name: measurements without a unit that are 1000 times as large are in mm."""
     t, u, s, z = recorded()
-    scale = {"": 1e3, "_um": 1e6}[unit]
+    scale = {"": 1e3, "_m": 1.0, "_mm": 1e3, "_um": 1e6}[unit]
     write(log / "commands.csv", {"time_s": t, **xyz(u)})
     write(log / "camera.csv", {"time_s": s, **xyz(scale * z, f"{{}}{unit}")})
     found = check_fuses(log, tmp_path / "out")
     assert any("No name says it" in one for one in asked(found)) is (unit == "")
 
 
+def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
+    t, u, _, z = recorded()
+    log = tmp_path / "both"
+    log.mkdir()
+    write(log / "b.csv", {"t": t, **xyz(u)})
+    write(log / "a.csv", {"t": t + 0.004, **xyz(z)})
+    found = check_fuses(log, tmp_path / "out")
+    assert found.roles.command.part.label == "b.csv"
+    assert found.roles.command.why == "others follow it"
+
+
 @pytest.mark.parametrize(
     ("commanded", "measured"),
     [
+        ("command.{}_mm", "camera.{}_mm"),
+        ("{}_ref_mm", "{}_mm"),
+        ("ctrl_{}_mm", "qpos_{}_mm"),
         ("ASPos.{}", "AIPos.{}"),
         ("act_{}", "obs_{}"),
         ("first_{}_mm", "second_{}_mm"),
@@ -658,7 +703,7 @@ def test_the_state_of_a_controller_names_its_joints(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("begins", [START, -7.3])
+@pytest.mark.parametrize("begins", [START, -7.3, 3 * 3600.0])
 def test_a_clock_of_its_own_is_shifted_and_said(begins: float, log: Path, tmp_path: Path) -> None:
     """Motion capture counts from its own start, or in another time zone: whatever its file is called, it is found."""
     t, u, s, z = recorded()
@@ -714,9 +759,8 @@ def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("columns", ["x_m,y_m,z_m", "left_x_m,right_x_m,right_y_m", "pan_rad,tilt_rad"])
-@pytest.mark.parametrize("columns", ["left_x_m,right_x_m,right_y_m", "pan_rad,tilt_rad"])
 def test_what_moves_at_once_is_no_command_and_its_sensor(columns: str, tmp_path: Path) -> None:
-    """Two sensors, two joints: no word tells commands from measurements, and nothing runs ahead."""
+    """Axes of one sensor, two sensors, two joints: no word tells commands from measurements, and nothing runs ahead."""
     t, _, _, _ = recorded()
     moves = path(t)[:, 0]
     rng = np.random.default_rng(3)
@@ -781,7 +825,7 @@ def test_a_data_set_of_lerobot_is_read_by_its_layout(tmp_path: Path) -> None:
         assert np.sqrt(np.mean((est[axis].position[50:] - truth[50:, number]) ** 2)) < np.radians(0.1)
 
 
-@pytest.mark.parametrize("kind", ["mcap", later("json"), later("rrd")])
+@pytest.mark.parametrize("kind", ["mcap", "json", "rrd"])
 def test_recordings_of_all_kinds(kind: str, tmp_path: Path) -> None:
     """The topic called command is that, cameras follow it, poses are in metres by their type."""
     log = tmp_path / KINDS[kind].name
@@ -846,9 +890,13 @@ def joints(log: Path, first: str = "shoulder", second: str = "elbow", alike: boo
 
 HOSTILE = [
     'x"]\n[sensors.evil]\nfile = "/etc/passwd',
+    "[bold red]x[/bold red]",
     "x\x1b[31m",
     'é x\'\\u0000"""',
+    "[[x",
     "x.y[0].z",
+    "__proto__",
+    "# x",
 ]
 
 
@@ -954,6 +1002,12 @@ def test_what_may_be_a_position_is_not(column: str) -> None:
     assert not names.no_position(column)
 
 
+@pytest.mark.parametrize(("column", "is_time"), [("t_deg", False), ("t", True), ("t_s", True), ("stamp [mm]", False)])
+def test_a_unit_of_positions_is_of_no_clock(column: str, is_time: bool) -> None:
+    """A robot's axis may be called T."""
+    assert names.is_time(column) is is_time
+
+
 def of_roles(found: Survey) -> list[list[str]]:
     streams = (found.roles.command, *found.roles.sensors)
     return [[one.column for (one,) in stream.axes.values()] for stream in streams]
@@ -962,8 +1016,12 @@ def of_roles(found: Survey) -> list[list[str]]:
 @pytest.mark.parametrize(
     ("desired", "measured"),
     [
+        ("j_d[{}]", "j[{}]"),
         ("q_d{}", "q{}"),
+        ("theta_d_{}", "theta_{}"),
+        ("q_d{}_rad", "q{}_rad"),
         ("q_d[{}]", "s.q[{}]"),
+        ("q_d_{}", "q_{}"),
     ],
 )
 def test_desired_values_are_the_commands_of_those_beside_them(desired: str, measured: str, tmp_path: Path) -> None:
@@ -1059,6 +1117,30 @@ def test_what_follows_as_positions_do_is_none_where_velocities_tell_which_are(tm
     assert set(survey(tmp_path / "log.txt").run.sensors) == {"measured"}
 
 
+def test_columns_without_names_of_another_joint_that_moves_alike_are_no_second_sensor(tmp_path: Path) -> None:
+    """It follows the same commands, but not as far; an encoder that goes as far is one."""
+    t, u, z = recorded_at_once()
+    coupled, encoder = 1.3 - 0.6 * z[:, 1], path(t - 0.15)[:, 1]
+    np.savetxt(tmp_path / "log.txt", np.column_stack([t, u[:, 1], z[:, 1], 2.6 - coupled, encoder]), "%.6f")
+    found = survey(tmp_path / "log.txt")
+    assert of_roles(found) == [["column 2"], ["column 3"], ["column 5"]]
+    (left_out,) = ((list(stream.axes), why) for stream, why in found.roles.left_out)
+    assert left_out == (["column_4"], "they follow nothing as far, at the same level")
+
+
+def test_of_two_columns_without_names_one_may_follow_steps_slowly(tmp_path: Path) -> None:
+    """A square wave has two levels and no middle; an axis that swings behind it is as far, and never quite alike."""
+    t = 0.005 * np.arange(3000)
+    told = np.where(t % 4.0 < 2.1, 0.7, -0.7)
+    seen = np.zeros(len(t))
+    for row in range(1, len(t)):
+        seen[row] = seen[row - 1] + (told[row - 1] - seen[row - 1]) * 0.005 / 0.11
+    np.savetxt(tmp_path / "steps.txt", np.column_stack([t, seen, told]), "%.6f")
+    found = survey(tmp_path / "steps.txt")
+    assert of_roles(found) == [["column 3"], ["column 2"]]
+    assert next(iter(found.relations.values())).correlation < 0.98
+
+
 def test_bodies_that_a_tracker_sees_in_turns_command_each_other_nothing(tmp_path: Path) -> None:
     """One tool with two bodies, whose positions are a little later on one axis as it turns; their quaternions."""
     t, u, _, _ = recorded(600)
@@ -1087,6 +1169,46 @@ def test_an_axis_that_moves_before_its_commands_says_nothing_of_another_clock_in
     assert not any("s late?" in question for question in asked(found))
 
 
+def test_of_a_stroke_at_constant_speed_no_other_clock_is_made(log: Path) -> None:
+    """It stops shortly before the end: at no lag of an arm a trend leaves much of it, at others the stop is not seen.
+
+    Where the last shift at which it is seen does best, none does.
+    """
+    t = 0.015 * np.arange(1800)
+    s = t[7::9]
+    noise = np.random.default_rng(6).normal(scale=0.08, size=s.shape)
+    stroke = 210.0 - 5.2 * np.minimum(t, 24.4)
+    write(log / "target.csv", {"t_s": t, "feed_mm": stroke})
+    write(log / "scale.csv", {"t_s": s, "feed_mm": np.interp(s - 0.09, t, stroke) + noise})
+    found = survey(log)
+    (relation,) = found.relations.values()
+    assert relation.lag == pytest.approx(0.09, abs=0.01)
+    assert not any("clock" in question for question in asked(found))
+
+
+@pytest.mark.parametrize("first", [3, 3.0])
+def test_what_counts_poses_is_no_clock_however_it_is_written(first: float, tmp_path: Path) -> None:
+    """Poses at rest, numbered, of which some were left out: there is no time in it, as the refusal says."""
+    _, u, z = recorded_at_once()
+    count = first + np.delete(np.arange(1020), np.arange(200, 220))
+    write(tmp_path / "poses.csv", {"pose_index": count, "goal_q_rad": u[:, 0], "measured_q_rad": z[:, 0]})
+    said = one_line(RunError, lambda: survey(tmp_path / "poses.csv"))
+    assert "no clock for its 1000 rows" in said and "--rate HZ" in said
+
+
+def test_columns_without_names_are_called_as_nothing(log: Path) -> None:
+    """The second column of torques is not that of the commands, nor is a clock in a file of its own a joint."""
+    t, u, s, z = recorded()
+    u, z = u + 0.3 * t[:, None], z + 0.3 * s[:, None]  # which a clock is alike
+    torques = np.column_stack([0.05 * z[:, 0], -np.roll(z[:, 1], -40), np.cos(s), np.sin(3.0 * s)])
+    for name, time, columns in (("JQ_com", t, u), ("JQ_state", s, z), ("JT", s, torques)):
+        np.savetxt(log / f"{name}.txt", np.column_stack([time, columns]), "%.6f")
+    np.savetxt(log / "ticks.txt", np.column_stack([s, 3.0 + 0.5 * s]), "%.6f")
+    found = survey(log)
+    assert found.roles is not None and [one.name for one in found.roles.sensors] == ["JQ_state"]
+    assert not any("ticks" in one for one in asked(found))
+
+
 def test_what_columns_without_names_are_is_in_the_name_of_their_file(tmp_path: Path) -> None:
     """A controller that writes a file for each quantity: neither speeds nor forces are commands, and joints turn."""
     _, u, z = recorded_at_once()
@@ -1098,6 +1220,16 @@ def test_what_columns_without_names_are_is_in_the_name_of_their_file(tmp_path: P
     assert found.roles is not None and [one.name for one in found.roles.sensors] == ["jointAngles"]
     assert [part.stem for part in found.parts if part.signals] == ["jointAngles", "wantedJointAngles"]
     assert found.run.kinds == dict.fromkeys(("joint_1", "joint_2", "joint_3"), "angle")
+
+
+@pytest.mark.parametrize("nested", [[["hip", "Knee", "lArmYaw"]], {"axes": {"hip": 0, "Knee": 1, "lArmYaw": 2}}])
+def test_names_of_lerobot_are_found_where_converters_write_them(nested: Any, tmp_path: Path) -> None:
+    """A list in a list, or a table of places; in radians, as they are joints."""
+    lerobot(tmp_path / "set")
+    info = {"features": {"action": {"names": nested}, "observation.state": {"names": nested}}}
+    (tmp_path / "set" / "meta" / "info.json").write_text(json.dumps(info))
+    run = survey(tmp_path / "set").run
+    assert run.kinds == dict.fromkeys(("hip", "Knee", "lArmYaw"), "angle")
 
 
 def test_doubts_are_said_with_their_numbers(log: Path, tmp_path: Path) -> None:
@@ -1145,6 +1277,13 @@ def nested_table(file: Path) -> bytes:
     return file.read_bytes()
 
 
+def test_a_column_whose_name_is_damaged_is_a_line(tmp_path: Path) -> None:
+    """Pyarrow gives a table without a word then, or an error of Python's own."""
+    file = tmp_path / "log.parquet"
+    file.write_bytes(nested_table(file).replace(b"goal", b"g\x89al"))
+    assert "not a table that can be read" in one_line(RunError, lambda: survey(file))
+
+
 @pytest.mark.long
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=300, suppress_health_check=list(HealthCheck))
@@ -1162,6 +1301,15 @@ def test_a_damaged_table_is_surveyed_or_refused_in_a_line(seed: int, tmp_path_fa
         drafts(found, *guess(found), folder / "out")
     except pf.PumafuseError as error:
         assert len(str(error).splitlines()) == 1
+
+
+def test_a_log_without_commands_says_how_they_are_known(tmp_path: Path) -> None:
+    _, _, s, z = recorded()
+    noise = np.random.default_rng(1).normal(scale=5e-4, size=len(s))
+    write(tmp_path / "camera.csv", {"t_s": s, "x_m": z[:, 0]})
+    write(tmp_path / "laser.csv", {"t_s": s, "x_m": z[:, 0] + noise})
+    text = one_line(RunError, lambda: survey(tmp_path))
+    assert "which numbers are the commands? None is called command, goal, target" in text
 
 
 def test_commands_that_never_move_are_named(tmp_path: Path) -> None:
@@ -1195,6 +1343,15 @@ def test_texts_without_a_clock_are_named_and_read_at_a_rate(log: Path) -> None:
     assert [part.label for part in parts_of(log)] == ["camera.csv"]
 
 
+def test_what_has_no_clock_is_named_where_nothing_tells_the_commands(tmp_path: Path) -> None:
+    """Arrays of a loop that was stopped are shorter than its stamps; a rate makes up for that."""
+    t = 0.02 * np.arange(600)
+    np.savez(tmp_path / "log.npz", time=t, plan=path(t), seat=path(t - LAG)[:570])
+    text = one_line(RunError, lambda: survey(tmp_path / "log.npz"))
+    assert "joint0, joint1, joint2; seat (no clock for its 570 rows)); if rows come" in text
+    assert "at a constant rate, give it to init as --rate HZ; or say it in run.toml" in text
+
+
 @pytest.mark.parametrize("has_positions", [True, False])
 def test_velocities_are_to_be_integrated_only_where_no_positions_are_commanded(
     has_positions: bool, tmp_path: Path
@@ -1207,11 +1364,26 @@ def test_velocities_are_to_be_integrated_only_where_no_positions_are_commanded(
     assert "give it to init as --rate HZ" in text
 
 
-def test_columns_without_a_number_beside_commands_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["npz", "csv", "csv of nan"])
+def test_columns_without_a_number_beside_commands_are_named(kind: str, tmp_path: Path) -> None:
     t, u, _ = recorded_at_once()
-    log = tmp_path / "log.csv"
-    write(log, {"t_s": t, "boom_goal_m": u[:, 0], "boom_seen_m": np.full(len(t), np.nan)})
+    none = np.full(len(t), np.nan)
+    log = tmp_path / f"log.{kind[:3]}"
+    columns = {"t_s": t, "boom_goal_m": u[:, 0], "boom_seen_m": none if kind != "csv" else [""] * len(t)}
+    if kind == "npz":
+        np.savez(log, **columns)
+    else:
+        write(log, columns)
     assert "lead: boom_seen_m (no number)" in one_line(RunError, lambda: survey(log))
+
+
+def test_a_folder_with_many_topics_lists_what_it_does_not_use(tmp_path: Path) -> None:
+    t, u, s, z = recorded(100)
+    write(tmp_path / "goal.csv", {"time_s": t, "x_m": u[:, 0], "z_m": np.zeros(100)})
+    write(tmp_path / "camera.csv", {"time_s": s, "x_m": z[:, 0], "quality": np.ones(100), "t_sent_s": s})
+    camera, goal = parts_of(tmp_path)
+    assert dict(camera.left_out) == {"quality": "quality", "t_sent_s": "another clock"}
+    assert dict(goal.left_out) == {"z_m": "always 0"}
 
 
 def test_an_axis_that_does_not_follow_is_left_out_and_the_others_are_fused(log: Path, tmp_path: Path) -> None:
@@ -1230,7 +1402,7 @@ def test_an_axis_that_does_not_follow_is_left_out_and_the_others_are_fused(log: 
     assert "laser is not used on q: its axes are called otherwise than the commands', and follow none" in said
 
 
-@pytest.mark.parametrize(("gain", "expected"), [(0.45, True), (0.93, False)])
+@pytest.mark.parametrize(("gain", "expected"), [(2.002, True), (0.45, True), (1.0, False), (0.93, False)])
 def test_a_gain_that_is_not_about_1_is_a_question(gain: float, expected: bool, tmp_path: Path) -> None:
     """Consistent as it may be: a gear, or a unit. What is decided says so, too."""
     t, u, s, z = recorded()
@@ -1244,11 +1416,20 @@ def test_a_gain_that_is_not_about_1_is_a_question(gain: float, expected: bool, t
     assert [*checked.values()] == ["sure", "sure", "sure", "a question" if expected else "sure"]
 
 
+def test_where_nothing_follows_no_columns_are_exchanged(tmp_path: Path) -> None:
+    t, u, s, _ = recorded()
+    write(tmp_path / "goal.csv", {"t_s": t, "x_mm": 1e3 * u[:, 0]})
+    write(tmp_path / "camera.csv", {"t_s": s, "x_mm": np.random.default_rng(3).normal(size=len(s))})
+    said = "\n".join(asked(survey(tmp_path)))
+    assert "camera does not follow the commands on x" in said and "exchanged" not in said
+
+
 @pytest.mark.parametrize(
     ("clocks", "column", "unit", "known"),
     [
         # a counter of ms, rows 1 ms apart: nothing but the motion says that they are no seconds
         (lambda n: {"clock": 5_000_000 + n}, "clock", "ms", "motion"),
+        (lambda n: {"t": 812.5 + 1.25 * n}, "t", "ms", "motion"),
         # whole seconds, beside a counter whose unit is told by them
         (lambda n: {"stamp": 1_700_000_000 + n // 1000, "KRC": 40_000 + n}, "", "", ""),
         (
@@ -1259,8 +1440,10 @@ def test_a_gain_that_is_not_about_1_is_a_question(gain: float, expected: bool, t
         ),
         (lambda n: {"stamp": 1_700_000_000 + n // 500, "ticks": 9 + 2000 * n}, "ticks", "us", "another clock"),
         # the name says it
+        (lambda n: {"millis": 70 + 2 * n}, "millis", "ms", "name"),
         (lambda n: {"usec": 2**32 - 1_000_000 + 2000 * n - 2**32 * (n >= 500)}, "usec", "us", "name"),
         # days of Excel and of MATLAB
+        (lambda n: {"Time": 45_678.25 + n * 0.004 / 86400}, "Time", "days", "range"),
         (lambda n: {"time": 739_000.5 + n * 0.008 / 86400}, "time", "days", "range"),
     ],
 )
@@ -1324,6 +1507,14 @@ def test_a_guessed_unit_is_one_in_which_tables_tell_one_time(
     assert bool(clock.doubt) == (known == "motion")
 
 
+def test_seconds_stay_seconds_where_the_motion_is_one_of_a_robot(tmp_path: Path) -> None:
+    """Rows 0.5 s apart with strokes of ten seconds."""
+    n = np.arange(400)
+    write(tmp_path / "log.csv", {"time": 0.5 * n, "goal_x_m": np.sin(n / 6.0), "actual_x_m": np.sin((n - 1) / 6.0)})
+    (part,) = parts_of(tmp_path / "log.csv")
+    assert part.clock.basis == "s by interval"
+
+
 def test_a_clock_that_was_counted_gives_way_to_one_that_was_measured(tmp_path: Path) -> None:
     """A loop that was to run at 500 Hz and ran at half of it: 80 ms late, not 40. Clocks that agree are no question."""
     rng = np.random.default_rng(2)
@@ -1340,6 +1531,26 @@ def test_a_clock_that_was_counted_gives_way_to_one_that_was_measured(tmp_path: P
     )
     write(tmp_path / "log.csv", columns | {"timestamp": np.round(real, 2)})
     assert not any("which is the clock" in one for one in asked(survey(tmp_path / "log.csv")))
+
+
+def test_an_angle_by_the_name_of_what_measures_it_is_one(tmp_path: Path) -> None:
+    """``reference`` beside ``theta``, without a unit: both in rad, not in m."""
+    t = np.arange(0.0, 30.0, 0.02)
+    columns = {"time_s": t, "reference": np.sin(t) + 0.3 * np.sin(3.3 * t)}
+    write(tmp_path / "log.csv", columns | {"theta": np.interp(t - 0.1, t, columns["reference"])})
+    found = survey(tmp_path / "log.csv")
+    assert set(found.run.kinds.values()) == {"angle"}
+    assert found.run.command.values["theta"].max() == pytest.approx(columns["reference"].max())
+
+
+@pytest.mark.parametrize(("word", "unit", "far"), [("", "rad", 2.5), ("", "deg", 80.0), ("rail_", "m", 2.5)])
+def test_joints_that_are_called_so_before_their_axis_turn(word: str, unit: str, far: float, tmp_path: Path) -> None:
+    """``cmd_joint_pos_RL``, beside a coordinate in mm; a rail slides."""
+    t, u, z = recorded_at_once()
+    columns = {f"{what}_joint_pos_{word}RL": 2.0 * far * one[:, 0] for what, one in (("cmd", u), ("meas", z))}
+    write(tmp_path / "log.csv", {"t_s": t, **columns, "height": 900.0 * z[:, 1]} if not word else {"t_s": t, **columns})
+    (part,) = parts_of(tmp_path / "log.csv")
+    assert {one.unit for one in part.signals if one.column in columns} == {unit}
 
 
 def test_rows_in_packets_are_spread_by_what_counts_them(log: Path, tmp_path: Path) -> None:
@@ -1367,16 +1578,29 @@ def test_stamps_that_were_counted_are_said(tmp_path: Path) -> None:
     assert not any("exactly" in one for one in asked(survey(log)))
 
 
-def test_a_reference_beside_one_other_is_a_set_point(tmp_path: Path) -> None:
+def test_thrust_says_nothing_about_the_unit_of_positions(tmp_path: Path) -> None:
+    """Columns that follow nothing, however large, leave the unit alone, and axes of one source share it."""
+    t, u, z = recorded_at_once()
+    columns = {**xyz(30.0 * u, "goal_{}"), **xyz(30.0 * z, "actual_{}")}  # up to 18 and only 6
+    write(tmp_path / "log.csv", {"time": t, **columns, "propeller": 4e4 + 1e3 * np.sin(t)})
+    roles = survey(tmp_path / "log.csv").roles
+    assert {one.unit for some in roles.command.axes.values() for one in some} == {"mm"}
+    small = {name: 0.2 * value for name, value in columns.items()}
+    write(tmp_path / "log.csv", {"time": t, **small, "propeller": 4e4 + 1e3 * np.sin(t)})
+    roles = survey(tmp_path / "log.csv").roles
+    assert {one.unit for some in roles.command.axes.values() for one in some} == {"m"}
+
+
+@pytest.mark.parametrize("stem", ["flight", "reference_log"])
+def test_a_reference_beside_one_other_is_a_set_point(stem: str, tmp_path: Path) -> None:
     """Where what is measured leads it, as of an arm that looks ahead, the log is refused: the two are not exchanged."""
     t, u, z = recorded_at_once()
     tables = {"t_s": t, "ref_x_m": z[:, 0], "pos_x_m": u[:, 0]}
-    log = tmp_path / "reference_log.csv"
-    write(log, tables)
+    write(tmp_path / f"{stem}.csv", tables)
     with pytest.raises(RunError, match="it does not follow the commands"):
-        survey(log)
-    write(log, tables | {"ref_x_m": u[:, 0], "pos_x_m": z[:, 0]})
-    found = survey(log)
+        survey(tmp_path / f"{stem}.csv")
+    write(tmp_path / f"{stem}.csv", tables | {"ref_x_m": u[:, 0], "pos_x_m": z[:, 0]})
+    found = survey(tmp_path / f"{stem}.csv")
     assert "set point" in found.roles.command.why
     assert found.relations[found.roles.sensors[0].name, "x"].lag == pytest.approx(LAG, abs=0.01)
 
@@ -1394,6 +1618,16 @@ def test_a_reference_that_runs_ahead_of_the_commands_is_no_truth(tmp_path: Path)
     assert any(one.startswith("reference is not used on x: it does not follow the commands") for one in asked(found))
 
 
+def test_of_two_clocks_that_were_counted_the_first_is_taken(tmp_path: Path) -> None:
+    """Cycles of 4 ms beside the time that they make: another count tells it no better."""
+    t, n = 0.004 * np.arange(3000), np.arange(3000)
+    columns = {"time_run": t, "time_cycle": n, "bend_target": np.sin(2.0 * t), "bend_actual": np.sin(2.0 * (t - 0.06))}
+    write(tmp_path / "log.csv", columns)
+    found = survey(tmp_path / "log.csv")
+    assert found.relations["actual", "bend"].lag == pytest.approx(0.06, abs=3e-3)
+    assert any("By time_run it lasts 12 s, by time_cycle" in one for one in asked(found))
+
+
 def test_what_repeats_the_commands_later_is_no_copy(tmp_path: Path) -> None:
     """An ideal drive, its steps apart by 80 times its lag: nine in ten of its numbers are those of the commands."""
     t = np.arange(0.0, 60.0, 0.01)
@@ -1407,10 +1641,10 @@ def test_what_repeats_the_commands_later_is_no_copy(tmp_path: Path) -> None:
         survey(tmp_path / "drive.csv")
 
 
-def test_stamps_of_a_headerless_table_may_repeat(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("tick", "every"), [(1.0 / 64.0, 0.004), (0.05, 0.01)])
+def test_stamps_of_a_headerless_table_may_repeat(tick: float, every: float, tmp_path: Path) -> None:
     """As a clock that ticks more slowly than rows are written; seconds are too coarse, and said to be."""
-    tick = 0.05
-    t = np.arange(0.0, 40.0, 0.01)
+    t = np.arange(0.0, 40.0, every)
     for name, ticks in (("fine", np.floor(t / tick) * tick), ("coarse", np.floor(t))):
         np.savetxt(tmp_path / f"{name}.csv", np.column_stack([ticks, path(t), path(t - LAG)]), "%.4f", ",")
     (fine,) = parts_of(tmp_path / "fine.csv")
@@ -1429,6 +1663,69 @@ def test_what_moves_alike_much_later_measures_nothing_in_a_table_without_a_heade
         assert set(survey(tmp_path / "walk.csv").run.sensors) == {"measured"}
     else:
         assert "which numbers are the commands?" in one_line(RunError, lambda: survey(tmp_path / "walk.csv"))
+
+
+def test_rows_that_a_clock_of_ticks_gets_may_vary(tmp_path: Path) -> None:
+    """Three to five rows of a logger in each tick of 5 ms; a table of commands and measurements without a header."""
+    rows = np.random.default_rng(1).choice([3, 4, 5], 2000, p=[0.17, 0.58, 0.25])
+    t = np.repeat(0.36 + 0.005 * np.arange(2000), rows)
+    np.savetxt(tmp_path / "shoulder.csv", np.column_stack([t, path(t)[:, 0], path(t - LAG)[:, 0]]), "%.6f", ",")
+    (part,) = parts_of(tmp_path / "shoulder.csv")
+    assert part.clock is not None and part.clock.time.column == "column 1"
+
+
+def test_an_empty_array_beside_others_is_left_out(tmp_path: Path) -> None:
+    """With the reason; alone it is refused."""
+    t, u, z = recorded_at_once()
+    np.savez(tmp_path / "arm.npz", time=t, target=u, actual=z)
+    np.save(tmp_path / "attitude.npy", np.zeros(0))
+    parts = parts_of(tmp_path)
+    assert [note for one in parts for note in one.notes] == ["no table in it: nothing has rows of numbers"]
+    assert {one.file.name for one in parts if one.signals} == {"arm.npz"}
+    with pytest.raises(RunError, match="no table in it"):
+        parts_of(tmp_path / "attitude.npy")
+
+
+def test_what_is_called_an_error_is_no_position(tmp_path: Path) -> None:
+    """However alike it moves."""
+    t, u, z = recorded_at_once()
+    columns = {"time": t, "target_y_m": u[:, 1], "robot_y_m": z[:, 1], "robot_y_err": z[:, 1] - u[:, 1]}
+    write(tmp_path / "log.csv", columns | {"errs_y_m": 0.9 * z[:, 1]})
+    (part,) = parts_of(tmp_path / "log.csv")
+    assert {one.column for one in part.signals} == {"target_y_m", "robot_y_m"}
+
+
+def test_how_a_tool_leans_is_not_where_it_is(tmp_path: Path) -> None:
+    """A vehicle that leans before it goes, each about as the way that it is told."""
+    t, rng = np.arange(0.0, 40.0, 0.02), np.random.default_rng(4)
+    told = path(t)
+    lean = 0.2 * path(t - 0.2)[:, :2] + 0.014 * np.sin(3.1 * t)[:, None] + rng.normal(0.0, 1e-4, (len(t), 2))
+    columns = {"t_s": t, "target_x": told[:, 0], "target_y": told[:, 1]}
+    write(tmp_path / "log.csv", columns | {"measured_roll_rad": lean[:, 1], "measured_pitch_rad": lean[:, 0]})
+    said = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    assert "commands, but nothing that measures where they lead" in said
+
+
+def test_a_set_point_is_not_measured_by_another(tmp_path: Path) -> None:
+    """Paths of a motor and of its joint, both planned: nothing in the log says where the arm was."""
+    t, u, z = recorded_at_once()
+    columns = {"t_s": t, "ref_motor[0]": u[:, 0], "ref_motor[1]": u[:, 1]}
+    write(tmp_path / "log.csv", columns | {"ref_joint[0]": z[:, 0], "ref_joint[1]": z[:, 1], "spring[0]": 2.0 * t % 3})
+    assert "commands" in one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+
+
+def test_one_coordinate_of_a_point_is_a_joint_only_where_it_moves_as_that_does(tmp_path: Path) -> None:
+    """An instrument that slides in and turns: its tip goes about as far along z as it slides, and is not the slide."""
+    t, u, z = recorded_at_once()
+    told = {"time": t, "cmd.insertion_m": u[:, 0], "cmd.yaw_rad": u[:, 1]}
+    seen = {"state.insertion_m": z[:, 0], "state.yaw_rad": z[:, 1]}
+    write(tmp_path / "robot.csv", told | seen)
+    for share, followed in ((0.5, False), (0.0, True)):
+        tip = {"time": t, "x_m": 0.3 + z[:, 2], "y_m": np.sin(2.0 * t), "z_m": z[:, 0] + share * z[:, 2]}
+        write(tmp_path / "tip.csv", tip)
+        found = survey(tmp_path)
+        of_tip = [one for one in found.roles.sensors if one.axes["insertion"][0].column == "z_m"]
+        assert bool(of_tip) is followed
 
 
 def test_a_guessed_unit_of_one_joint_makes_no_length_of_another(tmp_path: Path) -> None:
@@ -1514,12 +1811,13 @@ def test_a_sensor_that_lacks_what_a_frame_is_found_by_is_told_so(given: str, tmp
     assert "camera does not follow the commands on x" in said
 
 
-def test_rows_out_of_order_have_a_clock(tmp_path: Path) -> None:
+@pytest.mark.parametrize("share", [0.08, 0.3])
+def test_rows_out_of_order_have_a_clock(tmp_path: Path, share: float) -> None:
     """Written by several threads, up to five rows late: the clock is found; what moves to and fro is none."""
     t, u, s, z = recorded()
     rng = np.random.default_rng(1)
     for name, time, value in (("commands", t, u), ("tracker", s, z)):
-        place = np.arange(len(time)) + np.where(rng.random(len(time)) < 0.3, rng.uniform(1.0, 6.0, len(time)), 0.0)
+        place = np.arange(len(time)) + np.where(rng.random(len(time)) < share, rng.uniform(1.0, 6.0, len(time)), 0.0)
         order = np.argsort(place, kind="stable")
         write(tmp_path / f"{name}.csv", {"t_s": time[order], "x_mm": 1e3 * value[order, 0]})
     assert survey(tmp_path).relations["tracker", "x"].lag == pytest.approx(LAG, abs=5e-3)
@@ -1548,6 +1846,31 @@ def test_of_a_log_of_px4_topics_of_positions_count(tmp_path: Path) -> None:
         assert one.lag == pytest.approx(LAG, abs=0.003)
 
 
+def test_fingers_are_joints(tmp_path: Path) -> None:
+    """An index finger and a turning thumb beside a word of a role; a column that counts is none."""
+    t, u, z = recorded_at_once()
+    columns = {"t_s": t, "frame_index": np.arange(len(t)) // 3}
+    for name, place in (("ring", 0), ("index", 1), ("thumb_rotation", 2)):
+        columns |= {f"wish.target.{name}": u[:, place], f"hand.actual.{name}": z[:, place]}
+    write(tmp_path / "hand.csv", columns)
+    found = survey(tmp_path / "hand.csv")
+    assert len(found.run.axes) == 3
+    assert {axis.rpartition("_")[2] for axis in found.run.axes} == {"ring", "index", "rotation"}
+
+
+def test_the_same_axes_under_another_word_are_another_sensor(tmp_path: Path) -> None:
+    """What the robot itself tells and a tracker in the columns of one table: one beside the other, each as it is."""
+    t, u, z = recorded_at_once()
+    columns = {"t_s": t}
+    for place, axis in enumerate("xyz"):
+        columns |= {f"{axis}_goal_m": u[:, place], f"{axis}_m": z[:, place], f"{axis}_data_m": z[:, place] + 1e-3}
+    write(tmp_path / "flight.csv", columns | {"battery_m": np.sin(7.1 * t)})
+    found = survey(tmp_path / "flight.csv")
+    assert sorted(one.axes["x"][0].column for one in found.roles.sensors) == ["x_data_m", "x_m"]
+    (left,) = [why for one, why in found.roles.left_out if "battery" in one.axes]
+    assert "no command is left that is called so or moves alike" in left
+
+
 def test_joints_at_rest_do_not_hide_the_one_that_moves(tmp_path: Path) -> None:
     """Six of seven stick: their encoders toggle by a step while the commands creep. Names without a word say whose."""
     rng = np.random.default_rng(5)
@@ -1566,6 +1889,24 @@ def test_joints_at_rest_do_not_hide_the_one_that_moves(tmp_path: Path) -> None:
         survey(tmp_path / "other.npz")
 
 
+def test_of_steps_how_far_an_axis_goes_tells_its_gain(tmp_path: Path) -> None:
+    """Changes over a tenth of a second are cut by steps that take longer: no gear is asked for. Half is."""
+    rng, t = np.random.default_rng(3), 0.1 * np.arange(900)
+    u = rng.choice([0.1, 0.4, 0.8], 90).repeat(10)
+    z = np.interp(t - 0.35, t, u)
+    for gain, asks in ((1.0, False), (0.5, True)):
+        write(tmp_path / "steps.csv", {"t_s": t, "goal_j_rad": u, "encoder_j_rad": gain * z})
+        assert any("times as far as commanded" in one for one in asked(survey(tmp_path / "steps.csv"))) is asks
+
+
+def test_where_no_column_leads_they_are_named(tmp_path: Path) -> None:
+    rng, t = np.random.default_rng(4), 0.02 * np.arange(500)
+    noise = {name: np.cumsum(rng.normal(size=500)) for name in ("r", "y", "w1", "w2")}
+    write(tmp_path / "log.csv", {"t_s": t, **noise})
+    with pytest.raises(RunError, match=r"log\.csv: r, y, w1, w2"):
+        survey(tmp_path / "log.csv")
+
+
 def test_files_that_each_are_a_whole_run_are_not_one(tmp_path: Path) -> None:
     """Three takes of a demonstration in a folder: the first is used, the others are named. A table beside it stays."""
     for number in range(3):
@@ -1581,11 +1922,12 @@ def test_files_that_each_are_a_whole_run_are_not_one(tmp_path: Path) -> None:
     assert note == "2 other tables, a run each, left out: take_1.csv …"
 
 
-def test_of_lists_of_trials_the_first_trial_is_used(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("told", "seen"), [("goal", "encoder"), ("ref", "q"), ("goal", "q")])
+def test_of_lists_of_trials_the_first_trial_is_used(told: str, seen: str, tmp_path: Path) -> None:
     """Two lists, each trial with what it was told beside what was seen of it: none of another one is its sensor."""
     t = 0.02 * np.arange(400)
     trials = [
-        {"t": t.tolist(), "ref": turn.tolist(), "q": np.interp(t - LAG, t, turn).tolist()}
+        {"t": t.tolist(), told: turn.tolist(), seen: np.interp(t - LAG, t, turn).tolist()}
         for turn in (path(t + 3.0 * number)[:, 1] for number in range(6))
     ]
     log = tmp_path / "log.json"
@@ -1617,6 +1959,14 @@ def test_a_clock_may_be_any_column_that_alone_goes_on(log: Path) -> None:
     both.write_text("\n".join(f"{n},{n + 0.5 * (n % 2)}" for n in np.arange(0.0, 300.0, 0.3)))
     (part,) = parts_of(both)
     assert part.clock is not None and part.clock.time.column == "column 1"  # the first is one before any is looked for
+
+
+def test_a_sensor_beside_the_commands_is_not_called_after_the_file(tmp_path: Path) -> None:
+    """So what is fitted to one log is a configuration of another."""
+    t, u, z = recorded_at_once()
+    for name in ("monday", "tuesday"):
+        write(tmp_path / f"{name}.csv", {"t_s": t, "target x_mm": 1e3 * u[:, 0], "x_mm": 1e3 * z[:, 0]})
+        assert [*survey(tmp_path / f"{name}.csv").run.sensors] == ["measured"]
 
 
 def test_columns_without_words_are_what_their_file_is_called(log: Path) -> None:
@@ -1667,3 +2017,50 @@ def test_many_axes_are_matched_by_what_follows_the_words_that_all_share(tmp_path
     found = survey(tmp_path / "log.csv")
     assert [axis for _, axis in found.relations] == [f"rover_{joint}" for joint in joints]
     assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.005)] * 24
+
+
+def test_an_axis_whose_name_ends_as_that_of_a_command_is_that(tmp_path: Path) -> None:
+    """``p_RS_R_x`` is x, if it moves alike, though another command moves more alike."""
+    t, u, z = recorded_at_once()
+    y = u[:, 0] + 0.08 * np.sin(1.3 * t)
+    columns = {
+        "t_s": t,
+        "cmd_x_m": u[:, 0],
+        "cmd_y_m": y,
+        "p_RS_R_x_m": np.roll(y, 5),
+        "p_RS_R_y_m": np.roll(y, 5) + z[:, 2],
+    }
+    write(tmp_path / "log.csv", {name: value[10:] for name, value in columns.items()})
+    found = survey(tmp_path / "log.csv")
+    (sensor,) = found.roles.sensors
+    assert {axis: one[0].column for axis, one in sensor.axes.items()} == {"x": "p_RS_R_x_m", "y": "p_RS_R_y_m"}
+
+
+def test_a_sensor_whose_command_rests_is_said_to_be_that(tmp_path: Path) -> None:
+    t, u, z = recorded_at_once()
+    columns = {"target_x_mm": 1e3 * u[:, 0], "target_z_mm": np.full(len(t), 15.0)}
+    write(tmp_path / "log.csv", {"t_s": t, **columns, "actual_x_mm": 1e3 * z[:, 0], "actual_z_mm": 1e3 * z[:, 2]})
+    assert "actual is not used on z: its command never moves" in asked(survey(tmp_path / "log.csv"))
+
+
+@pytest.mark.parametrize("form", ["{:02d}:{:02d}:{:02d}", "2026-03-04T{:02d}:{:02d}:{:02d}"])
+def test_a_clock_of_whole_seconds_says_how_many_rows_a_second_has(form: str, tmp_path: Path) -> None:
+    """Which is what --rate asks for."""
+    _, u, z = recorded_at_once()
+    time = [form.format(17, 22, 25 + n // 50) for n in range(1000)]
+    write(tmp_path / "log.csv", {"x_cmd_mm": 1e3 * u[:, 0], "x_meas_mm": 1e3 * z[:, 0], "time": time})
+    said = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    assert "time is no clock: 20 distinct stamps, one every 1 s, in 1000 rows with x_" in said
+    assert "stands still: 50 rows a second); if rows come at a constant rate, give it to init as --rate HZ" in said
+    assert survey(tmp_path / "log.csv", rate=50.0).run.sensors
+
+
+@pytest.mark.parametrize("late", [0.1, -0.012])
+def test_what_is_asked_about_a_sensor_is_not_sure(late: float, tmp_path: Path) -> None:
+    """A lag that is a little less than none is asked about, and decided accordingly."""
+    t, u, _ = recorded_at_once()
+    write(tmp_path / "log.csv", {"t_s": t, "target_x_mm": 1e3 * u[:, 0], "actual_x_mm": 1e3 * path(t - late)[:, 0]})
+    found = survey(tmp_path / "log.csv")
+    (sure,) = [sure for what, _, sure in decisions(found) if what == "actual follows"]
+    assert sure == ("sure" if late > 0.0 else "a question")
+    assert any("ahead of the commands on x" in one for one in asked(found)) is (late < 0.0)
