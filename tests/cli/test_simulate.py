@@ -157,6 +157,19 @@ def test_many_runs_are_resumed(scenario: Path, tmp_path: Path) -> None:
     pumafuse("fuse", *given, *same, "-o", out, "--resume", "--force", code=2)
 
 
+def test_sweeping_up_takes_nothing_of_others(tmp_path: Path) -> None:
+    """Neither a hidden folder of the user's nor what another process is writing beside, whatever a batch ends like."""
+    users = tmp_path / ".scan.backup"
+    users.mkdir()
+    (users / "notes.txt").write_text("mine")
+    with folders.replacing(tmp_path / "scan") as new:  # this process is no worker of its own
+        (new / "x").write_text("")
+        many.run_jobs("testing", {"scan": partial(abs, 2)}, [tmp_path / "scan"])
+    assert names(tmp_path) == {".scan.backup", "scan"}
+    assert (users / "notes.txt").read_text() == "mine"
+    assert names(tmp_path / "scan") == {"x"}
+
+
 @contextmanager
 def _interrupted_bar(_what: str, _total: float) -> Generator[Callable[[float], None]]:
     """A progress bar during whose first move the user presses Ctrl-C."""
@@ -318,6 +331,26 @@ def test_an_output_that_fails_half_way_leaves_the_old_one_and_no_trace(
     assert names(tmp_path) == {"run"} and (run / "run.toml").read_text() == "old"
     write("new")
     assert names(tmp_path) == {"run"} and (run / "run.toml").read_text() == "new"
+
+
+@pytest.mark.parametrize("scenario_beside", [False, True])
+def test_what_somebody_made_is_not_replaced_even_with_force(
+    scenario_beside: bool, scenario: Path, tmp_path: Path
+) -> None:
+    """A run.toml with tables of its own is a measurement; a scenario with its path is written by hand."""
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    if scenario_beside:
+        path = 'trajectory = { kind = "path", file = "path.csv", axes = ["radial"] }\n'
+        scenario = mine / "scenario.toml"
+        scenario.write_text(f'name = "mine"\narm = "puma560-internal"\n{path}')
+        (mine / "path.csv").write_text("time_s,radial_mm\n0.0,1.0\n1.0,2.0\n")
+    else:
+        (mine / "run.toml").write_text('[command]\nfile = "commands.csv"\ntime = "t_s"\nradial = "u_mm"\n')
+        (mine / "commands.csv").write_text("t_s,u_mm\n0.0,1.0\n")
+    before = digests(mine)
+    assert "not ours to replace" in pumafuse("simulate", scenario, "-o", mine, "--force", code=1).stderr
+    assert digests(mine) == before
 
 
 @pytest.mark.long

@@ -116,6 +116,17 @@ def test_bad_lines_change_nothing_and_are_reported() -> None:
     assert both.stream.bad + refused + health.unknown == len(BAD)
 
 
+def test_random_bytes_change_no_bit() -> None:
+    """Thousands of lines of noise between good ones: the estimates are those without them."""
+    rng, clean, both = np.random.default_rng(12), Both(), Both()
+    clean.feed(lines(0.28) + lines(0.28, begin=0.28))
+    noise = rng.integers(1, 256, 250_000, dtype=np.uint8)
+    noise[rng.random(len(noise)) < 0.02] = 10
+    both.feed(lines(0.28) + noise.tobytes() + b"\n" + lines(0.28, begin=0.28))
+    assert both.stream.bad > 4500
+    assert both.written == clean.written
+
+
 def test_the_log_is_short_and_plain_whatever_a_line_calls_itself() -> None:
     """Of bad lines the first, the tenth, and so on; names of 1 kB with colours and line breaks, thousands of them."""
     both = Both()
