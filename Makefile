@@ -16,8 +16,8 @@ unexport PYTHONDONTWRITEBYTECODE
 
 help:
 	@echo "make demo       fuse a recorded run, score it, draw it (into ./demo)"
-	@echo "make test       the tests; six minutes on two cores"
-	@echo "make test-long  statistics, soak tests, notebooks and every command of the documentation; half an hour"
+	@echo "make test       the tests; three minutes on two cores"
+	@echo "make test-long  statistics, soak tests, notebooks and every command of the documentation; twenty minutes"
 	@echo "make lint       ruff and pyright"
 	@echo "make docs       the documentation as a site (into ./site)"
 	@echo "make notebooks  run the notebooks anew, in place"
