@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 import pumafuse as pf
 from pumafuse.filter.response import response
-from pumafuse.fusion.causes import Cause, Tried, evidence_of, suspects, together
+from pumafuse.fusion.causes import Cause, Tried, Weight, evidence_of, suspects, together
 from pumafuse.fusion.consistency import Consistency, Finding, consistency, log_likelihood
 from pumafuse.fusion.summary import decode, encode
 from pumafuse.fusion.verdicts import sentence
@@ -196,6 +196,13 @@ def test_smoothed_noise_is_not_taken_for_small_noise(change: Callable[[np.ndarra
         assert one.finding is Finding.TOO_SMALL
         assert Cause.CORRELATED in [each.cause for each in one.causes], sentence(one)
         assert "the noise is correlated" in sentence(one) and "latency_ms" not in sentence(one)
+
+
+def test_no_lag_is_said_that_is_longer_than_any_search() -> None:
+    """As where commands left for a moment, which nobody followed: a speed times 50 s explains that, too."""
+    for lag, causes in ((0.05, [Cause.LAG]), (50.0, [])):
+        weight = Weight(score=lag * 1e6, information=1e6, number=100, squares=1e10)
+        assert [one.cause for one in suspects({Tried(Cause.LAG, "camera"): weight})] == causes
 
 
 def test_where_nothing_is_wrong_no_cause_is_named() -> None:

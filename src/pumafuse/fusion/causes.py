@@ -63,6 +63,7 @@ _STILL = 1e-9  # m or rad; a shape that is smaller is none
 _LIMITS = (0.95, 0.85, 0.7)  # of the speed, over the highest
 _LEAST_DRIFT = 0.03  # 1/√s: density of the least drift, over the smallest sd, that is made larger; none stays none
 _WHOLE_LAGS = 1.0, 3.0  # update periods: lags looked for as a whole: an accurate sensor sees more of them than velocity
+_LONGEST_LAG = 2.0  # s; a search for an arm looks for none that is longer
 _SLOWER = 1.1  # times the plant's lag: a derivative by it
 _FASTER = 1.1, 1.5  # times the fastest speed
 
@@ -242,6 +243,8 @@ def _gain_of_shape(weight: Weight) -> float:
 
 def _is_possible(cause: Cause, which: float, size: float) -> bool:
     """Whether there is a cause of that size: no play is negative, and a lag of 1 ms does not look like one of 30."""
+    if cause in (Cause.LAG, Cause.LATENCY, Cause.PLANT) and abs(size) > _LONGEST_LAG:
+        return False
     if cause in (Cause.LAG, Cause.LATENCY, Cause.FASTEST):
         return which == 0.0 or 0.5 < size / which < 2.0
     return size > 0.0 or cause not in _OF_ONE_SIGN
