@@ -246,7 +246,7 @@ struct Arm {
         const Motion m = motion(d, side), n = motion(then, side);
         const auto stays = [&](double first, double last) {
             const double away = last > 0.0 ? n.slope : -n.slope;
-            return keeps(first, last) && !(may_return && first * m.slope < 0.0 && away > -still * fast);
+            return keeps(first, last) && !(may_return && m.slope * first < 0.0 && away > -still * fast);
         };
         return (cut_by_play && !stays(m.rate, n.rate)) || (cut_by_limit && !stays(m.closing, n.closing));
     }

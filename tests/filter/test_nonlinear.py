@@ -116,19 +116,24 @@ def test_what_is_never_reached_changes_no_bit(plant: PLANTS, recovery: float | N
 
 
 @pytest.mark.parametrize(
-    ("plant", "recovery", "play", "step", "ms"),
+    ("plant", "recovery", "play", "steps", "ms"),
     [
-        (SecondOrder(natural_frequency=26.8, damping=0.96), 0.3, 2.5e-5, 0.118, 285),
-        (FirstOrder(time_constant=0.0051), 0.0051, 3.23e-4, -0.069, 444),
-        (FirstOrder(time_constant=0.0022), 0.0053, 2.78e-4, -0.04, 377),
+        (SecondOrder(natural_frequency=26.8, damping=0.96), 0.3, 2.5e-5, {0: 0.118}, 285),
+        (SecondOrder(natural_frequency=439.6, damping=1.105), 0.3, 5.97e-4, {0: 0.0339, 106: 0.0376}, 284),
+        (FirstOrder(time_constant=0.0051), 0.0051, 3.23e-4, {0: -0.069}, 444),
+        (FirstOrder(time_constant=0.0022), 0.0053, 2.78e-4, {0: -0.04}, 377),
     ],
 )
-def test_a_command_again_changes_nothing(plant: PLANTS, recovery: float, play: float, step: float, ms: int) -> None:
-    """Steps from rest that turn, and fade until little but rounding is left: in one move as in hundreds."""
+def test_a_command_again_changes_nothing(
+    plant: PLANTS, recovery: float, play: float, steps: dict[int, float], ms: int
+) -> None:
+    """Steps that turn, and fade until little but rounding is left: in one move each as in hundreds."""
     axis = AxisModel(plant=plant, gain=PAPER, gain_recovery=recovery, play=play)
-    time, again = np.array([ms]) * MS + round(DELAY * 1e9), np.arange(ms) * MS
-    at_once = moved(axis, again[:1], np.array([START + step]), time)
-    np.testing.assert_allclose(at_once, moved(axis, again, np.full(ms, START + step), time), rtol=0.0, atol=1e-12)
+    given, command = np.array([*steps]), START + np.cumsum([*steps.values()])
+    again, time = np.arange(ms), np.array([ms]) * MS + round(DELAY * 1e9)
+    held = command[np.searchsorted(given, again, side="right") - 1]
+    at_once = moved(axis, given * MS, command, time)
+    np.testing.assert_allclose(at_once, moved(axis, again * MS, held, time), rtol=0.0, atol=1e-12)
 
 
 @settings(max_examples=40)
