@@ -491,26 +491,16 @@ def _signal(
 
 
 def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
-    """Signals without a unit get the likeliest one for their range, those of joints apart from the others."""
-    sizes: dict[Kind, float] = {}
-    for signal in (signal for signal in signals if not signal.unit):
-        kind = _likely(signal)
-        sizes[kind] = max(sizes.get(kind, 0.0), usual_size(signal.plain))
+    """Signals without a unit get the likeliest one for their own range; a source's sensors may tell a better one."""
     in_units = list[Signal]()
     for signal in signals:
         if not signal.unit:
-            kind = _likely(signal)
-            small, large, most = RANGES[kind]
-            signal = replace(signal, unit=large if sizes[kind] > most else small)
+            small, large, most = RANGES["angle" if names.turns(signal.column, signal.axis) else "length"]
+            signal = replace(signal, unit=large if usual_size(signal.plain) > most else small)
         if kind_of(f"_{signal.unit}") == "angle" and len(wraps(signal.value)):
             signal = replace(signal, turns=True, basis="turn" if signal.basis == "range" else signal.basis)
         in_units.append(signal)
     return tuple(in_units)
-
-
-def _likely(signal: Signal) -> Kind:
-    """What a signal without a unit is by its name."""
-    return "angle" if names.turns(signal.column, signal.axis) else "length"
 
 
 def usual_size(plain: FloatArray) -> float:
