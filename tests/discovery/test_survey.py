@@ -471,8 +471,12 @@ def test_a_command_that_leaps_away_decides_no_unit(tmp_path: Path) -> None:
     assert "are the numbers of log.csv in m? No name says it (run.toml)" in asked(found)
 
 
-def test_lines_as_the_monitor_of_epics_writes_them(tmp_path: Path) -> None:
-    """A channel, a date, a time and a value, with blanks between: no line is a header, by whatever name."""
+@pytest.mark.parametrize("alarm", ["", "HIHI MAJOR"])
+def test_lines_as_the_monitor_of_epics_writes_them(alarm: str, tmp_path: Path) -> None:
+    """A channel, a date, a time and a value, with blanks between: no line is a header, by whatever name.
+
+    Behind the first there may be an alarm.
+    """
     t, u, z = recorded_at_once()
     rows = [
         (at + late, f"BL7:{a}.{what}", value[n, k])
@@ -481,7 +485,7 @@ def test_lines_as_the_monitor_of_epics_writes_them(tmp_path: Path) -> None:
         for n, at in enumerate(t)
     ]
     lines = [f"{channel:<30} 2026-03-05 14:02:{at:09.6f} {value:.6f}  " for at, channel, value in sorted(rows)]
-    (tmp_path / "stage.log").write_text("\n".join([*lines, ""]))
+    (tmp_path / "stage.log").write_text("\n".join([lines[0] + alarm, *lines[1:], ""]))
     relations = survey(tmp_path / "stage.log").relations
     assert len(relations) == 3
     assert [(one.lag, one.slope) for one in relations.values()] == [pytest.approx((LAG, 1.0), abs=0.02)] * 3

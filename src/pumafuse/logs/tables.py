@@ -542,8 +542,10 @@ def _layout(text: bytes) -> _Layout:
     rows = next((n for n in full if n > header), header)
     of_rows = _separator(lines[rows])
     width = len(_cells(lines[rows], of_rows))
-    # What stands above rows of numbers and has another number of cells is no header of theirs.
-    is_other = first < header < rows and _begins(lines, rows, of_rows) and len(_cells(lines[header], of_rows)) != width
+    # What stands above rows of numbers and has another number of cells is no header of theirs, but for a first line of
+    # words, which may lack a name. A row with more cells, as EPICS writes alarms, is none.
+    cells = _cells(lines[header], of_rows)
+    is_other = (first < header or not _is_text(cells)) and _begins(lines, rows, of_rows) and len(cells) != width
     if header < 0 or is_other:
         separator, names, skipped, top, units = of_rows, list(map(_column, range(width))), rows, rows, False
     else:
