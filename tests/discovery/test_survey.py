@@ -547,8 +547,9 @@ def test_the_error_of_a_controller_alone_is_no_command(error: str, tmp_path: Pat
     columns = 'file = "log.csv"\ntime = "t_s"\nboom = '
     told = f'[command]\n{columns}{{ column = "{error}", unit = "mm" }}\n'
     (tmp_path / "run.toml").write_text(f'{told}[sensors.gauge]\n{columns}"level_mm"\n')
-    text = one_line(ConfigError, lambda: survey(tmp_path))
-    assert f'the commands are the sum of both: boom = ["MEASURED", "{error}"]' in text
+    for read in (survey, pf.Run.read):
+        text = one_line(ConfigError, lambda read=read: read(tmp_path))
+        assert f'the commands are the sum of both: boom = ["MEASURED", "{error}"]' in text
 
 
 def test_a_status_that_changes_all_the_time_tells_nothing_apart(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from ..errors import RunError, counted, printable
 from ..logs import formats, recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, sentinel, without
 from ..logs.frames import CARTESIAN
-from ..logs.manifest import Time
+from ..logs.manifest import ERROR, Time, is_error
 from ..logs.recordings import PATH, PATH_TIME
 from ..logs.run import Source, standing_clock
 from ..logs.stamps import packets
@@ -92,7 +92,6 @@ _VELOCITIES = names.words_in("Twist TwistStamped TwistWithCovariance TwistWithCo
 RESTS = "always"  # what a column is that never changes
 _SPEEDS = names.words_in("velocity velocities vel speed twist")  # why columns are no positions
 _ARE_VELOCITIES, _UNDECODED = "velocities, no positions", "its messages cannot be decoded"
-ERROR = "if it is the set point less what is measured, the commands are the sum of both"
 _OF_FRAME = ["header", "child_frame_id", "transform"]  # of a transform
 _PX4 = "PX4"  # whose numbers are in SI units; of its hundred topics those have positions that are called so:
 _PX4_TOPICS = names.words_in("position attitude odometry trajectory pose gimbal joint joints angle angles servo")
@@ -1017,7 +1016,7 @@ def no_commands(parts: Iterable[Part]) -> str:
                 f"{what} velocities, and commands must be positions: integrate them along the measured heading, as"
                 " docs/own-log.md does under 'Commands that are velocities'"
             )
-        errors = [column for column in part.left_out if names.is_error(column)]
+        errors = [column for column in part.left_out if is_error(column)]
         if errors and not told:
             of_axis = f'AXIS = ["MEASURED", "{errors[0]}"]'
             advice.append(f"{errors[0]} of {part.label} is an error: {ERROR}: {of_axis} under [command] in run.toml")

@@ -212,11 +212,6 @@ def no_position(column: str) -> str | None:
     return next(iter(whats), "in °C or °/s" if "°" in column and not is_told else of_unit)
 
 
-def is_error(column: str) -> bool:
-    """Whether a column is called as what is left between a set point and what is measured."""
-    return has_word(leaf(column), _ERRORS)
-
-
 def no_position_by_place(label: str, columns: Iterable[str]) -> str | None:
     """What the columns of a file or topic are by its name, if they have no words of their own and are no positions."""
     silent = all(axis_of(column, []) == "position" and not role_words(column) for column in columns)

@@ -13,15 +13,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import ConfigError
 from ..logs.axes import in_axes
 from ..logs.clock import without_strays
-from ..logs.manifest import load, refuse_twice
+from ..logs.manifest import refuse_twice
 from ..logs.run import REFERENCE, Run, Source
 from ..space.rotations import TURNING
 from ..units import MS
-from . import names
-from .contents import ERROR, Part, parts_of, period_of, unused
+from .contents import Part, parts_of, period_of, unused
 from .following import LATEST, Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
@@ -76,7 +74,6 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     described = log if log.name == "run.toml" else log / "run.toml"
     if os.path.isfile(described):  # noqa: PTH113 - Path.is_file raises on a name that is too long
         refuse_twice(described)
-        _refuse_errors(described)
         run = without_strays(Run.read(described))
         manifest = tomllib.loads(described.read_text(encoding="utf-8"))
         framed = own_frames(run)
@@ -115,17 +112,6 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         command = without_early.run.command.interpolated(step)
         without_early = replace(without_early, run=replace(without_early.run, command=command), interpolation=step)
     return without_early
-
-
-def _refuse_errors(described: Path) -> None:
-    """Refuse a ``run.toml`` in which the arm is told what a controller's error is."""
-    for axis, columns in load(described).command.axes.items():
-        if len(columns) == 1 and names.is_error(columns[0].column):
-            error = columns[0].column
-            raise ConfigError(
-                f"{described}: command.{axis} is '{error}', which is called an error: {ERROR}:"
-                f' {axis} = ["MEASURED", "{error}"]'
-            )
 
 
 def _along_axes(run: Run, framed: Collection[str]) -> Run:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from collections.abc import Iterable
 from itertools import product
@@ -29,6 +30,8 @@ _MOST = 2**63  # more than a whole number of a column can be
 _LETTERS = {"".join(letters) for letters in product("xyz", repeat=3) if letters[0] != letters[1] != letters[2]}
 _IN_POSE = "position", "orientation"  # what a Pose has, and a Transform:
 _IN_TRANSFORM = "translation", "rotation"
+_ERROR_WORD = re.compile(r"((?<![A-Za-z])e|E)rr(or)?s?(?![a-z])|(?<![A-Za-z])ERR(OR)?S?(?![A-Za-z])")
+ERROR = "if it is the set point less what is measured, the commands are the sum of both"
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -271,7 +274,17 @@ def load(path: Path) -> Manifest:
     if path.name == "run.toml" and path.parent.is_dir() and not path.exists():
         log = shlex.quote(str(path.parent))
         raise ConfigError(f"{path.parent}: has no run.toml; `pumafuse init {log}` looks at the log and writes one")
-    return of_tables(toml.read(path), str(path))
+    listed = of_tables(toml.read(path), str(path))
+    for axis, columns in listed.command.axes.items():
+        if len(columns) == 1 and is_error(error := columns[0].column):
+            sum_of_both = f'{axis} = ["MEASURED", "{error}"]'
+            raise ConfigError(f"{path}: command.{axis} is '{error}', which is called an error: {ERROR}: {sum_of_both}")
+    return listed
+
+
+def is_error(column: str) -> bool:
+    """Whether a column is called as what is left between a set point and what is measured."""
+    return _ERROR_WORD.search(leaf(column)) is not None
 
 
 def refuse_twice(path: Path) -> None:
