@@ -460,7 +460,9 @@ def test_set_points_are_what_is_followed_as_far_not_what_they_are_scaled_from(tm
     joints = many_joints(tmp_path)
     found = survey(tmp_path / "log.csv")
     assert of_roles(found)[0] == [f"target_sent_{joint}" for joint in joints]
-    assert not [question for question in asked(found) if "times as far" in question]
+    questions_asked = asked(found)
+    assert not [question for question in questions_asked if "times as far" in question]
+    assert [question for question in questions_asked if "other commands than target: exchange the two" in question]
 
 
 def test_a_command_that_leaps_away_decides_no_unit(tmp_path: Path) -> None:
@@ -1538,14 +1540,16 @@ def test_a_clock_that_was_counted_gives_way_to_one_that_was_measured(tmp_path: P
     assert not any("which is the clock" in one for one in asked(survey(tmp_path / "log.csv")))
 
 
-def test_an_angle_by_the_name_of_what_measures_it_is_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("told", "measured"), [("reference", "theta"), ("goal_RF_AA", "dof_RF_AA")])
+def test_an_angle_by_the_name_of_what_measures_it_is_one(told: str, measured: str, tmp_path: Path) -> None:
     """``reference`` beside ``theta``, without a unit: both in rad, not in m."""
     t = np.arange(0.0, 30.0, 0.02)
-    columns = {"time_s": t, "reference": np.sin(t) + 0.3 * np.sin(3.3 * t)}
-    write(tmp_path / "log.csv", columns | {"theta": np.interp(t - 0.1, t, columns["reference"])})
+    columns = {"time_s": t, told: np.sin(t) + 0.3 * np.sin(3.3 * t)}
+    write(tmp_path / "log.csv", columns | {measured: np.interp(t - 0.1, t, columns[told])})
     found = survey(tmp_path / "log.csv")
     assert set(found.run.kinds.values()) == {"angle"}
-    assert found.run.command.values["theta"].max() == pytest.approx(columns["reference"].max())
+    (value,) = found.run.command.values.values()
+    assert value.max() == pytest.approx(columns[told].max())
 
 
 @pytest.mark.parametrize(("word", "unit", "far"), [("", "rad", 2.5), ("", "deg", 80.0), ("rail_", "m", 2.5)])

@@ -113,7 +113,7 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
         if guessed:
             yield f"are the numbers of {', '.join(guessed)} in {' and '.join(units)}? No name says it (run.toml)"
         for stream, why in roles.left_out:
-            if stream.name in {*run.sensors, roles.command.name} or "follow" in why or "its commands" in why:
+            if stream.name in run.sensors or stream.role == "command" or "follow" in why or "its commands" in why:
                 yield f"{printable(stream.name)} is not used on {', '.join(stream.axes)}: {why}"
     yield from later
     for (name, axis), why in survey.unused.items():

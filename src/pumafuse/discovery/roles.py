@@ -182,7 +182,8 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         if stream is command:
             continue
         if stream.role == "command":
-            left_out.append((stream, "other commands: a run has one source of them; exchange the two to use these"))
+            other = f"other commands than {printable(command.name)}: exchange the two in run.toml to use these"
+            left_out.append((stream, other))
             continue
         if stream.role is None and stream.why:
             left_out.append((stream, stream.why))
@@ -798,9 +799,9 @@ def _angles_by_name(roles: Roles) -> Stream:
     """The commands, in units of angles where nothing says it of them, but the name of what measures them."""
     axes = dict(roles.command.axes)
     for axis, signals in roles.command.axes.items():
-        seen = [some for signal in roles.measured.values() for some in signal.axes.get(axis, ())]
-        guessed = signals[0].basis == "range" and roles.command.kind(axis) == "length"
-        if guessed and any(names.is_turning(signal.axis) and kind_of(f"_{signal.unit}") == "angle" for signal in seen):
+        seen = [some for stream in roles.measured.values() for some in stream.axes.get(axis, ())]
+        turning = [some for some in seen if names.turns(some.column, some.axis) and kind_of(f"_{some.unit}") == "angle"]
+        if turning and signals[0].basis == "range" and roles.command.kind(axis) == "length":
             axes[axis] = _in(signals, "_rad")
     return replace(roles.command, axes=axes)
 
