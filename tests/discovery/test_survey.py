@@ -991,6 +991,7 @@ def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
         *("moment[1]", "pwm.3", "delta_x_mm", "sd_x_mm", "rel_yaw_deg", "T [°C]", "success_rate", "delta_q_reset[0]"),
         *("Motor/MotorFbTor#0", "MotorCmdKp#0", "kd_2", "actual_cur", "cur_3", "current_joint2"),
         *("Z2_CurrentFeedback", "measured_current_y", "target_tensions[2]", "cable_tension_4"),
+        *("K_Nm_per_rad", "spring [N/mm]", "encoder counts per deg"),
     ],
 )
 def test_what_is_no_position_is_left_out(column: str) -> None:

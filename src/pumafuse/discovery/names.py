@@ -90,6 +90,7 @@ _TELLING = _TIMES | COUNTERS | WHOSE | VALID | words_in("episode run trial")
 _DIGITS = "0123456789"
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
+_PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
 _BRACKETED = re.compile(rf"[\[(] *(mm|m|um|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 # Joints in metres, where others turn.
@@ -197,6 +198,8 @@ def no_position(column: str) -> str | None:
     kind, unit, parts = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
     if not _CHANGES.isdisjoint(parts):
         return "relative: a change, no position"
+    if _PER.search(column):
+        return "a ratio"
     is_told = kind is not None or _BRACKETED.search(column) is not None
     if not is_told and role_words(column) and any(word.rstrip(_DIGITS) == "qd" for word in parts):
         return "velocity"  # as UR calls it: target_qd_0 beside target_q_0
