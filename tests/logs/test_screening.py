@@ -107,6 +107,16 @@ def test_a_sensor_that_froze_is_held(stuck: float | None) -> None:
     assert np.abs(est["slide"].position - right).max() < 4.0 * est["slide"].position_sd.max()
 
 
+def test_of_a_sensor_that_froze_at_rest_what_it_says_before_the_commands_move_counts() -> None:
+    """An axis that rests for long and is told to go back, beside a sensor without noise that stays where it was."""
+    path = 0.3 * np.clip(np.minimum(TIME - 2.0, 53.0 - TIME), 0.0, 1.0)
+    value = followed(path, 1e-3, noise=0.0)
+    back = int(np.flatnonzero(np.diff(path) < 0.0)[0]) + 1
+    value[back : back + 40] = value[back - 1]
+    est, notes = fused(path, value)
+    assert est.counts["rule"] == {"fused": 2360, "held": 40}, notes
+
+
 def test_a_sensor_slower_than_its_rows_counts_at_its_own_rate() -> None:
     """Each value four times: the estimate is that of the values given once, to the bit."""
     slow = np.repeat(VALUE[::4], 4)

@@ -150,7 +150,7 @@ class HoldWatch:
             return Judged(True, True)
         led, before = (commands.at(axis, instant) or 0.0 for instant in (stamp, repeated.since - lag))
         odd = led != before and (repeated.leapt or repeated.repeats ** (repeated.count - 1) < _ODD)
-        if repeated.believed or not (odd or habit.is_clear(max(led - repeated.low, repeated.high - led))):
+        if repeated.believed or not (odd or max(led - repeated.low, repeated.high - led) > habit.clear):
             return NEWS
         waited.append((stamp, value, spreads[axis]))
         if stamp - waited[0][0] <= self._patience:

@@ -140,14 +140,15 @@ class Habit(NamedTuple):
         Meanwhile the commands ``moved`` the axis, of its whole ``travel`` [m or rad]. It may have ``leapt`` away from
         the values beside it; other values are repeated so often, of 1.
         """
-        if count < _FROZEN * self.times or not self.is_clear(moved):
+        if count < _FROZEN * self.times or moved <= self.clear:
             return False
         unlikely = self.times == 1 and repeats ** (count - 1) < _BY_CHANCE
         return leapt or unlikely or moved > _SHARE * travel
 
-    def is_clear(self, moved: float) -> bool:
-        """Whether a motion [m or rad] is clearly more than the steps of the values."""
-        return moved > max(_STEPS * self.smallest, _CLEARLY * self.typical)
+    @property
+    def clear(self) -> float:
+        """The motion [m or rad] beyond which one is clearly more than the steps of the values."""
+        return max(_STEPS * self.smallest, _CLEARLY * self.typical)
 
     def is_again(self, count: int) -> bool:
         """Whether a value that has come ``count`` times before in a row is that of a sample that is held."""
@@ -172,8 +173,21 @@ def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArr
     for run in np.flatnonzero(count >= _FROZEN).tolist():
         first, last = int(begin[run]), int(begin[run] + count[run] - 1)
         low, high = np.searchsorted(command[0], [stamp[first], stamp[last] - lag], side="right").tolist()
-        moved = float(np.ptp(command[1][max(low - 1, 0) : high])) if high > max(low - 1, 0) else 0.0
+        meanwhile = slice(max(low - 1, 0), high)
+        told = command[1][meanwhile]
+        moved = float(np.ptp(told)) if len(told) else 0.0
         elsewhere = (repeats - count[run] + 1) / (len(value) - count[run])
         if habit.froze(int(count[run]), moved, travel, bool(leaps[run : run + 2].any()), elsewhere):
-            is_held[first + (0 if leaps[run] else 1) : last + 1] = True  # what it leaps to is where nobody was
+            if not leaps[run]:  # what it leaps to is where nobody was; before it is moved, an axis rests
+                since = _moved_since(command[0][meanwhile], told, habit.clear, int(stamp[first]), lag)
+                first = max(first + 1, int(np.searchsorted(stamp, since)))
+            is_held[first : last + 1] = True
     return is_held, habit.times
+
+
+def _moved_since(told_at: TimeArray, told: FloatArray, clear: float, since: int, lag: int) -> int:
+    """When commands [ns] begin to move an axis clearly that had rested for longer than it follows; else ``since``."""
+    until = int(np.argmax(np.abs(told - told[0]) > clear))
+    changes = told_at[1 : until + 1][np.diff(told[: until + 1]) != 0.0]
+    rests = np.flatnonzero(np.diff(changes, prepend=since) > lag)
+    return int(changes[rests[-1]]) if len(rests) else since
