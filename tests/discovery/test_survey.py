@@ -1104,6 +1104,22 @@ def test_of_columns_without_names_those_that_add_up_to_others_are_velocities(tmp
     assert parts_of(tmp_path / "log.txt")[0].left_out == {}
 
 
+def test_what_adds_up_to_a_position_is_its_velocity_by_whatever_name(tmp_path: Path) -> None:
+    """And what adds up to that an acceleration: none is an axis. Senders may be called as ``K2S`` and ``S2K``."""
+    columns = {"t_s": (t := 0.02 * np.arange(1000))}
+    for who, late in (("K2S", 0.0), ("S2K", LAG)):
+        ram = path(3.0 * (t - late)).sum(axis=1)
+        columns[f"{who} ram L"] = ram + np.random.default_rng(4).normal(scale=1e-5, size=len(t))
+        columns[f"{who} ram W"] = np.gradient(ram, t)
+        columns[f"{who} ram B"] = np.gradient(columns[f"{who} ram W"], t)
+    write(tmp_path / "log.csv", columns)
+    found = survey(tmp_path / "log.csv")
+    assert of_roles(found) == [["K2S ram L"], ["S2K ram L"]]
+    assert set(found.parts[0].left_out.values()) == {
+        f"velocity: it adds up to {who} ram {what} by the clock" for who in ("K2S", "S2K") for what in "LW"
+    }
+
+
 def test_of_columns_without_names_that_move_at_once_the_one_that_stands_is_the_command(tmp_path: Path) -> None:
     """What follows within a row has no lag that tells it; its noise does, where the commands rest."""
     t = 0.01 * np.arange(900)
@@ -1996,13 +2012,16 @@ def test_columns_without_words_are_what_their_file_is_called(log: Path) -> None:
 
 
 def test_the_best_pairs_of_axes_come_first(tmp_path: Path) -> None:
-    """Joints and their rates, called otherwise than the commands: no rate takes the place of a joint."""
+    """Joints and their rates in deg/s, called otherwise than the commands: no rate takes the place of a joint."""
     t = 0.01 * np.arange(1500)
     joints = [a * np.sin(1.9 * t + p) + 0.3 * a * np.sin(4.5 * t + 2.0 * p) for a, p in ((0.5, 0), (0.8, 1), (0.4, 2))]
     columns: dict[str, Any] = {"t": t}
     for place, joint in enumerate(joints):
         columns[f"cmd_q{place}"] = joint
-        columns |= {f"cmd_qd{place}": np.gradient(joint, t), f"was_qd{place}": np.gradient(np.roll(joint, 5), t)}
+        columns |= {
+            f"cmd_qd{place}": np.gradient(joint, t),
+            f"was_qd{place}": np.degrees(np.gradient(np.roll(joint, 5), t)),
+        }
         columns[f"was_q{place}"] = np.interp(t - 0.05, t, joint)
     write(tmp_path / "log.csv", columns)
     found = survey(tmp_path / "log.csv")

@@ -80,6 +80,7 @@ _OF_WAY = 0.1
 # Shares of the variance of the ways that a velocity explains as it is, as a correlation of 0.95 does, and the most that
 # the other way round may: on a circle at 1 rad/s each coordinate is the velocity of the other.
 _IS_VELOCITY, _EITHER = 0.9, 0.5
+_MOST_WAYS = 5_000  # that are compared with what adds up to them
 _TRIAL = re.compile(r"[^\[]*\[(\d+)\]")  # of a list of trials
 _ECHO = re.compile(r"^field\.(transforms0\.)?")
 _ECHOED = re.compile(r"field\..*(position|translation|point)\.[xyz]$")  # of a message by `rostopic echo -p`: in m, too
@@ -308,7 +309,7 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
     if clock is None or (rate and clock.counts):
         clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts)
     used = () if clock is None else tuple(clock.time.columns)
-    if clock and is_nameless(signals, clock):
+    if clock:
         sums = _velocities([signal for signal in signals if signal.column not in used], clock.stamp)
         left_out |= {name: f"velocity: it adds up to {position} by the clock" for name, position in sums.items()}
         signals = [
@@ -338,6 +339,7 @@ def _is_nameless(column: str) -> bool:
     return names.words(column)[:1] == NAMELESS
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of numbers that are none, nothing is a velocity
 def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
     """Columns that add up to another by the clock, and to which: they are its velocity, and no positions."""
     stamped = stamp != NO_STAMP
@@ -345,9 +347,10 @@ def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
     rows = max(1, round(_OF_WAY / max(median(steps), 1e-6))) if len(steps) else 1
     if len(signals) < 2 or len(steps) - rows < _FEWEST_ROWS:
         return {}
-    plain = np.stack([signal.plain[stamped] for signal in signals])
-    sums = np.pad(np.cumsum(0.5 * (plain[:, 1:] + plain[:, :-1]) * steps, axis=1), ((0, 0), (1, 0)))
-    ways, added = (sums_of_rows[:, rows:] - sums_of_rows[:, :-rows] for sums_of_rows in (plain, sums))
+    begin = np.unique(np.linspace(0, len(steps) - rows, _MOST_WAYS).astype(np.intp))
+    plain, again = ((signal.plain[stamped] for signal in signals) for _ in range(2))  # one at a time in memory
+    sums = (np.pad(np.cumsum(0.5 * (value[1:] + value[:-1]) * steps), (1, 0)) for value in again)
+    ways, added = (np.stack([value[begin + rows] - value[begin] for value in values]) for values in (plain, sums))
     # by adding up the second, of the variance of the first
     spread, power = np.var(ways, axis=1), np.mean(ways**2, axis=1)[:, None] + np.mean(added**2, axis=1)
     both = ways @ added.T / ways.shape[1]
@@ -356,8 +359,9 @@ def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
     )
     is_velocity = (as_it_is > _IS_VELOCITY) & ~(np.maximum(as_it_is, mirrored).T > _EITHER)
     return {
-        signals[column].name: signals[int(np.argmax(as_it_is[:, column]))].name
+        signals[column].name: signals[int(np.nanargmax(as_it_is[:, column]))].name
         for column in np.flatnonzero(is_velocity.any(axis=0)).tolist()
+        if signals[column].basis == "range"
     }
 
 

@@ -110,6 +110,7 @@ _TURNING = re.compile(
     re.IGNORECASE,
 )
 
+_HUMP = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[a-z]\d)(?=[A-Z])|(?<=[a-z]\d\d)(?=[A-Z])|(?<=[A-Z0-9])(?=[A-Z][a-z])")
 _KNOWN = _OF_ROLES | _SILENT | _NO_POSITIONS | _TELLING
 # Words of roles without a separator before or behind an axis or what is no position; com is a centre of mass, too.
 _ROLE = "|".join(sorted({word for word in _OF_ROLES if len(word) > 2} - {"com"} | {"act"}))
@@ -120,9 +121,10 @@ _GLUED = re.compile(rf"({_ROLE})({_WHAT})|({_WHAT})({_ROLE})")
 def words(name: str) -> list[str]:
     """The words of a name in lower case: ``goalPose_x`` is goal, pose, x; ``QTarget2`` is q, target, 2.
 
-    Numbers of devices stay with them: ``camera2`` is one word. ``refx`` is ref, x, and ``velcmd`` is vel, cmd.
+    Numbers of devices stay with them: ``camera2`` is one word. ``refx`` is ref, x, and ``velcmd`` is vel, cmd. ``H2C``
+    is one, too.
     """
-    apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
+    apart = _HUMP.sub("_", name)
     whole = [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
     glued = [None if word in _KNOWN else _GLUED.fullmatch(word) for word in whole]
     parts = [
