@@ -299,12 +299,8 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
         read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
         notes = [f"{table.path.name}: of {len(table.names)} columns {read}"]
     beside = [names.role_words(signal.column) for signal in signals if signal.axis in CARTESIAN]
-    left_out |= {
-        path: "turning"
-        for attitude in attitudes
-        if attitude.role_words not in beside
-        for path in attitude.columns.columns
-    }
+    for attitude in attitudes:
+        left_out |= {} if attitude.role_words in beside else dict.fromkeys(attitude.columns.columns, "turning")
     clock, why_none = _clock(table, signals, sorted(counts))
     if clock is None or (rate and clock.counts):
         clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts)
@@ -312,9 +308,8 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
     if clock:
         sums = _velocities([signal for signal in signals if signal.column not in used], clock.stamp)
         left_out |= {name: f"velocity: it adds up to {position} by the clock" for name, position in sums.items()}
-        signals = [
-            replace(signal, has_velocity=signal.name in sums.values()) for signal in signals if signal.name not in sums
-        ]
+        positions = [signal for signal in signals if signal.name not in sums]
+        signals = [replace(signal, has_velocity=signal.name in sums.values()) for signal in positions]
     left_out |= {path: "another clock" if clock else _no_clock(table, path) for path in times}
     accounted = {path for path in left_out if path in used or path.startswith(tuple(f"{path}." for path in used))}
     return replace(
@@ -416,24 +411,20 @@ def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
     ``id``. A ``status`` is none.
     """
     for name, column in table.columns.items():
-        whose, words = (
-            names.has_word(leaf(name), names.WHOSE),
-            pa.types.is_string(column.type) and not table.is_dated(name),
-        )
+        whose = names.has_word(leaf(name), names.WHOSE)
+        words = pa.types.is_string(column.type) and not table.is_dated(name)
         if not (whose and pa.types.is_integer(column.type)) and not (words and (whose or not names.no_position(name))):
             continue
         counts = pc.value_counts(column.drop_null())
-        keys = (
-            {entry["values"].as_py(): entry["counts"].as_py() for entry in counts} if len(counts) <= _MOST_KEYS else {}
-        )
-        if len(keys) < 2 or min(keys.values()) < _FEWEST_ROWS:
+        keys: list[Any] = counts.to_pylist() if len(counts) <= _MOST_KEYS else []
+        if len(keys) < 2 or min(key["counts"] for key in keys) < _FEWEST_ROWS:
             continue
         changed = pc.fill_null(pc.not_equal(column[1:], column[:-1]), True).cast(pa.uint8())
         changes = np.from_dlpack(changed.combine_chunks())
         others = [column for column in table.columns if column != name]
         is_below = changes.sum() == len(keys) - 1 and (whose or not any(map(names.role_words, others)))
         if changes.mean() > _IN_TURNS or (is_below and _begins_anew(table, others, np.flatnonzero(changes) + 1)):
-            return [{name: key} for key in keys]
+            return [{name: key["values"]} for key in keys]
     return [{}]
 
 
@@ -521,8 +512,7 @@ def _numeric_paths(table: Table) -> Iterator[str]:
             yield name
         else:
             beside = table.columns.get("name")
-            labelled = {} if beside is None else {"name": beside[0].as_py()}
-            yield from numeric_paths({**labelled, name: first[0].as_py()})
+            yield from numeric_paths({"name": None if beside is None else beside[0].as_py(), name: first[0].as_py()})
 
 
 # Clocks.
@@ -564,12 +554,10 @@ def _or_another(table: Table, clock: Clock, others: Iterable[Clock]) -> Clock:
         if max(spans) > _ALIKE_SPANS * min(spans) > 0.0:
             steps = np.diff([clock.stamp, other.stamp])
             counted = (np.ptp(steps, axis=1) <= _OF_STEP * np.median(steps, axis=1)).tolist() == [True, False]
-            names_of = clock.time.column, other.time.column
-            doubt = (
-                f"which is the clock of {table.path.name}? By {names_of[0]} it lasts {spans[0]:.4g} s, by"
-                f" {names_of[1]} {spans[1]:.4g} s"
-                + (f"; {names_of[0]} is exactly even, as what is counted, so {names_of[1]} is taken" if counted else "")
-            )
+            first, second = clock.time.column, other.time.column
+            lasts = f"By {first} it lasts {spans[0]:.4g} s, by {second} {spans[1]:.4g} s"
+            taken = f"; {first} is exactly even, as what is counted, so {second} is taken" if counted else ""
+            doubt = f"which is the clock of {table.path.name}? {lasts}{taken}"
             return replace(other if counted else clock, doubt=doubt)
     return clock
 
@@ -595,11 +583,9 @@ def _numbered(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
         rate = float(number[-1] / since[-1]) if since[-1] > 0.0 and name not in clock.time.columns else 0.0
         rounding = max(_ROUNDED, _FLOAT32 * float(np.abs(since).max(initial=0.0)))
         if rate and _counts(table, name) == 1.0 and (np.abs(since - number / rate) <= rounding).all():
-            return replace(
-                clock,
-                doubt=f"did the loop run at {rate:.4g} Hz? The stamps of {table.path.name} are exactly {name} /"
-                f" {rate:.4g}: they were counted, not measured. If it ran slower, lags are as much longer",
-            )
+            stamps = f"The stamps of {table.path.name} are exactly {name} / {rate:.4g}: they were counted, not measured"
+            doubt = f"did the loop run at {rate:.4g} Hz? {stamps}. If it ran slower, lags are as much longer"
+            return replace(clock, doubt=doubt)
     return clock
 
 
@@ -686,16 +672,12 @@ def _beside(part: Part, clock: Clock, parts: Iterable[Part]) -> Clock:
     """A clock; where its unit is a guess in which no other table tells the same time, in one in which one does."""
     if not clock.basis.endswith(_GUESSED):
         return clock
-    apart = [
-        other.clock for other in parts if other.clock and (other.file, other.clock.time) != (part.file, clock.time)
-    ]
-    others, own_ends = [_ends(other) for other in apart], _ends(clock)
+    clocks = [(other.file, other.clock) for other in parts if other.clock]
+    others = [_ends(other) for file, other in clocks if (file, other.time) != (part.file, clock.time)]
 
     def shares(size: float) -> bool:
-        first, last = size * own_ends
-        return any(
-            min(last, to) - max(first, since) > _SHARED * (max(last, to) - min(first, since)) for since, to in others
-        )
+        first, last = size * _ends(clock)
+        return any(min(last, to) - max(first, at) > _SHARED * (max(last, to) - min(first, at)) for at, to in others)
 
     units = {unit[1:]: divisor(clock.time.ending) / divisor(unit) for unit in TIMES}
     fit = [unit for unit, size in units.items() if shares(size)]
@@ -809,11 +791,10 @@ def without_clock(part: Part) -> str:
 def unused(parts: Iterable[Part]) -> list[str]:
     """What of a log is taken for nothing, each with the reason: first what has no clock, then columns, then files."""
     parts = list(parts)
-    sentences = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
-    sentences += [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
-    none = (part for part in parts if part.notes and not (part.signals or part.left_out))
-    sentences += [f"{part.label} ({part.notes[0]})" for part in none]
-    return [printable(sentence, 200) for sentence in dict.fromkeys(sentences)]
+    reasons = [(part.label, without_clock(part)) for part in parts if part.signals and part.clock is None]
+    reasons += [reason for part in parts for reason in part.left_out.items()]
+    reasons += [(part.label, part.notes[0]) for part in parts if part.notes and not (part.signals or part.left_out)]
+    return [printable(f"{what} ({why})", 200) for what, why in dict.fromkeys(reasons)]
 
 
 def _no_clock(table: Table, name: str) -> str:
@@ -862,10 +843,8 @@ def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
         yield Part(path, topic, type=_PX4, notes=("no positions, by its name",))
         return
     if path.suffix == ".parquet":
-        with tables.one_line(path):
-            fields = _likeliest(
-                [field.name for field in papq.read_schema(path) if "binary" not in str(field.type)]
-            )  # images
+        with tables.one_line(path):  # images are binary
+            fields = _likeliest([field.name for field in papq.read_schema(path) if "binary" not in str(field.type)])
         some = [name for name in names.EPISODES if name in fields]
         where = _first_run(read(fields=some)) if some else {}
         table = read(fields=fields, where=where)
@@ -924,9 +903,7 @@ def _validity(table: Table) -> dict[str, Any]:
 
 def _first_run(table: Table) -> dict[str, Any]:
     """Which rows are the first run, where a column tells several apart."""
-    for name in names.EPISODES:
-        if name not in table.columns:
-            continue
+    for name in filter(table.columns.__contains__, names.EPISODES):
         values = pc.unique(table.columns[name].drop_null())
         value: Any = values[0].as_py() if 1 < len(values) <= table.rows // _FEWEST_ROWS else None
         if isinstance(value, int | str | float):
@@ -944,10 +921,8 @@ def _labels(path: Path) -> dict[str, list[str]]:
     """What the elements of lists are called, by column, in a data set of LeRobot."""
     labels, info = dict[str, list[str]](), _Info({})
     with suppress(msgspec.MsgspecError, OSError, StopIteration):
-        about = next(
-            info_path for above in path.resolve().parents[:4] if (info_path := above / "meta" / "info.json").is_file()
-        )
-        info = msgspec.json.decode(about.read_bytes(), type=_Info)
+        about = (above / "meta" / "info.json" for above in path.resolve().parents[:4])
+        info = msgspec.json.decode(next(filter(Path.is_file, about)).read_bytes(), type=_Info)
     for key, feature in info.features.items():
         inside: Any = feature.get("names")
         while isinstance(inside, dict | list) and inside:  # a list in a list, as Unitree's converter writes it
@@ -962,10 +937,8 @@ def _labels(path: Path) -> dict[str, list[str]]:
 
 def _recorded(path: Path) -> Iterator[Part]:
     topics = recordings.topics(path)
-    if len(topics) > _MOST_PARTS:
-        raise RunError(
-            f"{path}: has {len(topics)} topics or entities, more than {_MOST_PARTS}; describe it in run.toml"
-        )
+    if (count := len(topics)) > _MOST_PARTS:
+        raise RunError(f"{path}: has {count} topics or entities, more than {_MOST_PARTS}; describe it in run.toml")
     for topic in topics:
         source = Part(path, "", topic.name) if path.suffix == ".rrd" else Part(path, topic.name)
         source = replace(source, type=topic.type, rows=topic.count)
@@ -1006,24 +979,19 @@ def no_commands(parts: Iterable[Part]) -> str:
     parts = list(parts)
     clockless = any(part.signals and part.clock is None for part in parts)
     advice = ["if rows come at a constant rate, give it to init as --rate HZ"] if clockless else list[str]()
-    told = any(
-        names.column_role(signal.name) == "command" for part in parts for signal in part.signals
-    )  # positions, too
+    told = any(names.column_role(signal.name) == "command" for part in parts for signal in part.signals)
     for part in parts:
-        speeds = [
-            column for column, why in part.left_out.items() if why in _SPEEDS and names.column_role(column) == "command"
-        ]
-        speeds = [] if told else speeds
+        others = dict[str, str]() if told else part.left_out
+        speeds = [column for column, why in others.items() if why in _SPEEDS and names.column_role(column) == "command"]
         if _ARE_VELOCITIES in part.notes or speeds:
-            what = f"{part.label} are" if not speeds else f"{', '.join(speeds[:3])} of {part.label} are"
+            what = f"{', '.join(speeds[:3])} of {part.label}" if speeds else part.label
             advice.append(
-                f"{what} velocities, and commands must be positions: integrate them along the measured heading, as"
+                f"{what} are velocities, and commands must be positions: integrate them along the measured heading, as"
                 " docs/own-log.md does under 'Commands that are velocities'"
             )
-        errors = [column for column in part.left_out if is_error(column)]
-        if errors and not told:
-            of_axis = f'AXIS = ["MEASURED", "{errors[0]}"]'
-            advice.append(f"{errors[0]} of {part.label} is an error: {ERROR}: {of_axis} under [command] in run.toml")
+        if error := next(filter(is_error, others), ""):
+            of_axis = f'AXIS = ["MEASURED", "{error}"]'
+            advice.append(f"{error} of {part.label} is an error: {ERROR}: {of_axis} under [command] in run.toml")
         advice += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
         if part.clock and len(rows := falls_back(part.clock.stamp)):
             advice.append(

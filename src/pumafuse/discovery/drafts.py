@@ -226,8 +226,8 @@ def _fusion_toml(survey: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGues
         lines += ["", _header(["sensors", name])]
         lines += _by_kind("sd", guess.sd, arm, "its scatter from one measurement to the next")
         lines.append(_line(_pair("latency_ms", _digits(guess.latency * MS, 3)), guess.latency_words))
-        if guess.latency_sd:
-            lines.append(_line(_pair("latency_sd_ms", _digits(guess.latency_sd * MS)), "by its rows and steps"))
+        if guess.pair and (scatter := guess.pair.alignment.unsteadiness):
+            lines.append(_line(_pair("latency_sd_ms", _digits(scatter * MS)), "by its rows and steps"))
         if guess.scale < 0.0:
             lines.append(_line(_pair("scale", -1.0), "it moves against the commands, as a distance may"))
         if guess.bias:

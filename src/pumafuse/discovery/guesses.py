@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -67,8 +67,7 @@ class Pair(NamedTuple):
 class SensorGuess:
     """A sensor: noise and biases by axis [m or rad], latency [s] and where it is from, scale, gate (0: none needed).
 
-    ``latency_sd``: how far the latency of a row is from that [s]. ``turns``: whether it measures angles within a turn.
-    ``doubts``: what one latency does not say, in sentences. ``pair``: what all that is from.
+    ``turns``: whether it measures angles within a turn. ``pair``: what the latency is from, and what that leaves open.
     """
 
     sd: Mapping[str, float]
@@ -78,9 +77,7 @@ class SensorGuess:
     scale: float
     gate: float
     turns: bool
-    latency_sd: float = 0.0
-    doubts: Sequence[str] = ()
-    pair: Pair | None = None
+    pair: Pair | None
 
 
 def guess(survey: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
@@ -95,16 +92,14 @@ def guess(survey: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
         if abs(relation.correlation) >= FOLLOWS and name not in survey.own_frames
     }
     first, latencies, pairs = _against_each_other(survey.run, relations)
-    leads = {
-        axis: {name: relations[name, axis] for name in run.sensors if (name, axis) in relations} for axis in run.axes
-    }
+    leads: dict[str, dict[str, Following]] = {axis: {} for axis in run.axes}
+    late: dict[str, list[float]] = {}
+    for (name, axis), relation in relations.items():
+        if name in run.sensors:
+            leads[axis][name] = relation
+            late.setdefault(axis, []).append(relation.lag - latencies.get(name, 0.0))
     # Behind the path through the commanded points a held command is late by half a period itself.
-    lags = {
-        axis: float(np.median([relation.lag - latencies.get(name, 0.0) for name, relation in followers.items()]))
-        - 0.5 * period
-        for axis, followers in leads.items()
-        if followers
-    }
+    lags = {axis: float(np.median(lags)) - 0.5 * period for axis, lags in late.items()}
     speeds = [own_frame.speeds.lag - 0.5 * period for own_frame in survey.own_frames.values()]
     unknown = max(float(np.median(speeds)), 0.0) if speeds else _UNKNOWN_LAG
     shortest = max(min(lags.values(), default=unknown), 0.0)
@@ -126,14 +121,11 @@ def _against_each_other(
     base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
     others = [name for name in lags if name != base]
     pairs = {name: Pair(base, alignment) for name in others if (alignment := aligned([run], base, name)) is not None}
-    every = {name: pair.alignment for name, pair in pairs.items()}
-    # One that seems earlier than the densest one, but not surely, would make the time of all wrong by that.
-    early = {
-        name: alignment.latency
-        for name, alignment in every.items()
-        if not -_SURELY * alignment.half < alignment.latency < 0.0
-    }
-    later = {base: 0.0, **early}
+    later = {base: 0.0}
+    for name, (_, alignment) in pairs.items():
+        # One that seems earlier than the densest one, but not surely, would make the time of all wrong by that.
+        if not -_SURELY * alignment.half < alignment.latency < 0.0:
+            later[name] = alignment.latency
     first = base if base == REFERENCE else min(later, key=later.__getitem__)
     ahead = float(np.median(lags[first]))
     ahead = ahead if ahead < -AHEAD else 0.0
@@ -170,20 +162,14 @@ def _sensor(
     leads: Mapping[str, Mapping[str, Following]],
     pair: Pair | None,
 ) -> SensorGuess:
-    noises = {} if pair is None else pair.alignment.sd
-    relations = {axis: survey.relations.get((name, axis)) for axis in survey.run.sensors[name].values}
-    by_axis = {axis: relation for axis, relation in relations.items() if relation is not None}
-    mirrored = [relation.slope < 0.0 for relation in by_axis.values() if abs(relation.correlation) >= FOLLOWS]
+    noises, relations = {} if pair is None else pair.alignment.sd, survey.of_source(name)
+    mirrored = [relation.slope < 0.0 for relation in relations.values() if abs(relation.correlation) >= FOLLOWS]
     scale = -1.0 if sum(mirrored) > len(mirrored) / 2 else 1.0
-    bias = {
-        axis: size for axis, relation in by_axis.items() if (size := _bias(survey, axis, relation, scale, leads[axis]))
-    }
-    sd = dict.fromkeys(relations, _UNKNOWN_SD)
-    for (
-        axis,
-        relation,
-    ) in by_axis.items():  # the least of three: how far a slow sensor moves from row to row is none of it
-        alone = noise(survey.run.command, survey.run.sensors[name], axis, relation.lag)
+    biases = {axis: _bias(survey, axis, relation, scale, leads[axis]) for axis, relation in relations.items()}
+    source = survey.run.sensors[name]
+    sd = dict.fromkeys(source.values, _UNKNOWN_SD)
+    for axis, relation in relations.items():  # how far a slow sensor moves from row to row is none of its noise
+        alone = noise(survey.run.command, source, axis, relation.lag)
         sd[axis] = max(min(relation.scatter, alone, noises.get(axis, math.inf)), relation.resolution, _SMALLEST_SD)
     words = "DECIDE: how old a measurement is when it is stamped"
     if first == REFERENCE and name in latencies:
@@ -191,15 +177,9 @@ def _sensor(
     elif first and name != first and name in latencies:
         words = f"so much later than {first}; add how old a measurement of that one is"
     turns = survey.roles is not None and any(sensor.turns for sensor in survey.roles.sensors if sensor.name == name)
-    source = survey.run.sensors[name]
-    gates = [_gate(*source.series(axis)) for axis in source.values]
-    gate = min((gate for gate in gates if gate), default=0.0)
-    by_axis = SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns)
-    if pair is None:
-        return by_axis
-    beside = pair.alignment
-    doubts = list(beside.doubts(name, pair.other))
-    return replace(by_axis, latency_sd=beside.unsteadiness, doubts=doubts, pair=pair)
+    gate = min(filter(None, (_gate(*source.series(axis)) for axis in source.values)), default=0.0)
+    bias = {axis: size for axis, size in biases.items() if size}
+    return SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns, pair)
 
 
 def _start(survey: Survey, axis: str, name: str, following: Following, misfit: float, travel: float) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -61,30 +60,19 @@ class Shrunk:
     freedom: float
 
 
-class Products(NamedTuple):
-    """Products of columns without means, (k, k), of these with what they are to explain, (k,), and its square."""
+def shrunk(square: FloatArray, score: FloatArray, total: float, rows: int, penalty: float | None = None) -> Shrunk:
+    """Least squares with a ridge; None: that with the least generalised cross-validation error.
 
-    square: FloatArray
-    score: FloatArray
-    power: float
-    rows: int
-
-    @classmethod
-    def of(cls, X: FloatArray, z: FloatArray) -> Products:
-        """Those of a design, (n, k), and what it is to explain, (n,)."""
-        return cls(X.T @ X, X.T @ z, float(z @ z), len(z))
-
-
-def shrunk(products: Products, penalty: float | None = None) -> Shrunk:
-    """Least squares with a ridge; None: that with the least generalised cross-validation error."""
-    power, V = np.linalg.eigh(products.square)
+    By products of columns without means, (k, k), of these with what they are to explain, (k,), and its square.
+    """
+    power, V = np.linalg.eigh(square)
     power = np.maximum(power, 0.0)
-    b = V.T @ products.score
+    b = V.T @ score
     ridges = _RIDGES * math.sqrt(max(float(power[-1]), 1e-300)) if penalty is None else np.array([penalty])
     share = 1.0 / (power + ridges[:, None] ** 2)
     freedom = (power * share).sum(axis=1)
-    left = products.power - (b**2 * (2.0 * share - power * share**2)).sum(axis=1)
-    best = int(np.argmin(left / np.maximum(products.rows - 2.0 - freedom, 1.0) ** 2))
+    left = total - (b**2 * (2.0 * share - power * share**2)).sum(axis=1)
+    best = int(np.argmin(left / np.maximum(rows - 2.0 - freedom, 1.0) ** 2))
     return Shrunk(V @ (share[best] * b), float(ridges[best]), float(freedom[best]))
 
 
@@ -163,7 +151,8 @@ def _explained(
     """Responses, their coefficients, and what they leave of a sensor, (n,)."""
     basis = _responses(*command, knots)
     X = basis(s)
-    ridge = shrunk(Products.of(X - X.mean(axis=0), z - z.mean()))
+    centred, told = X - X.mean(axis=0), z - z.mean()
+    ridge = shrunk(centred.T @ centred, centred.T @ told, float(told @ told), len(told))
     return basis, ridge, z - X @ ridge.coefficients
 
 

@@ -45,17 +45,14 @@ def decisions(survey: Survey) -> Iterator[tuple[str, str, str]]:
         moved = [stream.name for stream in streams if "follow" in stream.why]
         yield "who is who", f"{roles.command.part.label} is commanded, {who}", _sure(moved, "by how they move")
     for name in survey.run.sensors:
-        by_axis = {axis: relation for (source, axis), relation in survey.relations.items() if source == name}
+        by_axis = survey.of_source(name)
         if by_axis:
-            lag, gain = (
-                float(np.median([getattr(relation, key) for relation in by_axis.values()])) for key in ("lag", "slope")
-            )
+            lags = [relation.lag for relation in by_axis.values()]
+            gain = float(np.median([relation.slope for relation in by_axis.values()]))
             least = min(abs(relation.correlation) for relation in by_axis.values())
             moves_as_far = all(_moves_as_far(survey.run, name, axis, relation) for axis, relation in by_axis.items())
-            as_it_should = (
-                least >= SAME and moves_as_far and all(0.0 <= relation.lag <= MOST_LAG for relation in by_axis.values())
-            )
-            told = f"{lag * MS:.0f} ms late, gain {gain:.3g}, correlation {least:.3f}"
+            as_it_should = least >= SAME and moves_as_far and min(lags) >= 0.0 and max(lags) <= MOST_LAG
+            told = f"{np.median(lags) * MS:.0f} ms late, gain {gain:.3g}, correlation {least:.3f}"
             yield f"{name} follows", told, "sure" if as_it_should else "a question"
 
 
@@ -78,7 +75,7 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
     follow = any(abs(relation.correlation) >= SAME for relation in survey.relations.values())
     later = list[str]()
     for name, source in run.sensors.items():
-        by_axis = {axis: survey.relations[name, axis] for axis in source.values if (name, axis) in survey.relations}
+        by_axis = survey.of_source(name)
         if not by_axis:
             why = another_clock(source, run.command)
             yield f"{name}: {why or 'too few measurements, or no motion, while there are commands'}"
@@ -105,8 +102,9 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
                     "is its unit right" if not 1.0 / _OTHER_UNIT < size < _OTHER_UNIT else "is that its gear, or a unit"
                 )
                 later.append(f"{name} moves {size:.3g} times as far as commanded on {axis}: {unit}?")
-    for guess in sensors.values():
-        yield from guess.doubts
+    for name, guess in sensors.items():
+        if guess.pair:
+            yield from guess.pair.alignment.doubts(name, guess.pair.other)
     if roles is not None:
         guessed = {printable(stream.part.label): stream for stream in streams if stream.guessed}
         units = sorted({signal.unit for stream in guessed.values() for some in stream.axes.values() for signal in some})
@@ -125,14 +123,10 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
         )
 
 
-def _is_one(gain: float) -> bool:
-    """Whether a gain is about 1, whatever its sign."""
-    return 1.0 / ABOUT_ONE < abs(gain) < ABOUT_ONE
-
-
 def _moves_as_far(run: Run, name: str, axis: str, following: Following) -> bool:
     """Whether a sensor moves about as far as it is told to, whatever its sign."""
-    return _is_one(following.slope) or _is_one(_reach(run.measured[name], axis) / _reach(run.command, axis))
+    gains = abs(following.slope), _reach(run.measured[name], axis) / _reach(run.command, axis)
+    return any(1.0 / ABOUT_ONE < gain < ABOUT_ONE for gain in gains)
 
 
 def _reach(source: Source, axis: str) -> float:

@@ -157,36 +157,14 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         named[name] = replace(apart_stream, name=name)
     streams = _looked_at(list(named.values()))
     if (chosen := _command(streams)) is None:
-        what = "; ".join(
-            f"{printable(stream.part.label)}: {', '.join(list(stream.axes)[:_MOST_LISTED])}" for stream in streams
-        )
-        still = [
-            f"{column}, {why}"
-            for part in parts
-            for column, why in part.left_out.items()
-            if why.startswith(RESTS) and "command" in (names.column_role(column), names.role_of(part.stem))
-        ]
-        called = "None is called command, goal, target, desired, setpoint or action"
-        called = f"What is called so never moves: {printable('; '.join(still[:3]), _LONGEST)}" if still else called
-        advice = f"{no_commands(parts)}say it in run.toml"
-        beside = "".join(
-            f"; {reason}" for reason in unused(part for part in parts if part.clock is None)[:_MOST_LISTED]
-        )
-        why = f"{called}, and none runs ahead of others ({what}{beside}); {advice}"
-        raise UndecidedError(log, f"which numbers are the commands? {why}", parts)
+        raise UndecidedError(log, f"which numbers are the commands? {_none_leads(parts, streams)}", parts)
     command, why = chosen
     resting = {names.axis_of(column, []) for column, what in command.part.left_out.items() if what.startswith(RESTS)}
-    left_out: list[tuple[Stream, str]] = []
-    kept: list[Stream] = []
-    for stream in streams:
-        if stream is command:
-            continue
-        if stream.role == "command":
-            other = f"other commands than {printable(command.name)}: exchange the two in run.toml to use these"
-            left_out.append((stream, other))
-            continue
-        if stream.role is None and stream.why:
-            left_out.append((stream, stream.why))
+    left_out, kept = list[tuple[Stream, str]](), list[Stream]()
+    for stream in (stream for stream in streams if stream is not command):
+        if stream.role == "command" or (stream.role is None and stream.why):
+            others = f"other commands than {printable(command.name)}: exchange the two in run.toml to use these"
+            left_out.append((stream, others if stream.role else stream.why))
             continue
         stream = _on_one_clock(command, stream)
         axes, why_not = _matched(command, stream)
@@ -197,10 +175,8 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         if stream.role is None and axes:
             late, otherwise = _follows(command, matched)
             matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
-            why_not = (
-                f"neither its name nor its motion says what it is: {otherwise}; if it measures their axes, say so in"
-                " run.toml"
-            )
+            says = f"neither its name nor its motion says what it is: {otherwise}"
+            why_not = f"{says}; if it measures their axes, say so in run.toml"
         if axes and matched.role:
             kept.append(matched)
             used = {id(some) for some in axes.values()}
@@ -221,11 +197,25 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     sensors += [replace(stream, role="sensor", why=f"{stream.why}, but nothing else measures") for stream in alone]
     references = [] if alone else references
     reports = [sensor for sensor in sensors if "reported" in sensor.name.split("_") and len(sensors) > 1]
-    left_out += [
-        (report, "what the controller itself reports: no measurement of where the tool is") for report in reports
-    ]
+    no_measurement = "what the controller itself reports: no measurement of where the tool is"
+    left_out += [(report, no_measurement) for report in reports]
     sensors = [sensor for sensor in sensors if sensor not in reports]
     return _with_units(Roles(command, sensors, references[0] if references else None, left_out))
+
+
+def _none_leads(parts: Sequence[Part], streams: Sequence[Stream]) -> str:
+    """Why none of the streams is the commands, and what to do."""
+    what = [f"{printable(stream.part.label)}: {', '.join(list(stream.axes)[:_MOST_LISTED])}" for stream in streams]
+    still = [
+        f"{column}, {why}"
+        for part in parts
+        for column, why in part.left_out.items()
+        if why.startswith(RESTS) and "command" in (names.column_role(column), names.role_of(part.stem))
+    ]
+    called = "None is called command, goal, target, desired, setpoint or action"
+    called = f"What is called so never moves: {printable('; '.join(still[:3]), _LONGEST)}" if still else called
+    listed = "; ".join([*what, *unused(part for part in parts if part.clock is None)[:_MOST_LISTED]])
+    return f"{called}, and none runs ahead of others ({listed}); {no_commands(parts)}say it in run.toml"
 
 
 def _raw(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
@@ -377,22 +367,16 @@ def streams_of(part: Part) -> list[Stream]:
     told = {signal.axis for some in groups.values() for signal in some if names.column_role(signal.name) == "command"}
     of_file, of_columns = names.role_of(part.stem), {names.column_role(group[0].name) for group in groups.values()}
     of_file = None if len(groups) > 1 and of_file in of_columns else of_file  # then it is what these columns are
-    streams = list[Stream]()
-    by_type = "command" if part.type.endswith("JointTrajectory") or part.clock.time.column == PATH_TIME else None
-    by_type = "sensor" if part.type.endswith("JointState") else by_type
+    streams, clock = list[Stream](), part.clock.time.column
+    of_type: Role | None = "command" if part.type.endswith("JointTrajectory") or clock == PATH_TIME else None
+    of_type = "sensor" if part.type.endswith("JointState") else of_type
+    by_file, by_type = (of_file, f"it is called '{printable(part.stem)}'"), (of_type, f"its messages are {part.type}")
+    by_clock = (names.column_role(clock), f"its clock is called '{printable(clock)}'")
     for (key, listed, copy, desired), signals in groups.items():
         wanted = ("command" if desired else None, f"'{signals[0].column}' is of desired values, by its name")
         by_column = (names.column_role(signals[0].name), f"its columns are called '{key.replace('_', ' ')}'")
-        file = (of_file, f"it is called '{printable(part.stem)}'")
-        clock = (
-            names.column_role(part.clock.time.column),
-            f"its clock is called '{printable(part.clock.time.column)}'",
-        )
-        typed, order = (
-            (by_type, f"its messages are {part.type}"),
-            (by_column, file) if len(groups) > 1 else (file, by_column),
-        )
-        role, why = next((choice for choice in (wanted, *order, clock, typed) if choice[0]), (None, ""))
+        order = (by_column, by_file) if len(groups) > 1 else (by_file, by_column)
+        role, why = next((choice for choice in (wanted, *order, by_clock, by_type) if choice[0]), (None, ""))
         name = key if roles[key] == 1 else names.plain(f"{listed or key or part.stem}{copy}")
         # What has no word of its own beside commands is not called after the file: another of its kind fits then.
         beside_commands = roles.keys() > {""} and "command" in of_columns
@@ -418,16 +402,11 @@ def _seen_twice(key: _Group, signals: Sequence[Signal]) -> Iterator[tuple[_Group
         silent = [word for word in names.words(leaf(signal.column)) if word not in names.words(signal.axis)]
         by_words.setdefault(tuple(silent), []).append(signal)
     first = max(by_words.values(), key=len)
-    axes = {signal.axis for signal in first}
-    apart = {
-        words: some
-        for words, some in by_words.items()
-        if some is not first
-        and words
-        and len(some) > 1
-        and {signal.axis for signal in some} <= axes
-        and names.PARTS.isdisjoint(words)
-    }
+    axes, apart = {signal.axis for signal in first}, dict[tuple[str, ...], list[Signal]]()
+    for words, some in by_words.items():
+        is_again = some is not first and len(some) > 1 and axes.issuperset(signal.axis for signal in some)
+        if is_again and words and names.PARTS.isdisjoint(words):
+            apart[words] = some
     taken = {id(signal) for some in apart.values() for signal in some}
     yield key, [signal for signal in signals if id(signal) not in taken]
     for words, some in apart.items():
@@ -470,11 +449,13 @@ def _apart(stream: Stream) -> list[Stream]:
     def of(word: str, rests: Iterable[tuple[str, ...]]) -> Stream:
         axes = {names.axis_of("_".join(words_left), []): stream.axes[by_word[word][words_left]] for words_left in rests}
         others = frozenset(other for other in by_word if not _AXIS_WORD.fullmatch(other))
-        for attitude in stream.part.attitudes:  # with the word in its names; without one, with none of the others
+
+        def has_word(attitude: Attitude) -> bool:  # in its names; without a word, none of the others
             inside = names.words(attitude.columns.columns[0])
-            if word in inside if word else others.isdisjoint(inside):
-                return Stream(names.plain(word) or stream.name, None, "", stream.part, axes, attitude)
-        return Stream(names.plain(word) or stream.name, None, "", stream.part, axes)
+            return word in inside if word else others.isdisjoint(inside)
+
+        attitude = next(filter(has_word, stream.part.attitudes), None)
+        return Stream(names.plain(word) or stream.name, None, "", stream.part, axes, attitude)
 
     ways = list[list[Stream]]()
     for word, axes_of_word in by_word.items():
@@ -521,21 +502,16 @@ def _led(stream: Stream) -> list[Stream]:
     if not pairs or (positions and positions.isdisjoint(paired)):
         return [stream]
     beside = {other for leader in pairs for other in leads[leader]} - paired
-    told, seen = (
-        {leader: stream.axes[leader] for leader in pairs},
-        {leader: stream.axes[other] for leader, other in pairs.items()},
+    told = {leader: stream.axes[leader] for leader in pairs}
+    seen = {leader: stream.axes[other] for leader, other in pairs.items()}
+    again = {axis: stream.axes[axis] for axis in columns if axis in beside}
+    others = {axis: some for axis, some in stream.axes.items() if axis not in paired | beside}
+    every = (
+        Stream("commanded", "command", "others follow it as far, later or noisier", stream.part, told),
+        *(Stream("measured", None, "", stream.part, axes) for axes in (seen, again)),
+        Stream("others", None, "they follow nothing as far, at the same level", stream.part, others),
     )
-    command = Stream("commanded", "command", "others follow it as far, later or noisier", stream.part, told)
-    others = (
-        ("measured", "", seen),
-        ("measured", "", {axis: stream.axes[axis] for axis in columns if axis in beside}),
-        (
-            "others",
-            "they follow nothing as far, at the same level",
-            {axis: some for axis, some in stream.axes.items() if axis not in paired | beside},
-        ),
-    )
-    return [command, *(Stream(name, None, why, stream.part, axes) for name, why, axes in others if axes)]
+    return [of_log for of_log in every if of_log.axes]
 
 
 def _stands_beside(told: FloatArray, seen: FloatArray) -> bool:
@@ -630,10 +606,8 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     relations = _relations(command, stream)
     alike = [relation for relation in relations if relation.correlation >= SAME]
     behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
-    gains, fewest = (
-        [relation.slope for relation in behind],
-        0.0 if _is_namesake(command, stream) else len(relations) / 2,
-    )
+    gains, fewest = [relation.slope for relation in behind], len(relations) / 2
+    fewest = 0.0 if _is_namesake(command, stream) else fewest
     if len(behind) > fewest and max(gains) < _GAINS * min(gains):
         return f"{float(np.median([relation.lag for relation in behind])) * 1e3:.0f} ms late", ""
     speeds = speeds_follow(command.source, stream.source)
@@ -700,16 +674,11 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     named = {(name, axis) for name, axis in product(others, free) if _ends(name, told[axis])}  # as p_RS_R_x is x
     # Of joints names tell enough; coordinates may be another frame's.
     few = few and not (_OF_POSE.isdisjoint(told.values()) and {axis for _, axis in named} == {*free})
-    alike = [
-        (name, axis)
-        for name, axis in product(others, free)
-        if (few or (name, axis) in named) and _same_kind(command, axis, stream, name)
-    ]
-    follows = {
-        pair: relation.correlation
-        for pair in alike
-        if (relation := _relation(command, pair[1], stream, pair[0])) is not None
-    }
+    follows = dict[tuple[str, str], float]()
+    for name, axis in product(others, free):
+        may_be = (few or (name, axis) in named) and _same_kind(command, axis, stream, name)
+        if may_be and (relation := _relation(command, axis, stream, name)) is not None:
+            follows[name, axis] = relation.correlation
     if not fits and (point := _turned_point(command, stream, follows)):
         return point, ""
     pairs = {pair: abs(correlation) for pair, correlation in follows.items()}
@@ -742,11 +711,9 @@ def _turned_point(
     orders = (zip(order, CARTESIAN, strict=True) for order in permutations(moving))
     if any(all(follows.get(pair, 0.0) >= SAME for pair in order) for order in orders):
         return {}
-    values = {axis: stream.source.values[name] for axis, name in zip(CARTESIAN, moving, strict=True)}
-    speeds = speeds_follow(command.source, replace(stream.source, values=values))
-    if speeds is None or speeds.correlation < SAME:
-        return {}
-    return {axis: stream.axes[name] for axis, name in zip(CARTESIAN, moving, strict=True)}
+    point = {axis: stream.axes[name] for axis, name in zip(CARTESIAN, moving, strict=True)}
+    speeds = speeds_follow(command.source, replace(stream, axes=point).source)
+    return {} if speeds is None or speeds.correlation < SAME else point
 
 
 def _ends(axis: str, words: str) -> bool:
@@ -773,10 +740,9 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
     command, *others = streams
     called = {axis: other.axes[axis][0].axis for other in reversed(others) for axis in other.axes}
     free = {axis: name for axis, name in called.items() if _NUMBERED.fullmatch(axis) and name not in command.axes}
-    if len(set(free.values())) < len(free):
-        return list(streams)
+    free = {} if len(set(free.values())) < len(free) else free
     return [
-        replace(stream, axes={free.get(axis, axis): stream.axes[axis] for axis in stream.axes}) for stream in streams
+        replace(stream, axes={free.get(axis, axis): some for axis, some in stream.axes.items()}) for stream in streams
     ]
 
 
@@ -790,9 +756,8 @@ def _with_units(roles: Roles) -> Roles:
     if not sure:
         command = _ranged(command, {axis for other in others for axis in other.axes})
     sensors = [_fitted(sensor, command) for sensor in roles.sensors]
-    return replace(
-        roles, command=command, sensors=sensors, reference=None if reference is None else _fitted(reference, command)
-    )
+    reference = None if reference is None else _fitted(reference, command)
+    return replace(roles, command=command, sensors=sensors, reference=reference)
 
 
 def _angles_by_name(roles: Roles) -> Stream:

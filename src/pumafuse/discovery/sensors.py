@@ -25,7 +25,6 @@ from .paths import (
     ASIDE,
     Basis,
     Path,
-    Products,
     Residue,
     Shrunk,
     clipped_rms,
@@ -303,13 +302,10 @@ def _linear(axis: _Axis, noise: _Noise, latency: float, fitted: bool) -> _Linear
     y1, y2 = axis.z1 - left1, axis.z2 - noise.scale * left2
     y1, y2 = y1 - y1.mean(), y2 - y2.mean()
     weight1, weight2 = 1.0 / noise.sd1**2, noise.scale / noise.sd2**2
-    products = Products(
-        weight1 * basis.square + weight2 * noise.scale * two.square,
-        weight1 * (y1 @ basis.responses) + weight2 * (y2 @ two.responses),
-        weight1 * float(y1 @ y1) + float(y2 @ y2) / noise.sd2**2,
-        n1 + n2,
-    )
-    ridge = shrunk(products, None if fitted else noise.penalty)
+    square = weight1 * basis.square + weight2 * noise.scale * two.square
+    score = weight1 * (y1 @ basis.responses) + weight2 * (y2 @ two.responses)
+    total = weight1 * float(y1 @ y1) + float(y2 @ y2) / noise.sd2**2
+    ridge = shrunk(square, score, total, n1 + n2, None if fitted else noise.penalty)
     coefficients, k = ridge.coefficients, len(ridge.coefficients)
     moved1, moved2 = basis.responses @ coefficients, two.responses @ coefficients
     rest1, rest2 = y1 - moved1, y2 - noise.scale * moved2

@@ -16,7 +16,7 @@ import numpy as np
 from ..logs.axes import in_axes
 from ..logs.clock import without_strays
 from ..logs.manifest import refuse_twice
-from ..logs.run import REFERENCE, Run, Source
+from ..logs.run import REFERENCE, Run
 from ..space.rotations import TURNING
 from ..units import MS
 from .contents import Part, parts_of, period_of, unused
@@ -61,6 +61,10 @@ class Survey:
         """The log's name without the endings of files."""
         return name_of(self.log)
 
+    def of_source(self, name: str) -> dict[str, Following]:
+        """How a source follows the commands, by axis."""
+        return {axis: relation for (source, axis), relation in self.relations.items() if source == name}
+
 
 def name_of(log: Path) -> str:
     """A log's name without the endings of files."""
@@ -88,18 +92,14 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     framed = own_frames(run)
     run = _along_axes(run, framed)
     related = relations(run)
-    lags, least = (
-        [relation.lag for relation in related.values() if abs(relation.correlation) >= _SURELY],
-        least_lag(run),
-    )
-    surely = _SURELY if max(lags, default=0.0) < least else math.inf
+    lags, least = [relation.lag for relation in related.values() if _is_sure(relation)], least_lag(run)
+    all_ahead = max(lags, default=0.0) < least
     bad = dict[tuple[str, str], str]()
     for key, relation in related.items() if lags else ():
+        follows = f"correlation {relation.correlation:+.2f}"
         if abs(relation.correlation) < FOLLOWS:
-            bad[key] = (
-                f"it does not follow the commands (correlation {relation.correlation:+.2f}): are columns exchanged?"
-            )
-        elif relation.lag < least and abs(relation.correlation) < surely:
+            bad[key] = f"it does not follow the commands ({follows}): are columns exchanged?"
+        elif relation.lag < least and not (all_ahead and _is_sure(relation)):
             bad[key] = _ahead(relation)
     bad |= {(name, axis): why for name, why in _without_lag(related).items() for axis in (*run.axes, *TURNING)}
     roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
@@ -129,15 +129,11 @@ def _followed(run: Run, related: _Relations) -> tuple[Run, _Relations]:
         correlation = np.array([related[name, axis].correlation for axis in turning])
         if turning and float(power @ correlation) >= TURNS * float(power.sum()):
             turned.add(name)
-    every = {name: source if name in turned else _without_turning(source) for name, source in run.measured.items()}
+    every = {name: source if name in turned else source.without(TURNING) for name, source in run.measured.items()}
     run = replace(run, sensors={name: every[name] for name in run.sensors}, reference=every.get(REFERENCE))
     if run.sensors and turned.isdisjoint(run.sensors):
-        run = replace(run.each(lambda _, source: _without_turning(source)), tool=None)
+        run = replace(run.each(lambda _, source: source.without(TURNING)), tool=None)
     return run, {(name, axis): relation for (name, axis), relation in related.items() if axis in every[name].values}
-
-
-def _without_turning(source: Source) -> Source:
-    return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
 def _without_lag(related: _Relations) -> dict[str, str]:
@@ -163,20 +159,18 @@ def least_lag(run: Run) -> float:
 def early(survey: Survey, name: str) -> dict[str, float]:
     """By how much a source moves before its commands [s], for each of its axes that surely does."""
     least = least_lag(survey.run)
-    by_axis = {axis: relation for (source, axis), relation in survey.relations.items() if source == name}
-    return {axis: -relation.lag for axis, relation in by_axis.items() if _is_sure(relation) and relation.lag < least}
+    sure = {axis: relation for axis, relation in survey.of_source(name).items() if _is_sure(relation)}
+    return {axis: -relation.lag for axis, relation in sure.items() if relation.lag < least}
 
 
 def _without_early(survey: Survey) -> Survey:
     """Without the axes of a sensor that move before their commands, where it surely follows those of others."""
     run, unused = survey.run, dict[tuple[str, str], str]()
     for name, source in run.sensors.items():
-        ahead = early(survey, name)
-        sure = [axis for (source, axis), relation in survey.relations.items() if source == name and _is_sure(relation)]
-        if ahead and len(ahead) < len(sure):
-            values = {axis: value for axis, value in source.values.items() if axis not in ahead}
-            run = replace(run, sensors={**run.sensors, name: replace(source, values=values)})
-            unused |= {(name, axis): _ahead(survey.relations[name, axis]) for axis in ahead}
+        ahead, by_axis = early(survey, name), survey.of_source(name)
+        if ahead and len(ahead) < sum(map(_is_sure, by_axis.values())):
+            run = replace(run, sensors={**run.sensors, name: source.without(ahead)})
+            unused |= {(name, axis): _ahead(by_axis[axis]) for axis in ahead}
     related = {key: relation for key, relation in survey.relations.items() if key not in unused}
     return replace(survey, run=run, relations=related, unused=unused)
 

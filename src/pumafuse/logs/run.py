@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
@@ -135,9 +135,12 @@ class Source:
         """The source with joints as its axes, in the place of the pose to which they move the tool."""
         if self.joints is None:
             return self
-        values = {axis: value for axis, value in self.values.items() if axis not in CARTESIAN}
-        values |= dict(zip(self.joints.chain.joints, self.joints.values.T.copy(), strict=True))
-        return replace(self, values=values, orientation=None, joints=None)
+        told = dict(zip(self.joints.chain.joints, self.joints.values.T.copy(), strict=True))
+        return replace(self, values={**self.without(CARTESIAN).values, **told}, orientation=None, joints=None)
+
+    def without(self, axes: Container[str]) -> Source:
+        """The source without some axes."""
+        return replace(self, values={axis: value for axis, value in self.values.items() if axis not in axes})
 
     def ordered(self, axis: str) -> IntArray:
         """The rows that have a stamp and a value of an axis, by stamp, (n,)."""
@@ -203,10 +206,9 @@ class Source:
             some = [replace(source, values={axis: source.values[axis]}, apart=False) for axis, source in alone.items()]
             every = [source.interpolated(step) for source in some]
             stamp = np.concatenate([source.stamp for source in every])
-            values = {
-                axis: np.concatenate([source.values.get(axis, np.full(len(source.stamp), np.nan)) for source in every])
-                for axis in self.values
-            }
+            number = np.repeat(np.arange(len(every)), [len(source.stamp) for source in every])
+            value = np.concatenate([value for source in every for value in source.values.values()])
+            values = {axis: np.where(number == of_axis, value, np.nan) for of_axis, axis in enumerate(self.values)}
             whole = replace(every[0], stamp=stamp, values=values)
             return whole.rows(np.argsort(stamp, kind="stable")).pivoted()
         gap = np.diff(self.stamp.astype(np.float64))  # far and negative where a row has no stamp
@@ -546,9 +548,8 @@ def _from_arrays(label: str, arrays: Any, notes: list[str]) -> Source:
         ) from None
     for axis, column in columns.items():
         if stamp.ndim != 1 or column.shape != stamp.shape:
-            raise RunError(
-                f"{label}: {axis} has shape {column.shape}, its stamps {stamp.shape}; one value a stamp is needed"
-            )
+            shapes = f"has shape {column.shape}, its stamps {stamp.shape}"
+            raise RunError(f"{label}: {axis} {shapes}; one value a stamp is needed")
     if turned is not None and turned.shape != (*stamp.shape, 4):
         raise RunError(f"{label}: orientation has shape {turned.shape}; a quaternion x, y, z, w a stamp is needed")
     if (not columns and turned is None) or not len(stamp):
