@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
-from ..logs.clock import missing_commands, other_interval, two_senders
+from ..logs.clock import interval_fault, missing_commands
 from ..logs.frames import Cylindrical, Frame
 from ..logs.run import Source
 from ..model.arm import ArmModel, Validity
@@ -115,11 +115,9 @@ class CommandWatch:
         if len(recent) == _FIRST and not self._knows_interval:
             self._knows_interval = True
             stamps = np.sort(np.array([stamp for stamp, _ in recent]))
-            if (senders := two_senders(stamps, self._arm.update_period)) is not None:
-                self._senders = True
-                self._log.write("interval of commands", senders)
-            elif (other := other_interval(stamps, self._arm.update_period)) is not None:
-                sentence, kind = other
+            if (fault := interval_fault(stamps, self._arm.update_period)) is not None:
+                sentence, kind = fault
+                self._senders = kind == "senders"
                 where = " A stream has t in s, or t_ns in ns" if kind == "unit" else ""
                 self._log.write("interval of commands", sentence + where)
         if len(recent) >= _MANY:

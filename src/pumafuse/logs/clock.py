@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -151,10 +151,8 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
     if not cuts:
         return [run], []
     if run.interval:
-        raise RunError(
-            f"{run.command.label}: the clock is set back in row {cuts[0] + 1}, so that '{run.interval}' is of two"
-            " times; cut the log there first"
-        )
+        back = f"the clock is set back in row {cuts[0] + 1}, so that '{run.interval}' is of two times"
+        raise RunError(f"{run.command.label}: {back}; cut the log there first")
 
     def pieces(source: Source) -> list[Source]:
         jumps = _jumps(source)
@@ -168,32 +166,26 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
     measured = {name: pieces(source) for name, source in run.measured.items()}
     parts = list[Run]()
     for index, command in enumerate(pieces(run.command)):
-        times = {name: parts[index] for name, parts in measured.items()}
-        reference = None if run.reference is None else times.pop(REFERENCE)
-        begin: dict[str, Any] = {} if index == 0 else {"start": {}, "notes": ()}
-        parts.append(replace(run, command=command, sensors=times, reference=reference, **begin))
-    lag, label = behind(run.command.stamp) / 1e9, run.command.label
-    notes = [
-        f"{label}: the clock is set back by {lag[row]:.3f} s in row {row + 1}: new segment, filter restarted"
-        for row in cuts
-    ]
+        sensors = {name: parts[index] for name, parts in measured.items()}
+        reference = None if run.reference is None else sensors.pop(REFERENCE)
+        part = run if index == 0 else replace(run, start={}, notes=())
+        parts.append(replace(part, command=command, sensors=sensors, reference=reference))
+    lag, what = behind(run.command.stamp) / 1e9, f"{run.command.label}: the clock is set back by"
+    notes = [f"{what} {lag[row]:.3f} s in row {row + 1}: new segment, filter restarted" for row in cuts]
     return parts, notes
 
 
 def _jumps(source: Source) -> list[int]:
     """Rows at which the clock was set back by more than 1 s."""
-    jumps: list[int] = []
-    while True:
-        first = jumps[-1] if jumps else 0
-        back = np.flatnonzero(behind(source.stamp[first:]) > TOLERATED_STEP_BACK_NS)
-        if not len(back):
-            return jumps
-        jumps.append(first + int(back[0]))
+    jumps, first = list[int](), 0
+    while len(back := np.flatnonzero(behind(source.stamp[first:]) > TOLERATED_STEP_BACK_NS)):
+        jumps.append(first := first + int(back[0]))
         if len(jumps) > _MOST_JUMPS:
             raise RunError(
                 f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock,"
                 " or many runs in one table (run.toml chooses one by 'where')"
             )
+    return jumps
 
 
 def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
@@ -201,15 +193,12 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
     clock_faults, label, stamp = list[str](), run.command.label, run.command.stamp
     command = np.sort(stamp[stamp != NO_STAMP], kind="stable")
     first = run.command.series(run.axes[0])[0] if run.command.apart else command
-    if (senders := two_senders(first, period)) is not None:
-        clock_faults.append(f"{label}: {senders}")
-    elif (other := other_interval(first, period)) is not None:
-        sentence, kind = other
-        if kind != "other":
-            advice = _CORRECT if kind == "unit" else "Log every command"
-            raise RunError(f"{label}: {sentence} {advice}, or correct update_period_ms in arm.toml")
-        clock_faults.append(f"{label}: {sentence}")
-    if senders is None and (missing := missing_commands(run.command)) is not None:
+    sentence, kind = interval_fault(first, period) or ("", "other")
+    if kind in ("unit", "lost"):
+        advice = _CORRECT if kind == "unit" else "Log every command"
+        raise RunError(f"{label}: {sentence} {advice}, or correct update_period_ms in arm.toml")
+    clock_faults += [f"{label}: {sentence}"] if sentence else []
+    if kind != "senders" and (missing := missing_commands(run.command)) is not None:
         clock_faults.append(f"{label}: {missing}: the model holds the one before; log every command")
     for name in sensors:
         stamp = run.sensors[name].stamp
@@ -226,17 +215,26 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
     return clock_faults
 
 
-def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit", "lost", "other"]] | None:
-    """Whether the interval of commands by ascending stamps is far from the update period [s]; None where it is not.
+def interval_fault(stamp: TimeArray, period: float) -> tuple[str, Literal["senders", "unit", "lost", "other"]] | None:
+    """What is wrong with the intervals of commands by ascending stamps, beside the update period [s]; None: nothing.
 
-    A sentence that ends in a question, and what it is: stamps in another ``unit``, a steady stream in which most
-    commands are ``lost``, or another interval (who sends only what changes leaves commands out on purpose).
+    A sentence, and what it is: commands of two ``senders`` that lie between each other, stamps in another ``unit``, a
+    steady stream in which most commands are ``lost``, or another interval (who sends only what changes leaves commands
+    out on purpose).
     """
     every = np.diff(stamp[:_MANY])  # rows that share a stamp are there, even if only the last one counts
     intervals = every[every > 0]
     if len(intervals) < _FEW:
         return None
     early, usual, late = _quartiles(intervals)
+    pairs = (intervals[1:] + intervals[:-1]) / 1e9
+    both = median(pairs)
+    near = np.minimum(np.abs(intervals / 1e9 - early), np.abs(intervals / 1e9 - late)) < _EVEN * both
+    alternate = min(np.mean(np.abs(pairs - both) < _EVEN * both), np.mean(near)) >= _ALTERNATE
+    if alternate and late - early >= _EVEN * both and 1.0 / _OTHER_BEAT < both / period < _OTHER_BEAT:
+        each = f"each sends every {both * 1e3:.4g} ms, one {early * 1e3:.4g} ms after the other"
+        asked = "is one of them too many? The model follows whichever came last"
+        return f"commands of two senders: {each}: {asked}", "senders"
     units, even = mistaken(usual / period, TIMES), late - early <= _EVEN * usual
     if units and even:
         times = f"{usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms = {period * 1e3:g}"
@@ -248,25 +246,6 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit"
     times = f"{usual * 1e3:.4g} ms, {usual / period:.3g} times the arm's update_period_ms = {period * 1e3:g}"
     is_lost = even and float(every.mean()) / 1e9 > _MOST_LOST * period
     return f"commands come every {times}: {lost}", "lost" if is_lost else "other"
-
-
-def two_senders(stamp: TimeArray, period: float) -> str | None:
-    """A sentence if commands of two senders lie between each other: each sends every update period [s]."""
-    every = np.diff(stamp[:_MANY])
-    intervals = every[every > 0]  # rows may share a stamp
-    if len(intervals) < _FEW:
-        return None
-    short, _, long = _quartiles(intervals)
-    both = (intervals[1:] + intervals[:-1]) / 1e9
-    usual = median(both)
-    near = np.minimum(np.abs(intervals / 1e9 - short), np.abs(intervals / 1e9 - long)) < _EVEN * usual
-    even = min(np.mean(np.abs(both - usual) < _EVEN * usual), np.mean(near))
-    if even < _ALTERNATE or long - short < _EVEN * usual or not 1.0 / _OTHER_BEAT < usual / period < _OTHER_BEAT:
-        return None
-    return (
-        f"commands of two senders: each sends every {usual * 1e3:.4g} ms, one {short * 1e3:.4g} ms after the other:"
-        " is one of them too many? The model follows whichever came last"
-    )
 
 
 def _quartiles(intervals: IntArray) -> list[float]:
