@@ -30,7 +30,7 @@ def in_axes(run: Run, frame: Frame | None, tool: tuple[float, float, float] | No
     """
     run = _turning(without_strays(run), tool)
     frame = frame if run.frame is None else run.frame
-    named = {name for source in (run.command, *run.sensors.values()) for name in source.values}
+    named = set(run.command.values).union(*(source.values for source in run.sensors.values()))
     if frame is None or named.isdisjoint(CARTESIAN):
         return run, None
     placed = _placed(run, frame)
@@ -61,11 +61,9 @@ def _turning(run: Run, tool: tuple[float, float, float] | None) -> Run:
         if source.orientation is None:
             return source
         vector = rotations.vectors(source.orientation, reference)
-        values = dict(source.values) | dict(zip(TURNING, vector.T.copy(), strict=True))
-        spread = dict(source.spread)
-        if source is not run.command:
-            spread |= dict.fromkeys(TURNING, rotations.spread(vector))
-        return replace(source, values=values, spread=spread, orientation=None)
+        values = {**source.values, **dict(zip(TURNING, vector.T.copy(), strict=True))}
+        of_turning = {} if source is run.command else dict.fromkeys(TURNING, rotations.spread(vector))
+        return replace(source, values=values, spread={**source.spread, **of_turning}, orientation=None)
 
     turned = run.each(turning)
     told = np.stack([turned.command.values[axis] for axis in TURNING])
@@ -109,12 +107,9 @@ def _converted(source: Source, placed: Placed, command: Source | None) -> Source
     if not cartesian:
         return source
     if ("x" in cartesian) != ("y" in cartesian):
-        raise RunError(
-            f"{source.label}: gives {'x without y' if 'x' in cartesian else 'y without x'}; a frame needs both"
-        )
-    named = {axis: value for axis, value in source.values.items() if axis not in CARTESIAN}
-    spread = dict(source.spread)
-    converted: dict[str, FloatArray] = {}
+        gives = "x without y" if "x" in cartesian else "y without x"
+        raise RunError(f"{source.label}: gives {gives}; a frame needs both")
+    named, spread, converted = source.without(CARTESIAN).values, dict(source.spread), dict[str, FloatArray]()
     if "x" in cartesian:
         near = None  # where the commands are then, tangential [m], (rows,)
         if command is not None and not isinstance(placed.frame, Rotated):

@@ -169,7 +169,8 @@ def _refuse_endless(types: Mapping[str, Any], name: str) -> None:
         for _, (kind, inner) in () if name in checked else types[name][1]:
             if kind == Nodetype.ARRAY and inner[1] > _LONGEST_ARRAY:
                 raise ValueError(f"{name} has an array of {inner[1]} elements")
-            kind, inner = inner[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, inner)
+            if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                kind, inner = inner[0]
             if kind == Nodetype.NAME:
                 check(inner, (*above, name))
         checked.add(name)
@@ -182,10 +183,9 @@ def fields_of(value: Any) -> Message | None:
     if isinstance(value, Mapping):
         return cast(Message, value)
     if hasattr(value, "DESCRIPTOR"):  # protobuf: what can be absent, and is, is null
-        fields = (
-            (field.name, not field.has_presence or value.HasField(field.name)) for field in value.DESCRIPTOR.fields
-        )
-        return {name: getattr(value, name) if is_there else None for name, is_there in fields}
+        fields = value.DESCRIPTOR.fields
+        absent = {field.name for field in fields if field.has_presence and not value.HasField(field.name)}
+        return {field.name: None if field.name in absent else getattr(value, field.name) for field in fields}
     if hasattr(value, "get_fields_and_field_types"):  # of a running ROS 2
         return {name: getattr(value, name) for name in value.get_fields_and_field_types()}
     if hasattr(value, "__msgtype__"):  # ROS, by rosbags
@@ -219,11 +219,10 @@ def records_of(path: Path, topic: str | None, faults: Faults, seen: set[Channel]
     elif path.suffix == ".db3":
         yield from _sqlite_records(path, topic, faults, seen)
     else:
+        records = _ros1_records if path.suffix == ".bag" else _mcap_records
         with path.open("rb") as file:
-            source = _Whole(file, path.stat().st_size)
-            for record in (_ros1_records if path.suffix == ".bag" else _mcap_records)(source, faults, seen):
-                if topic in (None, record.channel.topic):
-                    yield record
+            every = records(_Whole(file, path.stat().st_size), faults, seen)
+            yield from (record for record in every if topic in (None, record.channel.topic))
 
 
 class _Whole:
@@ -378,10 +377,9 @@ def _has_lost_pages(path: Path) -> bool:
     (page,), (pages,) = struct.unpack_from(">H", head, 16), struct.unpack_from(">I", head, 28)
     page, length = 65536 if page == 1 else page, path.stat().st_size  # sqlite.org/fileformat.html, 1.3
     if page and length % page:
-        raise RunError(
-            f"{path}: the recording was cut off within a page; what is there can be read from a copy of whole pages:"
-            f" head -c {length - length % page} {path.name} > saved.db3"
-        )
+        copied = f"head -c {length - length % page} {path.name} > saved.db3"
+        cut = "the recording was cut off within a page; what is there can be read from a copy of whole pages"
+        raise RunError(f"{path}: {cut}: {copied}")
     return length < page * pages
 
 
@@ -390,11 +388,9 @@ def _sqlite_records(path: Path, topic: str | None, faults: Faults, seen: set[Cha
 
     journal = path.with_name(f"{path.name}-wal")
     if journal.exists() and journal.stat().st_size:
-        raise RunError(
-            f"{path}: its last messages are still in {journal.name}; put them in first:"
-            f' sqlite3 {path.name} "pragma wal_checkpoint(truncate)"'
-        )
-    faults.cut = faults.cut or _has_lost_pages(path)
+        advice = f'put them in first: sqlite3 {path.name} "pragma wal_checkpoint(truncate)"'
+        raise RunError(f"{path}: its last messages are still in {journal.name}; {advice}")
+    faults.cut |= _has_lost_pages(path)
     address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     with closing(sqlite3.connect(address, uri=True)) as database:
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST)

@@ -200,10 +200,9 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     def fields(self) -> list[str]:
         """All its columns and field paths."""
         axes = [column for columns in (*self.axes.values(), *self.joints.values()) for column in columns]
-        turning = () if self.orientation is None else self.orientation.columns
-        noise = () if self.noise is None else (self.noise.column,)
-        times = (*self.time.columns, *(() if self.arrived is None else self.arrived.columns))
-        names = [*times, *(column.column for column in axes), *turning, *noise]
+        names = [*self.time.columns, *(self.arrived.columns if self.arrived else ())]
+        names += [*(column.column for column in axes), *(self.orientation.columns if self.orientation else ())]
+        names += [self.noise.column] if self.noise else []
         return [*names, *(name for axis in axes for name in axis.where)]
 
     @property
@@ -349,9 +348,8 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     if "pose" in keys:
         keys = _with_pose(keys, where, path)
     fields_of_kind = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes", "kinds"}
-    axes = {
-        axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in list(keys) if axis not in fields_of_kind
-    }
+    named = [key for key in keys if key not in fields_of_kind]
+    axes = {axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in named}
     if "orientation" in keys:
         _check_orientation(keys["orientation"], axes, where, f"{path}.orientation")
     if "joints" in keys:
@@ -470,10 +468,8 @@ def _time(table: Any, where: str, path: str) -> dict[str, Any]:
 def _where(table: Any, where: str, path: str) -> dict[str, Any]:
     """Values by column, in the unit of the column: they are compared with what is in the file."""
     values = cast(dict[str, Any], table if isinstance(table, dict) else {})
-    accepted = (
-        isinstance(value, str) or (isinstance(value, int | float) and abs(value) < _MOST) for value in values.values()
-    )
-    if not values or not all(accepted):
+    numbers = [value for value in values.values() if not isinstance(value, str)]
+    if not values or not all(isinstance(value, int | float) and abs(value) < _MOST for value in numbers):
         raise ConfigError(
             f"{where}: {path}: expected a number, a text or a boolean for each column, as in {{ episode_index = 3 }};"
             " a field path is quoted, as in { 'meta.episode' = 3 }"

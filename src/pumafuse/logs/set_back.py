@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -91,29 +92,19 @@ def _sources(run: Run) -> dict[str, Source]:
 
 def _candidates(steps: Mapping[str, list[Step]]) -> Iterable[Step]:
     """The steps of all sources, the first ones first; of one instant those of the densest source."""
-    every = sorted(
-        (step for steps_of_source in steps.values() for step in steps_of_source),
-        key=lambda step: (step.newest - step.back, step.usual),
-    )
-    return every[:_MOST]
+    return sorted(chain(*steps.values()), key=lambda step: (step.newest - step.back, step.usual))[:_MOST]
 
 
 def _common(run: Run, step: Step, steps: Mapping[str, list[Step]]) -> Step | None:
     """The step back of all clocks at a step of one: the surest one; None where not all were."""
-    agreeing = list[Step]()
-    for name, source in _sources(run).items():
-        agreeing_steps = [other for other in steps[name] if _agree(other, step)]
-        if agreeing_steps:
-            agreeing += agreeing_steps[:1]
-        elif _goes_on(source.stamp, step):
-            return None
-    if steps[""] and not any(_agree(other, step) for other in steps[""]):
-        return None
-    several = len(agreeing) > 1 or not run.sensors
-    if not several or max(step.behind for step in agreeing) < _OF_ALL:
+    by_source = {name: [other for other in steps[name] if _agree(other, step)][:1] for name in steps}
+    agreeing, several = [*chain(*by_source.values())], sum(map(len, by_source.values())) > 1 or not run.sensors
+    others = (source for name, source in _sources(run).items() if not by_source[name])
+    apart = any(_goes_on(source.stamp, step) for source in others) or (steps[""] and not by_source[""])
+    if apart or not several or max(other.behind for other in agreeing) < _OF_ALL:
         return None
     surest = min(agreeing, key=lambda step: step.usual)
-    return surest._replace(newest=max(step.newest for step in agreeing))
+    return surest._replace(newest=max(other.newest for other in agreeing))
 
 
 def _agree(step: Step, other: Step) -> bool:
@@ -138,23 +129,14 @@ def _shows(stamp: TimeArray, step: Step) -> bool:
 
 
 def _rows_after(source: Source, step: Step) -> IntArray:
-    """The rows of a source that came after a step, of those with a stamp."""
+    """The rows of a source that came after a step, of those with a stamp: from where its interval is shorter by it."""
     stamped = np.flatnonzero(source.stamp != NO_STAMP)
     stamp = source.stamp[stamped]
-    rows = [other.row for other in steps_back(stamp) if abs(other.newest - step.newest) <= step.back]
-    falls = (np.diff(stamp) < 0) & (np.abs(stamp[:-1] - step.newest) <= step.back)
-    rows = rows or (np.flatnonzero(falls) + 1).tolist()
-    return stamped[rows[0] if rows else _shortest(stamp, step) :]
-
-
-def _shortest(stamp: TimeArray, step: Step) -> int:
-    """Where a source whose interval is longer than the step is cut: where its interval is shorter by the step."""
     interval = np.diff(stamp)
-    near = np.flatnonzero((stamp[1:] > step.newest - step.back) & (stamp[:-1] <= step.newest))
+    near = np.flatnonzero((stamp[1:] > step.newest - step.back) & (stamp[:-1] <= step.newest + step.usual))
     if not len(near):
-        return int(np.searchsorted(stamp, step.newest, side="right"))
-    usual = float(np.median(interval))
-    return int(near[np.argmin(np.abs(interval[near] + step.back - usual))]) + 1
+        return stamped[np.searchsorted(stamp, step.newest, side="right") :]
+    return stamped[near[np.argmin(np.abs(interval[near] + step.back - np.median(interval)))] + 1 :]
 
 
 def _moved(run: Run, step: Step) -> Run:

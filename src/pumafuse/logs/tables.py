@@ -333,12 +333,8 @@ def _of_csv(path: Path, text: bytes, choice: Choice | None) -> _Text:
             raise
         table, names, more = _parsed(path, text.decode("cp1252").encode(), choice)
         more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
-    names_numbered, twice = _numbered(path, table.column_names)
-    return (
-        pa.table([_listed(column) for column in table.columns], names_numbered),
-        names or names_numbered,
-        [*twice, *more],
-    )
+    numbered, twice = _numbered(path, table.column_names)
+    return pa.table([_listed(column) for column in table.columns], numbered), names or numbered, [*twice, *more]
 
 
 def _numbered(path: Path, header: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -582,10 +578,8 @@ def _header(lines: Sequence[str], full: Sequence[int]) -> int:
     if '"' in lines[header]:  # a name may go on in the next line
         return header
     first, *below = (_cells(lines[n], separator) for n in full[: 1 + _BESIDE])
-    begin = next(
-        (n for n in full[1:] if any(_begins(lines, n, letter) for letter in {separator, _separator(lines[n - 1])})),
-        header + 1,
-    )
+    begins = (n for n in full[1:] if _begins(lines, n, separator) or _begins(lines, n, _separator(lines[n - 1])))
+    begin = next(begins, header + 1)
     between = [_cells(lines[n], separator) for n in full[1:] if n < begin]
     most = Counter(len(_split(lines[n], separator)) for n in full).most_common(1)[0][0]
     even = all(len(row) == len(first) == most > 1 for row in below)
@@ -669,9 +663,8 @@ def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa
     with _opened(path) as file:
         wanted, empty = _wanted(path, file, fields, where)
         conditions = _conditions(path, empty, where)
-        groups = [
-            index for index in range(file.num_row_groups) if _may_hold(file.metadata.row_group(index), conditions)
-        ]
+        every = range(file.num_row_groups)
+        groups = [index for index in every if _may_hold(file.metadata.row_group(index), conditions)]
         kept = [part.filter(_met(path, part, conditions)) if where else part for part in _parts(file, wanted, groups)]
         if where and not any(part.num_rows for part in kept):
             raise _no_row(path, _parts(file, prefixes(list(where)), None), where)
@@ -717,8 +710,10 @@ def _filterable(table: pa.Table) -> pa.Table:
 
 
 def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
-    chosen = whole.filter(_met(path, whole, _conditions(path, whole, where))) if where else whole
-    if where and not chosen.num_rows:
+    if not where:
+        return whole
+    chosen = whole.filter(_met(path, whole, _conditions(path, whole, where)))
+    if not chosen.num_rows:
         raise _no_row(path, [whole], where)
     return chosen
 
@@ -748,14 +743,10 @@ def _met(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.
 
 def _may_hold(group: Any, conditions: Mapping[str, pa.Scalar]) -> bool:
     """Whether a part of Parquet may have rows that meet all conditions, by the least and the greatest of its values."""
-    columns = [group.column(index) for index in range(group.num_columns if conditions else 0)]
-    for name, value in conditions.items():
-        statistics = [column.statistics for column in columns if column.path_in_schema == name and column.is_stats_set]
-        if (
-            len(statistics) == 1
-            and statistics[0].has_min_max
-            and not statistics[0].min <= value.as_py() <= statistics[0].max
-        ):
+    for column in map(group.column, range(group.num_columns if conditions else 0)):
+        name = column.path_in_schema
+        told = column.statistics if column.is_stats_set and name in conditions else None
+        if told is not None and told.has_min_max and not told.min <= conditions[name].as_py() <= told.max:
             return False
     return True
 
