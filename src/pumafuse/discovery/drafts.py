@@ -61,7 +61,7 @@ def _other_columns(part: Part) -> list[str]:
     """The columns of a part that are in no source, and why."""
     clockless = without_clock(part) if part.clock is None else ""
     others = dict.fromkeys((signal.column for signal in part.signals if clockless), clockless) | dict(part.left_out)
-    lines = [f"# {_line(_pair(names.plain(column), column), printable(why, 200))}" for column, why in others.items()]
+    lines = [f"# {_pair(names.plain(column), column, printable(why, 200))}" for column, why in others.items()]
     return ["", f"# Of {printable(part.label)} not taken for positions:", *lines] if others else []
 
 
@@ -77,9 +77,9 @@ def _run_toml(survey: Survey, arm: ArmGuess, folder: Path) -> str:
     lines += _source(["command"], roles.command, folder)
     if survey.interpolation:
         why = "DECIDE: what measures follows the path between commands; without this line each is held"
-        lines.append(_line(_pair("interpolation_ms", survey.interpolation * MS), why))
+        lines.append(_pair("interpolation_ms", survey.interpolation * MS, why))
     if levels := _levels(arm):
-        lines.append(_line(_pair("start", levels), "its sensor says so: not at its first command"))
+        lines.append(_pair("start", levels, "its sensor says so: not at its first command"))
     for sensor in roles.sensors:
         lines += _source(["sensors", sensor.name], sensor, folder)
     if roles.reference is not None:
@@ -111,13 +111,13 @@ def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
 def _location(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
     part, clock = stream.part, stream.part.clock
     assert clock is not None
-    lines = ["", _line(_header(table), printable(stream.why, 200)), _line(_pair("file", _from(folder, part.file)))]
+    lines = ["", _line(_header(table), printable(stream.why, 200)), _pair("file", _from(folder, part.file))]
     keys = {"topic": part.topic, "entity": part.entity, "where": dict(part.where)}
-    lines += [_line(_pair(key, value)) for key, value in keys.items() if value]
+    lines += [_pair(key, value) for key, value in keys.items() if value]
     time: Any = {key: value for key, value in to_builtins(clock.time).items() if value}
     if set(time) <= {"column", "nanoseconds"}:
         time = list(time.values()) if clock.time.nanoseconds else clock.time.column
-    lines.append(_line(_pair("time", time), clock.basis))
+    lines.append(_pair("time", time, clock.basis))
     return lines
 
 
@@ -125,16 +125,16 @@ def _columns(stream: Stream) -> list[str]:
     lines = list[str]()
     pose = _pose(stream)
     if pose and stream.attitude:
-        lines.append(_line(_pair("pose", pose), "in m, and how it is turned"))
+        lines.append(_pair("pose", pose, "in m, and how it is turned"))
     for axis, signals in stream.axes.items() if not pose else ():
         columns: list[Any] = [_column(signal) for signal in signals]
         how = "DECIDE: unit " if signals[0].basis == "range" else "unit "
-        lines.append(_line(_pair(axis, columns[0] if len(columns) == 1 else columns), how + BASES[signals[0].basis]))
+        lines.append(_pair(axis, columns[0] if len(columns) == 1 else columns, how + BASES[signals[0].basis]))
     if stream.attitude and not pose:
         asked = "DECIDE: " if stream.attitude.doubt else ""
         every: dict[str, Any] = to_builtins(stream.attitude.columns)
         told = {key: value for key, value in every.items() if value and value != "xyzw"}
-        lines.append(_line(_pair("orientation", told), f"{asked}{stream.attitude.basis}"))
+        lines.append(_pair("orientation", told, f"{asked}{stream.attitude.basis}"))
     return lines
 
 
@@ -181,8 +181,8 @@ def _arm_toml(survey: Survey, arm: ArmGuess) -> str:
     lines = [
         "# The arm to begin with. `pumafuse tune --fit noise,delay,plant` finds better numbers; `gain` may be added.",
         f"name = {_value(survey.name)}",
-        _line(_pair("update_period_ms", _digits(arm.period * MS, 6)), "median time between commands"),
-        _line(_pair("delay_ms", _digits(arm.delay * MS)), "a guess: 60 % of the shortest lag; the rest is the plant's"),
+        _pair("update_period_ms", _digits(arm.period * MS, 6), "median time between commands"),
+        _pair("delay_ms", _digits(arm.delay * MS), "a guess: 60 % of the shortest lag; the rest is the plant's"),
     ]
     for axis, guess in arm.axes.items():
         lines += ["", _header(["axes", axis])]
@@ -192,7 +192,7 @@ def _arm_toml(survey: Survey, arm: ArmGuess) -> str:
         lag = as_late_as if guess.follows else "a guess: nothing follows this axis"
         lines += [
             _pair("plant", "first-order"),
-            _line(_pair("time_constant_ms", _digits(guess.time_constant * MS)), lag),
+            _pair("time_constant_ms", _digits(guess.time_constant * MS), lag),
         ]
         if guess.follows and abs(guess.gain - 1.0) > 0.05:
             why = f"{guess.follows} moves {guess.gain:.2f} times as far as commanded: try it, or tune --fit gain"
@@ -213,30 +213,28 @@ def _fusion_toml(survey: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGues
         lines += [
             "",
             _header(["process", axis]),
-            _line(_pair(f"input_noise_{unit}_rtHz", _digits(guess.input_noise * scale)), left),
-            _line(_pair(f"drift_{unit}_rts", _digits(guess.drift * scale)), "likewise"),
+            _pair(f"input_noise_{unit}_rtHz", _digits(guess.input_noise * scale), left),
+            _pair(f"drift_{unit}_rts", _digits(guess.drift * scale), "likewise"),
         ]
     if survey.run.tool is not None:
         reference = [_digits(angle * DEG, 8) for angle in survey.run.tool]
         lines += ["", _header(["tool"])]
-        lines.append(_line(_pair("reference_rotation_vector_deg", reference), "the mean commanded orientation"))
+        lines.append(_pair("reference_rotation_vector_deg", reference, "the mean commanded orientation"))
     for name, own_frame in survey.own_frames.items():
         lines += ["", f"# Not used: {printable(name)} {own_frame.words}", f"# {_header(['sensors', name])}"]
     for name, guess in sensors.items():
         lines += ["", _header(["sensors", name])]
         lines += _by_kind("sd", guess.sd, arm, "its scatter from one measurement to the next")
-        lines.append(_line(_pair("latency_ms", _digits(guess.latency * MS, 3)), guess.latency_words))
+        lines.append(_pair("latency_ms", _digits(guess.latency * MS, 3), guess.latency_words))
         if guess.pair and (scatter := guess.pair.alignment.unsteadiness):
-            lines.append(_line(_pair("latency_sd_ms", _digits(scatter * MS)), "by its rows and steps"))
+            lines.append(_pair("latency_sd_ms", _digits(scatter * MS), "by its rows and steps"))
         if guess.scale < 0.0:
-            lines.append(_line(_pair("scale", -1.0), "it moves against the commands, as a distance may"))
+            lines.append(_pair("scale", -1.0, "it moves against the commands, as a distance may"))
         if guess.bias:
             lines += _by_kind("bias_sd", guess.bias, arm, "its zero is another than the commands'")
         if guess.turns:
-            lines.append(_line(_pair("turn_deg", 360), "it measures within a turn"))
-        lines.append(
-            _line(_pair("gate", guess.gate), "it has outliers" if guess.gate else "it has no outliers: 0 is none")
-        )
+            lines.append(_pair("turn_deg", 360, "it measures within a turn"))
+        lines.append(_pair("gate", guess.gate, "it has outliers" if guess.gate else "it has no outliers: 0 is none"))
     return "\n".join([*lines, ""])
 
 
@@ -267,8 +265,8 @@ def _header(table: Sequence[str]) -> str:
     return f"[{'.'.join(_key(word) for word in table)}]"
 
 
-def _pair(key: str, value: Any) -> str:
-    return f"{_key(key)} = {_value(value)}"
+def _pair(key: str, value: Any, comment: str = "") -> str:
+    return _line(f"{_key(key)} = {_value(value)}", comment)
 
 
 def _key(key: str) -> str:

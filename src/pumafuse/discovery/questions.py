@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import printable
 from ..logs.frames import CARTESIAN
-from ..logs.run import Run, Source
+from ..logs.run import Run
 from ..units import MS
 from .following import ABOUT_ONE, LATEST, Following
 from .guesses import SensorGuess
@@ -125,14 +125,9 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
 
 def _moves_as_far(run: Run, name: str, axis: str, following: Following) -> bool:
     """Whether a sensor moves about as far as it is told to, whatever its sign."""
-    gains = abs(following.slope), _reach(run.measured[name], axis) / _reach(run.command, axis)
+    # Of steps, which a span cuts, how far both go tells a gain better.
+    gains = abs(following.slope), run.measured[name].travel(axis) / max(run.command.travel(axis), 1e-12)
     return any(1.0 / ABOUT_ONE < gain < ABOUT_ONE for gain in gains)
-
-
-def _reach(source: Source, axis: str) -> float:
-    """How far an axis goes, outliers apart [m or rad]: of steps, which a span cuts, that tells a gain better."""
-    low, high = np.nanquantile(source.values[axis], [0.02, 0.98])
-    return max(float(high - low), 1e-12)
 
 
 def _sure(doubtful: list[str], else_: str = "a guess") -> str:

@@ -705,7 +705,7 @@ def _turned_point(
 
     Columns of a frame that is turned, each called after what it follows best, would be mirrored.
     """
-    moving = [axis for axis in stream.axes if _travel(stream, axis) > 0.0]
+    moving = [axis for axis in stream.axes if stream.source.travel(axis) > 0.0]
     if len(moving) != len(CARTESIAN) or not {*CARTESIAN} <= command.axes.keys():
         return {}
     orders = (zip(order, CARTESIAN, strict=True) for order in permutations(moving))
@@ -787,7 +787,7 @@ def _ranged(stream: Stream, measured: Set[str]) -> Stream:
 
 def _fitted(stream: Stream, anchor: Stream) -> Stream:
     """A stream whose guessed units, one of each kind, are those in which it moves as far as another."""
-    made = dict(stream.axes)
+    made, anchored = dict(stream.axes), anchor.source
     shared = [axis for axis in anchor.axes if axis in made and any(signal.basis == "range" for signal in made[axis])]
     for kind in KINDS:
         axes = [axis for axis in shared if anchor.kind(axis) == kind]
@@ -795,8 +795,8 @@ def _fitted(stream: Stream, anchor: Stream) -> Stream:
             continue
 
         def misfit(unit: str, of_kind: Sequence[str] = axes) -> float:
-            scaled = replace(stream, axes={axis: _in(stream.axes[axis], unit) for axis in of_kind})
-            ratios = [max(_travel(scaled, axis), 1e-12) / max(_travel(anchor, axis), 1e-12) for axis in of_kind]
+            moved = replace(stream, axes={axis: _in(stream.axes[axis], unit) for axis in of_kind}).source
+            ratios = [max(moved.travel(axis), 1e-12) / max(anchored.travel(axis), 1e-12) for axis in of_kind]
             return abs(float(np.median(np.log(ratios))))
 
         unit = min(OF_KIND[kind], key=misfit)
@@ -806,10 +806,3 @@ def _fitted(stream: Stream, anchor: Stream) -> Stream:
 
 def _in(signals: Sequence[Signal], unit: str) -> list[Signal]:
     return [replace(signal, unit=unit.removeprefix("_")) if signal.basis == "range" else signal for signal in signals]
-
-
-def _travel(stream: Stream, axis: str) -> float:
-    """How far an axis moves, outliers apart [m or rad]."""
-    value = stream.source.values[axis]
-    low, high = np.nanquantile(value, [0.02, 0.98])
-    return float(high - low) or float(np.nanmax(value) - np.nanmin(value))

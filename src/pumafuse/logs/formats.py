@@ -20,6 +20,7 @@ import pyarrow as pa
 from ..errors import RunError, counted, one_line, unknown_part, warn
 
 Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
+_Tables: TypeAlias = dict[str, pa.Table | bytes]  # by name; of a sheet its cells as CSV
 
 SHEETS = ".xlsx"
 ENDINGS = (".mat", ".npy", ".npz", ".json", ".ulg", SHEETS)
@@ -58,7 +59,7 @@ def _written(path: Path) -> int:
 
 
 @lru_cache(maxsize=1)
-def _tables(path: Path, _written: int) -> dict[str, pa.Table | bytes]:
+def _tables(path: Path, _written: int) -> _Tables:
     """The tables of a file by name; a file is read once for all of them."""
     with one_line(path, "'pumafuse[formats]'"):
         if path.is_dir():
@@ -73,12 +74,12 @@ def _tables(path: Path, _written: int) -> dict[str, pa.Table | bytes]:
     return {"": next(iter(tables.values()))} if len(tables) == 1 else tables
 
 
-def _sheets(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
+def _sheets(_path: Path, file: BinaryIO) -> _Tables:
     """The sheets of a workbook that have cells, as CSV."""
     from openpyxl import load_workbook
 
     book: Any = load_workbook(file, read_only=True, data_only=True)
-    sheets = dict[str, pa.Table | bytes]()
+    sheets = _Tables()
     for sheet in book.worksheets:
         text = io.StringIO()
         rows = (row for row in sheet.iter_rows(values_only=True) if any(cell is not None for cell in row))
@@ -88,11 +89,11 @@ def _sheets(_path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     return sheets
 
 
-def _topics(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
+def _topics(path: Path, file: BinaryIO) -> _Tables:
     """The topics of a log of PX4, whose stamps are in us; what its reader prints of a damaged one is a warning."""
     from pyulog import ULog  # pyright: ignore[reportMissingTypeStubs]
 
-    by_topic = dict[str, pa.Table | bytes]()
+    by_topic = _Tables()
     with contextlib.redirect_stdout(io.StringIO()) as said:
         topics = cast(Any, ULog)(file).data_list
     if lines := said.getvalue().splitlines():
@@ -104,7 +105,7 @@ def _topics(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
     return by_topic
 
 
-def _arrays(path: Path, file: BinaryIO) -> dict[str, pa.Table | bytes]:
+def _arrays(path: Path, file: BinaryIO) -> _Tables:
     if path.suffix == ".json":
         text = file.read()
         try:
@@ -146,9 +147,9 @@ def _loaded(folder: Path) -> Arrays:
     return arrays
 
 
-def _of_value(value: Any) -> dict[str, pa.Table | bytes]:
+def _of_value(value: Any) -> _Tables:
     """The tables in a value of arrays, structs and lists."""
-    tables = dict[str, pa.Table | bytes]()
+    tables = _Tables()
     for name, item in _apart(value, ""):
         tables.update(_by_length(item, name))
     return tables

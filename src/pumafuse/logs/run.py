@@ -152,6 +152,12 @@ class Source:
         rows = self.ordered(axis)
         return self.stamp[rows], self.values[axis][rows]
 
+    def travel(self, axis: str) -> float:
+        """How far an axis moves, outliers apart [m or rad]."""
+        value = self.values[axis]
+        low, high = np.nanquantile(value, [0.02, 0.98])
+        return float(high - low) or float(np.nanmax(value) - np.nanmin(value))
+
     def beside(self, command: Source, turns: Mapping[str, float]) -> Source:
         """The source with angles that go on moved by whole ``turns`` [rad], by axis, to where they are commanded."""
         values = dict(self.values)
