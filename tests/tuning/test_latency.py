@@ -21,6 +21,7 @@ from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.roles import relations
 from pumafuse.discovery.survey import Survey
 from pumafuse.tuning import latency as module
+from pumafuse.tuning.arms import Arm, NoiseModel
 from pumafuse.tuning.latency import Latency
 from pumafuse.tuning.likelihood import Likelihood
 
@@ -151,7 +152,9 @@ def test_shifts_of_parts_are_those_of_a_dense_regression() -> None:
     config = pf.FusionConfig(
         arm=arm, start=pf.Start(offset_sd=1e-3), process={"x": process}, sensors={"tracker": sensor}
     )
-    _, shift, information = Likelihood([run], config).shifts("x", config, 5) or (None, None, None)
+    recorded_axis = Likelihood([run], config).measured("x", config)
+    true, noise = Arm.of(arm.axes["x"], arm.delay), NoiseModel(np.array([1e-4]), walk=process.drift)
+    _, shift, information = recorded_axis.shifts(true, [], noise, 5) or (None, None, None)
     assert shift is not None and information is not None
     stamp, z = run.sensors["tracker"].stamp / 1e9, run.sensors["tracker"].values["x"]
     time, command = path("smooth")
@@ -160,7 +163,7 @@ def test_shifts_of_parts_are_those_of_a_dense_regression() -> None:
         return moved(time, command, stamp - 0.004 - late) - command[0]
 
     slope = (response(1e-3) - response(-1e-3)) / 2e-3
-    cov = 1e-6 + process.drift**2 * np.minimum(stamp[:, None], stamp) + 1e-8 * np.eye(len(stamp))
+    cov = 1.0 + process.drift**2 * np.minimum(stamp[:, None], stamp) + 1e-8 * np.eye(len(stamp))
     place = np.minimum(((stamp - stamp[0]) / (stamp[-1] - stamp[0]) * 5).astype(np.int64), 4)
     X = np.where(place[:, None] == np.arange(5), slope[:, None], 0.0)
     weighted = np.linalg.solve(cov, X)

@@ -56,7 +56,7 @@ _STARTS = 3  # maxima of the grid from which an arm is fitted
 _NEARLY = 40.0  # log-likelihood that a better noise may gain
 _NEAR = 20.0  # log-likelihood behind the best, up to which a maximum of the grid is looked at
 _GATED = 2  # times: outliers widen the noise by which they are told
-_GATE = 6.0  # standard deviations, from which a measurement does not count
+GATE = 6.0  # standard deviations, from which a measurement does not count
 _EARLIER, _DAMPED = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no dead time, ζ
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
 WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
@@ -205,7 +205,7 @@ class ArmSearch:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
         for _ in range(_GATED):
             self.noise = self._likely_noise(self._best(self._fits).arm, least, believed)
-            self._measured = self._measured.gated(self._best(self._fits).arm, self.noise, _GATE)
+            self._measured = self._measured.gated(self._best(self._fits).arm, self.noise, GATE)
         self._fits = self._likely(self._fitted([self._best(self._fits).arm, *self._on_grid(1)], self._fits))
         self.noise = self._likely_noise(self._best(self._fits).arm, least, believed)
         self._fits = self._likely(self._fitted([self._best(self._fits).arm], self._fits))

@@ -53,6 +53,7 @@ _REACH = {
 }  # fmt: skip
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _NUDGE = 1e-5  # of a coordinate, by which a size is varied
+_SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
 _LOG_2PI = math.log(2.0 * math.pi)
 
 Coordinates: TypeAlias = Sequence[str]  # among the fields below
@@ -431,6 +432,34 @@ class Measured:
         scores = np.add.reduceat(slopes * left, np.unique(np.arange(pieces) * len(left) // pieces), axis=1)
         weight = covariance(self._linear(arm, free, noise, limits).information) @ slope
         return float(slope @ weight), float(np.sum((weight @ scores) ** 2))
+
+    def shifts(
+        self, arm: Arm, names: Coordinates, noise: NoiseModel, count: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """How much later an arm is in each of ``count`` parts of the longest recording than on the whole.
+
+        They are least squares on what a lag that is longer in one part alone adds to the motion. The coordinates of
+        ``names`` were fitted to the same measurements, and may have explained a part of it.
+
+        Returns:
+            The middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,),
+            (n,) and (n, n); None where there are too few measurements.
+        """
+        longest = self.of([max(self.recordings, key=lambda recording: len(recording.time))])
+        (recording,), since = longest.recordings, (longest.recordings[0].time - longest.recordings[0].told[0]) / 1e9
+        if len(since) < 3 * count:
+            return None
+        edges = np.linspace(since[0], since[-1], count + 1)
+        part = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, count - 1)
+        ((response, rate, *others),) = longest._derivatives(arm, ["delay", *names])
+        later = np.where(part == np.arange(count)[:, None], rate, 0.0)
+        white, _ = longest.whitened(noise, [np.vstack([recording.value - response, later, *others])])
+        left, moved, fitted = np.split(white, [1, 1 + count])
+        basis = np.linalg.qr(fitted.T)[0]
+        moved -= (moved @ basis) @ basis.T
+        information = moved @ moved.T
+        inverse = np.asarray(np.linalg.pinv(information, _SINGULAR, hermitian=True), dtype=np.float64)
+        return 0.5 * (edges[:-1] + edges[1:]), inverse @ moved @ left[0], information
 
     def likeliest(self, arms: Sequence[Arm], noise: NoiseModel, limits: Limits | None, count: int) -> list[Arm]:
         """The likeliest of some arms, the best first, each with its best gain; for ``limits`` of None with its own."""

@@ -28,20 +28,11 @@ from ..model.arm import ArmModel, AxisModel, Sag
 from ..model.plants import FirstOrder
 from ..toml import Interval
 from ..units import MS, Kind
-from .arm_search import ArmSearch, Chosen, Freedom, chosen_arms
+from .arm_search import GATE, ArmSearch, Chosen, Freedom, chosen_arms
 from .arms import BENDS, Arm
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
-from .parameters import (
-    Parameter,
-    changed,
-    parameters,
-    rounded,
-    with_arm,
-    with_noise,
-    with_own_delays,
-    with_shared_delay,
-)
+from .parameters import changed, rounded, with_arm, with_noise, with_shared_delay
 from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
 from .posterior import Model, Quantity
 
@@ -292,7 +283,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
         if sensor_guess.pair and len(every) == 1
     }
     best, sensors, said = _sensors(every, config, trusted, pairs)
-    lags, clock = _with_courses(likelihood, config, lags)
+    lags, clock = _with_courses(likelihood, config, lags, searches)
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
     notes = [*turned, *likelihood.notes, *said, *likelihood.overruns(config.arm)]
     notes += [f"{axis}: does not move, or {trusted} does not measure it" for axis in still]
@@ -581,16 +572,6 @@ def _sensors(
 # ---- the lag over the run -------------------------------------------------------------------------------------------
 
 
-def _free_arm(likelihood: Likelihood, config: FusionConfig, axis: str) -> list[Parameter]:
-    """The numbers of an axis's arm that were fitted."""
-    config = with_own_delays(config, [axis])
-    every = parameters(config, config, {axis: likelihood.sensors[axis]}, ["delay", "plant", "gain"])
-    fixed = config.arm.axes[axis].gain.intercept == 1.0
-    return [
-        parameter for parameter in every if parameter.axis == axis and not (fixed and parameter.path[-1] == "intercept")
-    ]
-
-
 class _Course(NamedTuple):
     """How much later an axis is in each part of a run: middles [s], shifts [s], their information [1/s²]."""
 
@@ -615,12 +596,14 @@ class _Trend(NamedTuple):
 
 
 def _with_courses(
-    likelihood: Likelihood, config: FusionConfig, lags: Mapping[str, AxisLag]
+    likelihood: Likelihood, config: FusionConfig, lags: Mapping[str, AxisLag], searches: Mapping[str, ArmSearch]
 ) -> tuple[dict[str, AxisLag], tuple[float | None, float | None]]:
     """The lags with their courses over the longest run, and drift and wandering of a clock that all axes share."""
     courses: dict[str, _Course] = {}
     for axis in lags:
-        shifts = likelihood.shifts(axis, with_own_delays(config, [axis]), _PARTS, _free_arm(likelihood, config, axis))
+        arm, noise = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis)), searches[axis].noise
+        fitted = ["delay", "lag", *(name for name, none in Arm._field_defaults.items() if getattr(arm, name) != none)]
+        shifts = likelihood.measured(axis, config).gated(arm, noise, GATE).shifts(arm, fitted, noise, _PARTS)
         if shifts is not None and np.trace(shifts[2]) > 0.0:
             courses[axis] = _Course(*shifts)
     with_courses = dict(lags)

@@ -37,13 +37,11 @@ from ..logs.clock import clock_faults, segments
 from ..logs.run import Run
 from ..model.arm import ArmModel
 from .arms import Measured, Recording
-from .parameters import Parameter, changed
+from .parameters import Parameter
 
 _LOG_STEP = 1e-4  # of a logarithm: the truncation error is a sixth of its square, the rounding error 1e-11
 _STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
 _PIECES = 20  # of a run, that a model which is right has independent scores in
-_SHIFT = 1e-4  # s, by which a lag is varied
-_SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
 _COUNTED = 0.98  # of the innovations
 _MOST, _STRETCHES = 80_000, 8  # components of all axes that are enough for a fit; of longer runs, in so many stretches
 _SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
@@ -276,54 +274,6 @@ class Likelihood:
                 if (its_rows := part.segment.measurement_rows.source == number).any():
                     apart.setdefault((name, self.axes[part.axis]), []).append(left[its_rows])
         return apart
-
-    def shifts(
-        self, axis: str, config: FusionConfig, count: int, free: Sequence[Parameter] = ()
-    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """How much later an axis is in each of ``count`` parts of its longest recording than on the whole.
-
-        The filter is linear in the measurements: what a lag that is longer in one part alone adds to the innovations
-        is the difference of two runs of it, and the shifts are least squares on those.
-
-        What is ``free`` was fitted to the same measurements, and may have explained a part of the shifts. Returns the
-        middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,), (n,) and
-        (n, n); None where there are too few measurements.
-        """
-        part = max(self._of(axis), key=lambda part: len(part.rows), default=None)
-        if part is None or len(part.rows) < 3 * count:
-            return None
-        segment, rows = part.segment, part.segment.measurement_rows
-        filtered = innovations(segment, config)
-        weight = ((filtered.outcome != int(Outcome.REJECTED)) / filtered.innovation_sd)[:, 0]
-        delay, certain = config.arm.delay_of(axis), _certain(config)
-
-        def predicted(shift: float) -> FloatArray:
-            moved = changed(certain, ("arm", "axes", axis, "delay"), max(delay + shift, 0.0))
-            return -innovations(segment, moved).innovation[:, 0]
-
-        def changes(part: Segment, at: FusionConfig) -> FloatArray:
-            """What becomes of the innovations, over their deviations, the outcomes being the same."""
-            return weight * (innovations(part, at, filtered.outcome).innovation - filtered.innovation)[:, 0]
-
-        rate = (predicted(_SHIFT) - predicted(-_SHIFT)) / (_SHIFT + min(_SHIFT, delay))
-        since = (rows.time - segment.origin) / 1e9
-        edges = np.linspace(float(since.min()), float(since.max()), count + 1)
-        part_of_row = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, count - 1)
-        later = [rows.value + (rate * (part_of_row == number))[:, None] for number in range(count)]
-        moved = np.array(
-            [changes(replace(segment, measurement_rows=rows._replace(value=value)), config) for value in later]
-        )
-        if free:
-            steps = [
-                parameter.move(config, parameter.at(config) + (_LOG_STEP if parameter.log else _STEP))
-                for parameter in free
-            ]
-            fitted, _ = np.linalg.qr(np.array([moved.sum(axis=0), *(changes(segment, step) for step in steps)]).T)
-            moved -= (moved @ fitted) @ fitted.T
-        information = moved @ moved.T
-        inverse = np.asarray(np.linalg.pinv(information, _SINGULAR, hermitian=True), dtype=np.float64)
-        shift = np.asarray(inverse @ moved @ (weight * filtered.innovation[:, 0]), dtype=np.float64)
-        return 0.5 * (edges[:-1] + edges[1:]), shift, information
 
     def misfit(self, config: FusionConfig) -> dict[str, float]:
         """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis."""
