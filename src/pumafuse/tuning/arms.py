@@ -364,30 +364,20 @@ class Measured:
                 at(recording.told), at(recording.command), len(arms), at(records), at(products_here),
             )  # fmt: skip
             products += products_here
-        plain, more = products[:, 0], products[:, 1]
-        left = np.zeros((len(arms), 1 + c, 1 + c))  # products of what the plain response leaves, gain, and biases
-        left[:, 0, 0] = columns_alone[0, 0] - 2.0 * plain[:, 2] + plain[:, 0]
-        left[:, 0, 1] = left[:, 1, 0] = more[:, 2] - plain[:, 1]
-        left[:, 1, 1] = more[:, 1]
-        left[:, 2:, 2:] = columns_alone[1:, 1:]
-        left[:, 0, 2:] = left[:, 2:, 0] = columns_alone[0, 1:] - plain[:, 3:]
-        left[:, 1, 2:] = left[:, 2:, 1] = more[:, 3:]
-        free = [*range(1, 1 + c)]
-        if limits is None:
-            beyond_one = np.array([arm.gain for arm in arms]) - 1.0
-            left[:, 0, 0] += beyond_one * (beyond_one * left[:, 1, 1] - 2.0 * left[:, 0, 1])
-            left[:, 0, 2:] -= beyond_one[:, None] * left[:, 1, 2:]
-            left[:, 2:, 0] = left[:, 0, 2:]
-            free = free[1:]
-        else:
+        every = np.zeros((len(arms), 2 + c, 2 + c))  # products of plain response, gain, measurements and biases
+        every[:, :2], every[:, :, :2], every[:, 2:, 2:] = products, products.swapaxes(1, 2), columns_alone
+        gain, parts = np.array([arm.gain for arm in arms]), np.zeros((len(arms), 1 + c, 2 + c))
+        parts[:, 0, 0], parts[:, 0, 1], parts[:, 0, 2] = -1.0, 0.0 if limits else 1.0 - gain, 1.0  # what is left
+        parts[:, 1, 1], parts[:, 2:, 3:] = 1.0, np.eye(c - 1)  # gain, and biases
+        left, free = parts @ every @ parts.swapaxes(1, 2), [*range(1 if limits else 2, 1 + c)]
+        if limits:
             mean, sd = limits.priors.get("gain", (1.0, math.inf))
             left[:, 1, 1] += 1.0 / sd**2
-            left[:, 0, 1] += (mean - 1.0) / sd**2
-            left[:, 1, 0] = left[:, 0, 1]
+            left[:, (0, 1), (1, 0)] += (mean - 1.0) / sd**2
         inner = left[:, free][:, :, free] + 1e-12 * np.eye(len(free)) * np.maximum(left[:, free, free], 1e-30)[:, None]
         best = np.linalg.solve(inner, left[:, free, 0][:, :, None])[:, :, 0] if free else np.zeros((len(arms), 0))
         squares = left[:, 0, 0] - np.einsum("ni,ni->n", best, left[:, free, 0])
-        gain = 1.0 + best[:, 0] if limits is not None else np.array([arm.gain for arm in arms])
+        gain = 1.0 + best[:, 0] if limits else gain
         log = -0.5 * (np.maximum(squares, 0.0) + log_determinant + self.count * _LOG_2PI)
         return np.asarray(log, dtype=np.float64), np.asarray(gain, dtype=np.float64)
 
@@ -446,20 +436,22 @@ class Measured:
             (n,) and (n, n); None where there are too few measurements.
         """
         longest = self.of([max(self.recordings, key=lambda recording: len(recording.time))])
-        (recording,), since = longest.recordings, (longest.recordings[0].time - longest.recordings[0].told[0]) / 1e9
+        (recording,) = longest.recordings
+        since: FloatArray = (recording.time - int(recording.told[0])) / 1e9
         if len(since) < 3 * count:
             return None
-        edges = np.linspace(since[0], since[-1], count + 1)
+        edges = np.linspace(float(since[0]), float(since[-1]), count + 1)
         part = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, count - 1)
-        ((response, rate, *others),) = longest._derivatives(arm, ["delay", *names])
+        (moved,) = longest._derivatives(arm, ["delay", *names])
+        response, rate, others = moved[0], moved[1], moved[2:]
         later = np.where(part == np.arange(count)[:, None], rate, 0.0)
-        white, _ = longest.whitened(noise, [np.vstack([recording.value - response, later, *others])])
+        white, _ = longest.whitened(noise, [np.vstack([recording.value - response, later, others])])
         left, moved, fitted = np.split(white, [1, 1 + count])
         basis = np.linalg.qr(fitted.T)[0]
         moved -= (moved @ basis) @ basis.T
         information = moved @ moved.T
         inverse = np.asarray(np.linalg.pinv(information, _SINGULAR, hermitian=True), dtype=np.float64)
-        return 0.5 * (edges[:-1] + edges[1:]), inverse @ moved @ left[0], information
+        return 0.5 * (edges[:-1] + edges[1:]), np.asarray(inverse @ moved @ left[0], dtype=np.float64), information
 
     def likeliest(self, arms: Sequence[Arm], noise: NoiseModel, limits: Limits | None, count: int) -> list[Arm]:
         """The likeliest of some arms, the best first, each with its best gain; for ``limits`` of None with its own."""

@@ -295,14 +295,6 @@ class Likelihood:
         """Why sensors do not follow the commands, those that do not."""
         return [fault for segment in self._segments for fault in not_following(segment, config)]
 
-    def rejecting(self, results: Sequence[Results]) -> list[str]:
-        """The axes of which measurements are rejected."""
-        rejected = int(Outcome.REJECTED)
-        numbers = {
-            part.axis for part in self._parts if (results[part.whole].outcome[part.rows, part.column] == rejected).any()
-        }
-        return [axis for number, axis in enumerate(self.axes) if number in numbers]
-
     def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> Point:
         """The log-likelihood of the measurements, without priors; for ``outcomes`` of None the gates decide on them."""
         axes, results, densities = np.zeros(len(self.axes)), list[Results](), list[FloatArray]()

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
+from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from .arm_search import SMOOTHER, WANDERS, ArmSearch, Freedom, chosen_arms
 from .arms import BENDS, Arm
@@ -41,7 +42,8 @@ _NARROWER, _WIDER = 0.6, 3.0  # times the gates
 _NARROWEST = 3.0  # gate: below it rejecting good measurements pays
 _SLOW = 2.0  # s, of a disturbance that is large at first
 _QUIET = 0.03  # share of what the rest is, that other noise begins with
-_KINDS = {"matern": "smooth (Matérn)", "ou": "rough (Ornstein-Uhlenbeck)"}  # of disturbances
+_CALM, _KINDS = "none", {"matern": "smooth (Matérn)", "ou": "rough (Ornstein-Uhlenbeck)"}  # of disturbances
+_HANDICAPS = {_CALM: WANDERS, _KINDS["matern"]: SMOOTHER, _KINDS["ou"]: 0.0}  # log-likelihood
 _WALKING = ("input_noise", "drift", "maneuver_noise", "maneuver_drift")  # noise without a disturbance
 _NAMES = {  # of an arm's coordinates, by the fields that they are in a configuration
     "delay": "delay",
@@ -86,15 +88,12 @@ class Search:
         if self._likeliest([*points, *smooth]) != likeliest:
             points += smooth
         best = self._without_needless(self._from_wider_gates(self._likeliest(points, told=True)))
-        best = self._under_gates(best, config)
+        likeliest = with_gates(best, config)
+        peak = maximise_with_gates(self.likelihood, likeliest, self.free(likeliest), self.notify)
         for axis, why in self.reasons.items():
-            if rings(best.config, axis):
+            if rings(peak.config, axis):
                 why.append("its plant rings: what holds the tool off is a disturbance, not noise that shakes the plant")
-        return best, {axis: "; ".join(why) for axis, why in self.reasons.items() if why}
-
-    def _of_axes(self, config: FusionConfig) -> list[Parameter]:
-        """The free parameters that belong to an axis."""
-        return [parameter for parameter in self.free(config) if parameter.axis is not None]
+        return peak, {axis: "; ".join(why) for axis, why in self.reasons.items() if why}
 
     # ---- arms and latencies -----------------------------------------------------------------------------------------
 
@@ -152,13 +151,10 @@ class Search:
         From little of it, beside noise that is not the best yet, it vanishes.
         """
         calm = [axis for axis in self._may_be_disturbed(config) if config.process[axis].disturbance_sd == 0.0]
-        if not calm:
-            return []
         model = config
         for axis in calm:
             model = with_disturbance(model, axis, self.arms[axis].spread, _SLOW)
-        disturbed = self._maximum(model, axes=calm).config
-        return [point(self.likelihood, disturbed, self._of_axes(disturbed))]
+        return [self._maximum(model, axes=calm)] if calm else []
 
     def _with_free_noise(self, config: FusionConfig, model: FusionConfig) -> FusionConfig:
         """The configuration with the noises of a model that are free."""
@@ -203,44 +199,28 @@ class Search:
         def free(at: FusionConfig) -> list[Parameter]:
             return [parameter for parameter in self.free(at) if axes is None or parameter.axis in axes]
 
-        times = _narrower(config) if times is None else times
-        gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())
-        at = config
-        for wider in (times, 1.0) if gated else (1.0,):
+        gated, at = any(sensor.gate > 0.0 for sensor in config.sensors.values()), config
+        for wider in (times or _narrower(config), 1.0) if gated else (1.0,):
             at = with_gates(at, config, wider)
             if shared := [parameter for parameter in free(at) if parameter.axis is None]:
                 at = maximise(self.likelihood, at, shared, self.notify, tolerance=_ROUGHLY).config
-            own_parameters = [parameter for parameter in free(at) if parameter.axis is not None]
-            at = maximise_by_axis(self.likelihood, at, own_parameters, self.notify, _ROUGHLY).config
-        if any(
-            parameter.axis is None and parameter.sensor is not None for parameter in free(at)
-        ):  # which trades with noise
-            at = maximise(self.likelihood, at, free(at), self.notify, tolerance=_ROUGHLY).config
-        return point(self.likelihood, at, [parameter for parameter in free(at) if parameter.axis is not None])
+            of_axes = [parameter for parameter in free(at) if parameter.axis is not None]
+            at = maximise_by_axis(self.likelihood, at, of_axes, self.notify, _ROUGHLY).config
+        if any(parameter.axis is None and parameter.sensor is not None for parameter in free(at)):
+            at = maximise(self.likelihood, at, free(at), self.notify, tolerance=_ROUGHLY).config  # trades with noise
+        return point(self.likelihood, at, self._of_axes(at))
 
     def _from_wider_gates(self, config: FusionConfig) -> FusionConfig:
         """The higher maximum of each axis, this one or that reached by way of wider gates, where any are rejected."""
         best = point(self.likelihood, config, self._of_axes(config))
-        if not self.likelihood.rejecting(best.results):
+        if not any((outcomes == int(Outcome.REJECTED)).any() for outcomes in best.outcomes):
             return config
         peaks = [best, self._maximum(config, _WIDER)]
         return _best_by_axis(self.likelihood, peaks, [peak.posteriors for peak in peaks])
 
-    def _under_gates(self, best: FusionConfig, configured: FusionConfig) -> Point:
-        """The highest of the maxima under the gates as given.
-
-        Where whole rows are rejected it is looked for from narrower and wider gates.
-        """
-        free = self.free(best)
-        peak = maximise_with_gates(self.likelihood, with_gates(best, configured), free, self.notify)
-        whole = any(sensor.gates_rows(configured.arm) for sensor in configured.sensors.values())
-        if not (whole and self.likelihood.rejecting(peak.results)):
-            return peak
-        starts = [with_gates(peak.config, configured, times) for times in (_narrower(configured), _WIDER)]
-        for start in [maximise(self.likelihood, start, free, tolerance=_ROUGHLY).config for start in starts]:
-            other = maximise_with_gates(self.likelihood, with_gates(start, configured), free, self.notify)
-            peak = max(peak, other, key=lambda peak: peak.log_posterior)
-        return peak
+    def _of_axes(self, config: FusionConfig) -> list[Parameter]:
+        """The free parameters that belong to an axis."""
+        return [parameter for parameter in self.free(config) if parameter.axis is not None]
 
     # ---- which noise pays -------------------------------------------------------------------------------------------
 
@@ -248,27 +228,19 @@ class Search:
         """The model of noise that is best for each axis after the penalty for its numbers; the reasons get why."""
         scores = [_penalised(self.likelihood, peak, self.free(peak.config)) for peak in peaks]
         for number, axis in enumerate(self.likelihood.axes):
+            best_of_kind: dict[str, float] = {}
             for peak, score in zip(peaks, scores, strict=True):
-                process = peak.config.process[axis]
-                if process.disturbance_sd == 0.0:
-                    score[number] -= WANDERS
-                elif process.disturbance_kind == "matern":
-                    score[number] -= SMOOTHER
-            kinds = [_kind(peak.config, axis) for peak in peaks]
-            if told and len(set(kinds)) > 1 and axis in self.reasons:
-                best_of_kind = dict[str, float]()
-                for kind, score in zip(kinds, scores, strict=True):
-                    best_of_kind[kind] = max(float(score[number]), best_of_kind.get(kind, -np.inf))
-                gain = max(best_of_kind[kind] for kind in best_of_kind if kind != "none") - best_of_kind.get(
-                    "none", -np.inf
-                )
-                why = f"(one {gain:+.1f})"
-                if np.isinf(gain):
+                kind = _kind(peak.config, axis)
+                score[number] -= _HANDICAPS[kind]
+                best_of_kind[kind] = max(float(score[number]), best_of_kind.get(kind, -np.inf))
+            if told and len(best_of_kind) > 1 and axis in self.reasons:
+                best = max(best_of_kind, key=lambda kind: best_of_kind[kind])
+                calm = best_of_kind.pop(_CALM, -np.inf)
+                why = f"(one {max(best_of_kind.values()) - calm:+.1f})"
+                if np.isinf(max(best_of_kind.values())):
                     soon = 1e3 * quickest(peaks[0].config)
                     why = f"(one would be forgotten within {soon:.0f} ms, too soon for an arm)"
-                self.reasons[axis].append(
-                    f"disturbance: {max(best_of_kind, key=lambda kind: best_of_kind[kind])} {why}"
-                )
+                self.reasons[axis].append(f"disturbance: {best} {why}")
         return _best_by_axis(self.likelihood, peaks, scores)
 
     def _without_needless(self, config: FusionConfig) -> FusionConfig:
@@ -357,7 +329,7 @@ def _narrower(config: FusionConfig) -> float:
 def _kind(config: FusionConfig, axis: str) -> str:
     """What disturbance an axis has, in words."""
     process = config.process[axis]
-    return "none" if process.disturbance_sd == 0.0 else _KINDS[process.disturbance_kind]
+    return _CALM if process.disturbance_sd == 0.0 else _KINDS[process.disturbance_kind]
 
 
 def _well_known(likelihood: Likelihood, config: FusionConfig, free: Sequence[Parameter]) -> set[str]:
