@@ -164,6 +164,11 @@ def reported(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
     return from_si(msgspec.to_builtins(_of_kind(value, axis), enc_hook=float))
 
 
+def json_text(tree: Any) -> str:
+    """A tree of dictionaries, lists and structs as JSON to read."""
+    return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode()
+
+
 def as_lengths(tree: Any, kind: Any = None) -> Any:
     """Tables with the key names for lengths, which are those of structs; names of fields of ``kind`` stay."""
     if not isinstance(tree, Mapping):

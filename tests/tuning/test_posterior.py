@@ -18,7 +18,6 @@ from pumafuse.tuning.posterior import (
     Mixture,
     Model,
     chosen_model,
-    own_worth,
     shared_delay,
     sharing,
 )
@@ -31,9 +30,7 @@ def branch(delay: float, sd: float, height: float = 0.0, model: Model = FIRST, l
     at = delay + sd * np.linspace(-5.0, 5.0, 41)
     log = height + norm.logpdf(at, delay, sd)
     pairs = zip(at.tolist(), log.tolist(), strict=True)
-    entries = [
-        Entry(t, Arm(t, 0.1 - t), one, {"lag": 0.1, "delay": t}, {"lag": lag_sd, "delay": 0.0}) for t, one in pairs
-    ]
+    entries = [Entry(Arm(t, 0.1 - t), one, {"lag": 0.1, "delay": t}, {"lag": lag_sd, "delay": 0.0}) for t, one in pairs]
     return Branch(model, entries)
 
 
@@ -56,16 +53,16 @@ def test_quantiles_over_models_are_those_of_the_mixture() -> None:
 def test_axes_that_agree_share_a_delay_and_others_do_not() -> None:
     """Delays 1 ms apart, known to 2 ms, are one; one that is 20 ms away is another; at most one is told apart."""
     near = {name: AxisPosterior([branch(at, 2e-3)]) for name, at in (("a", 0.080), ("b", 0.081), ("c", 0.1))}
-    assert sharing(near) == ["a", "b"]
-    assert sharing({name: near[name] for name in "ac"}) == []
-    assert sharing({"a": near["a"]}) == []
+    assert sharing(near)[0] == ["a", "b"]
+    assert sharing({name: near[name] for name in "ac"})[0] == []
+    assert sharing({"a": near["a"]})[0] == []
 
 
 def test_an_own_delay_is_worth_what_the_evidence_gains() -> None:
     """Two axes known to 1 ms and 1 ms apart: ∫ p₁p₂ of normal densities, times 50 ms and the ten to one of sharing."""
     pair = {name: AxisPosterior([branch(at, 1e-3)]) for name, at in (("a", 0.080), ("b", 0.081))}
     shared = norm.logpdf(1e-3, 0.0, math.sqrt(2.0) * 1e-3) + math.log(0.05) + 2.3
-    assert own_worth(pair, ["a", "b"]) == pytest.approx({"a": -shared, "b": -shared}, abs=0.05)
+    assert sharing(pair)[1] == pytest.approx({"a": -shared, "b": -shared}, abs=0.05)
 
 
 def test_a_shared_delay_weighs_the_axes_by_what_they_know() -> None:

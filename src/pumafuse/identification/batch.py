@@ -87,10 +87,8 @@ class Batch:
 
     def slopes(self, at: Point, order: Order) -> tuple[FloatArray, FloatArray]:
         """Derivatives by (delay, q, p) of the fitted response (k, R, m) and its amplitude (k, R); order 1 without p."""
-        raw = (
-            np.stack([self.project(change) for change in sensitivity(self.time, at.shape, order)])
-            * at.amplitude[:, None]
-        )
+        changes = [self.project(change) for change in sensitivity(self.time, at.shape, order)]
+        raw = np.stack(changes) * at.amplitude[:, None]
         share = np.einsum("kij,ij->ki", raw, at.unit) / _power(at.unit)
         return raw - share[:, :, None] * at.unit, -share
 

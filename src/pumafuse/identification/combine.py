@@ -304,10 +304,8 @@ def _choose(
 
 def _gain_line(together: Common, period: float, kind: Kind) -> tuple[Gain, float | None, str]:
     """K = a·speed + b with intervals, the p of its lack of fit, and what the line shows."""
-    speed, levels = (
-        np.array([trial.speed_at(period) for trial in together.trials]),
-        speed_levels(together.trials, period, kind),
-    )
+    speed = np.array([trial.speed_at(period) for trial in together.trials])
+    levels = speed_levels(together.trials, period, kind)
     distinct = ordered(set(levels))
     if len(distinct) == 1 or len(speed) < 4:
         level = common(together.gain, together.gain_sd)

@@ -126,8 +126,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True):
             "axes": {name: toml.reported(axis, axis.kind) for name, axis in self.arm.axes.items()},
             "provenance": self.arm.provenance,
         }
-        tree = toml.reported(self, self.kind) | {"arm": arm}
-        return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode()
+        return toml.json_text(toml.reported(self, self.kind) | {"arm": arm})
 
 
 def identify(

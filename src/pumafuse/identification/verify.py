@@ -27,10 +27,9 @@ from ..logs.run import Run
 from ..model.arm import ArmModel, commanded_speed
 from ..model.plants import PLANTS
 from ..toml import Interval
-from ..tuning.arms import Arm, Coordinates, Limits, Measured, NoiseModel, Recording
+from ..tuning.arms import Arm, Limits, Measured, Recording
 from ..tuning.plain import COMMANDS, LAGS, ROWS, delays
 from ..units import Kind
-from .estimate import t_quantile
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
@@ -44,7 +43,6 @@ _BETTER = 0.8  # share of the error below which a recovery is recommended
 
 _DAMPED = 1.0  # ζ of the grid, of second order
 _STARTS = 3  # cells of it to search from
-_BLOCKS = 10  # of a run, whose errors count as independent of each other
 _REAL = -np.inf, np.inf
 _ANY = Limits(  # s, s, 1, 1, s/m or s/rad: as far as arms may be given, and beyond what is seen of them
     {"delay": (0.0, 1e4), "lag": (1e-6, 1e4), "damping": (1e-3, 1e3), "gain": _REAL, "slope": _REAL}, {}
@@ -347,7 +345,8 @@ def best_in_class(measured: Measured, configured: Arm) -> BestInClass:
     near = max(fits, key=lambda fit: fit.log_posterior).arm
     noise = measured.white(near)  # beside the noise of a poor start the last steps seemed to gain nothing
     best, speed = measured.fitted(near, names, noise, _ANY).arm, float(moving.mean())
-    lag, half = best.model.lag(best.delay, speed), _half_width(measured, best, names, noise, speed)
+    lag = best.model.lag(best.delay, speed)
+    half = measured.half_width(best, names, noise, _ANY, lambda arm: arm.model.lag(arm.delay, speed))
     return BestInClass(
         fit=model_fit(measured, best),
         lag=lag,
@@ -363,13 +362,3 @@ def _on_grid(measured: Measured, arm: Arm) -> list[Arm]:
     part, alike = measured.excerpt(COMMANDS, ROWS), arm._replace(damping=_DAMPED if arm.damping else 0.0, slope=0.0)
     arms = [alike._replace(delay=delay, lag=lag) for delay, lag in product(delays(part).tolist(), LAGS.tolist())]
     return part.likeliest(arms, part.white(arm), _ANY, _STARTS)
-
-
-def _half_width(measured: Measured, arm: Arm, names: Coordinates, noise: NoiseModel, speed: float) -> float:
-    """Half the 95 % interval of the lag at a ``speed`` [m/s or rad/s].
-
-    What a model leaves over of a run is correlated, and each measurement alone would count far too much: a block of the
-    run counts as one observation (Bester, Conley & Hansen, J. Econometrics 165, 2011).
-    """
-    _, variance = measured.variances(arm, names, noise, _ANY, _BLOCKS, lambda arm: arm.model.lag(arm.delay, speed))
-    return t_quantile(_BLOCKS - 1) * (variance * _BLOCKS / (_BLOCKS - 1)) ** 0.5

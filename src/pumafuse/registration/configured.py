@@ -91,10 +91,8 @@ def placed_by(
     config: FusionConfig, registrations: Mapping[str, Registration], latencies: Mapping[str, Quantity]
 ) -> FusionConfig:
     """The configuration with frame, marker, latency and bias of sensors."""
-    constants, count = (
-        _constants(config.arm, registrations),
-        sum(registration.frame is not None for registration in registrations.values()),
-    )
+    constants = _constants(config.arm, registrations)
+    count = sum(registration.frame is not None for registration in registrations.values())
     sensors = {
         name: msgspec.structs.replace(
             config.sensors[name],

@@ -43,6 +43,42 @@ class Reading(enum.Enum):
     W_LAST = "with w last (order = 'xyzw')"
 
 
+_UNTOLD = "the commands tell no orientation (run.toml), by which alone one knows where its marker is"
+_UNTRUE = (
+    "are units, the order and the unit of orientations right, of the commands, too (run.toml)? A path that drifts, or"
+    " poses that no arm commands, leave as much"
+)
+_WORDS = {
+    Finding.SHORT: "has {size:.1f} s of measurements beside commands: too little to register it; record 10 s or more",
+    Finding.UNRELATED: (
+        "does not move with the tool (correlation of speeds {size:+.2f}): is it of this run and clock?"
+    ),
+    Finding.UNEXPLAINED: "moves with the tool, and no frame explains how: {percent:.0f} % are left; {why}",
+    Finding.MIRRORED: (
+        "has left-handed axes beside the commands': is a sign wrong, or are two axes exchanged (run.toml)?"
+    ),
+    Finding.LINE: "saw motion along ({axis}) of the base only: how it is turned about that is not known",
+    Finding.PLANE: "saw motion in a plane only: its axes are taken to be right-handed, which nothing tells",
+    Finding.SCALE: (
+        "measures lengths that are to be multiplied by {size:.4g}{scale_of}: mend unit or scale (run.toml)"
+    ),
+    Finding.STILL: "saw a tool that does not turn: its marker stays as given, and the frame's place makes up for it",
+    Finding.ONE_AXIS: "saw the tool turn about ({axis}) of its own only: along that the marker stays as given",
+    Finding.READING: "and the commands turn alike if the orientations of the {source} are read {reading}",
+    Finding.ATTITUDE: (
+        "tells orientations in another frame than positions, turned by {degrees:.1f}°: its orientations are not used"
+    ),
+    Finding.ATTITUDE_UNRELATED: (
+        "tells orientations that do not follow the commanded ones: they are not used{angles_of}"
+    ),
+    Finding.AHEAD: (
+        "moves {ms:.1f} ms before an arm can that holds each command: are these samples of a path (interpolation_ms in"
+        " run.toml), or is a clock off (shift_s)?"
+    ),
+    Finding.ALONG_BASE: "measures along the base's axes, as far as the motion tells: no frame is written",
+}
+
+
 class Found(msgspec.Struct, frozen=True, kw_only=True):
     """A finding with its numbers."""
 
@@ -63,55 +99,17 @@ class Found(msgspec.Struct, frozen=True, kw_only=True):
 
     def sentence(self, sensor: str) -> str:
         """What to know of a sensor, and what to do."""
-        size, axis = self.size or 0.0, ", ".join(f"{number:.3f}" for number in self.axis or ())
-        match self.finding:
-            case Finding.SHORT:
-                what = (
-                    f"has {size:.1f} s of measurements beside commands: too little to register it; record 10 s or more"
-                )
-            case Finding.UNRELATED:
-                what = f"does not move with the tool (correlation of speeds {size:+.2f}): is it of this run and clock?"
-            case Finding.UNEXPLAINED:
-                why = (
-                    "the commands tell no orientation (run.toml), by which alone one knows where its marker is"
-                    if self.source == "command"
-                    else f"{self.unit} (run.toml)"
-                    if self.unit
-                    else "are units, the order and the unit of orientations right, of the commands, too (run.toml)?"
-                    " A path that drifts, or poses that no arm commands, leave as much"
-                )
-                what = f"moves with the tool, and no frame explains how: {100.0 * size:.0f} % are left; {why}"
-            case Finding.MIRRORED:
-                what = (
-                    "has left-handed axes beside the commands': is a sign wrong, or are two axes exchanged (run.toml)?"
-                )
-            case Finding.LINE:
-                what = f"saw motion along ({axis}) of the base only: how it is turned about that is not known"
-            case Finding.PLANE:
-                what = "saw motion in a plane only: its axes are taken to be right-handed, which nothing tells"
-            case Finding.SCALE:
-                unit = f", as if it were {self.unit}, or the commands the other way round" if self.unit else ""
-                what = f"measures lengths that are to be multiplied by {size:.4g}{unit}: mend unit or scale (run.toml)"
-            case Finding.STILL:
-                what = "saw a tool that does not turn: its marker stays as given, and the frame's place makes up for it"
-            case Finding.ONE_AXIS:
-                what = f"saw the tool turn about ({axis}) of its own only: along that the marker stays as given"
-            case Finding.READING:
-                reading = "" if self.reading is None else self.reading.value
-                what = f"and the commands turn alike if the orientations of the {self.source} are read {reading}"
-            case Finding.ATTITUDE:
-                what = (
-                    f"tells orientations in another frame than positions, turned by {size * DEG:.1f}°:"
-                    " its orientations are not used"
-                )
-            case Finding.ATTITUDE_UNRELATED:
-                unit = f"; {self.unit} (run.toml)" if self.unit else ""
-                what = f"tells orientations that do not follow the commanded ones: they are not used{unit}"
-            case Finding.AHEAD:
-                what = (
-                    f"moves {size * MS:.1f} ms before an arm can that holds each command: are these samples of a path"
-                    " (interpolation_ms in run.toml), or is a clock off (shift_s)?"
-                )
-            case Finding.ALONG_BASE:
-                what = "measures along the base's axes, as far as the motion tells: no frame is written"
-        return f"{sensor} {what}"
+        size, unit = self.size or 0.0, f"{self.unit} (run.toml)" if self.unit else ""
+        words = _WORDS[self.finding].format(
+            size=size,
+            percent=100.0 * size,
+            degrees=size * DEG,
+            ms=size * MS,
+            axis=", ".join(f"{number:.3f}" for number in self.axis or ()),
+            source=self.source,
+            reading=self.reading and self.reading.value,
+            why=_UNTOLD if self.source == "command" else unit or _UNTRUE,
+            scale_of=f", as if it were {self.unit}, or the commands the other way round" if self.unit else "",
+            angles_of=f"; {unit}" if unit else "",
+        )
+        return f"{sensor} {words}"

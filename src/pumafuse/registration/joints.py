@@ -67,10 +67,8 @@ def joint_lags(
 def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Registration) -> _Step:
     """How much later each joint is beside a registration."""
     sensor = _seen(told(later), sensor)
-    attitude, mean = (
-        registration.rms_rotation is not None,
-        np.concatenate([motion.position for motion in sensor]).mean(axis=0),
-    )
+    attitude = registration.rms_rotation is not None
+    mean = np.concatenate([motion.position for motion in sensor]).mean(axis=0)
     state = _state(registration, mean)
 
     def beside(commands: Later) -> Rows:

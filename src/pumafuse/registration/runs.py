@@ -96,8 +96,7 @@ class Registrations:
 
     def to_json(self) -> str:
         """All of it as JSON, in the units of the names."""
-        tree = toml.reported(self.details)
-        return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode() + "\n"
+        return toml.json_text(toml.reported(self.details)) + "\n"
 
 
 def register(
@@ -286,11 +285,8 @@ def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, 
 
 def _without_frame(registration: Registration) -> Registration:
     """The same of a sensor that needs no frame, nor a marker where that is the tool point."""
-    seen = (
-        registration.marker
-        if registration.marker and not is_here(registration.marker.at, registration.marker.rotation)
-        else None
-    )
+    marker = registration.marker
+    seen = marker if marker and not is_here(marker.at, marker.rotation) else None
     return msgspec.structs.replace(registration, frame=None, marker=seen)
 
 

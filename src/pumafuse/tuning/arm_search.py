@@ -42,7 +42,6 @@ from .posterior import (
     Model,
     Quantity,
     chosen_model,
-    own_worth,
     shared_delay,
     sharing,
 )
@@ -168,7 +167,7 @@ class ArmSearch:
         entries = [entry for branch in self.posterior.branches if branch.model == model for entry in branch.entries]
         if delay is None:
             return max(entries, key=lambda entry: entry.log_density).arm
-        near = min(entries, key=lambda entry: abs(entry.delay - delay)).arm._replace(delay=delay)
+        near = min(entries, key=lambda entry: abs(entry.arm.delay - delay)).arm._replace(delay=delay)
         names = [name for name in self.freedom.names(model) if name != "delay"]
         return self._measured.fitted(near, names, self.noise, self.limits).arm
 
@@ -398,7 +397,7 @@ class ArmSearch:
         for quantity, mean in means.items():
             slope = np.array([(beside[quantity] - mean) / _SLOPE for beside in moved])
             sds[quantity] = math.sqrt(max(float(slope @ cov @ slope), 0.0)) if free else 0.0
-        return Entry(fit.arm.delay, fit.arm, self._laplace(fit, names, inside), means, sds)
+        return Entry(fit.arm, self._laplace(fit, names, inside), means, sds)
 
 
 class Chosen(NamedTuple):
@@ -419,9 +418,8 @@ def chosen_arms(
     That of ``delayed`` axes is free; with ``one_delay`` they share one whatever the measurements say.
     """
     posteriors = {axis: search.posterior for axis, search in searched.items() if axis in delayed}
-    shares = list(posteriors) if one_delay else sharing(posteriors)
+    shares, worth = (list(posteriors), dict[str, float]()) if one_delay else sharing(posteriors)
     delay, chosen = shared_delay([posteriors[axis] for axis in shares]) if shares else None, dict[str, Chosen]()
-    worth = {} if one_delay else own_worth(posteriors, shares)
     for axis, search in searched.items():
         is_shared, posterior = axis in shares, search.posterior
         others = [posteriors[other] for other in shares if is_shared and other != axis]

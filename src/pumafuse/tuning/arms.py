@@ -54,6 +54,7 @@ _REACH = {
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _NUDGE = 1e-5  # of a coordinate, by which a size is varied
 _SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
+_BLOCKS, _STUDENT = 10, 2.262157  # of the motion; the 97.5 % point of Student's t distribution of one fewer
 _LOG_2PI = math.log(2.0 * math.pi)
 
 Coordinates: TypeAlias = Sequence[str]  # among the fields below
@@ -224,12 +225,9 @@ class Measured:
 
     def left(self, arm: Arm) -> FloatArray:
         """What an arm leaves of the measurements that count, of each recording about its mean [m]."""
-        parts = [
-            left[part.weight > 0.0]
-            for left, part in zip(self.residuals(arm), self.recordings, strict=True)
-            if part.weight.any()
-        ]
-        return np.concatenate([left - left.mean() for left in parts] or [np.zeros(0)])
+        parts = zip(self.residuals(arm), self.recordings, strict=True)
+        counted = [left[part.weight > 0.0] for left, part in parts if part.weight.any()]
+        return np.concatenate([left - left.mean() for left in counted] or [np.zeros(0)])
 
     def squares(self, arm: Arm) -> float:
         """The sum of the squares that an arm leaves [m²]."""
@@ -239,22 +237,16 @@ class Measured:
     @property
     def power(self) -> float:
         """The sum of squares of all that is measured [m²], of each recording about its mean."""
-        return sum(
-            float(np.var(recording.value) * len(recording.value))
-            for recording in self.recordings
-            if len(recording.value)
-        )
+        values = [recording.value for recording in self.recordings if len(recording.value)]
+        return sum(float(np.var(value) * len(value)) for value in values)
 
     def without_far_from(self, arm: Arm, times: float) -> Measured:
         """Without measurements so many times as far off an arm as half of them are: those in motion, and those at rest.
 
         What is nearer than a small part of the motion does no harm.
         """
-        left = np.abs(
-            np.concatenate(
-                [residual - np.median(residual) if len(residual) else residual for residual in self.residuals(arm)]
-            )
-        )
+        residuals = [left - np.median(left) if len(left) else left for left in self.residuals(arm)]
+        left = np.abs(np.concatenate(residuals))
         moving = self.of(
             [recording._replace(weight=np.ones(len(recording.time))) for recording in self.recordings]
         ).moving
@@ -423,6 +415,17 @@ class Measured:
         weight = covariance(self._linear(arm, free, noise, limits).information) @ slope
         return float(slope @ weight), float(np.sum((weight @ scores) ** 2))
 
+    def half_width(
+        self, arm: Arm, names: Coordinates, noise: NoiseModel, limits: Limits, size: Callable[[Arm], float]
+    ) -> float:
+        """Half the 95 % interval of a size.
+
+        What an arm leaves is correlated, and each measurement alone would count far too much: a block of the motion
+        counts as one observation (Bester, Conley & Hansen, J. Econometrics 165, 2011).
+        """
+        _, variance = self.variances(arm, names, noise, limits, _BLOCKS, size)
+        return _STUDENT * math.sqrt(variance * _BLOCKS / (_BLOCKS - 1))
+
     def shifts(
         self, arm: Arm, names: Coordinates, noise: NoiseModel, count: int
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
@@ -505,12 +508,8 @@ class Measured:
 
     def _columns(self, recording: Recording) -> FloatArray:
         """The measurements, and for each sensor but the first which are its, (s, m)."""
-        return np.array(
-            [
-                recording.value,
-                *((recording.source == other).astype(np.float64) for other in range(1, len(self.sensors))),
-            ]
-        )
+        others = [recording.source == other for other in range(1, len(self.sensors))]
+        return np.array([recording.value, *others], dtype=np.float64)
 
     def _responses(self, arms: Sequence[Arm]) -> list[FloatArray]:
         """The responses of arms, for each recording (n, m)."""

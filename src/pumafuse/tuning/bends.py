@@ -37,7 +37,6 @@ _MANY = 1.02  # times those that are near the linear arm
 _KINDS = (("play", "max_speed", "sag"), ("stops",))  # of bends; sags have one knee, stops one on each side
 _SAGS = ("sag", "stops")
 _SLOPES = {"beyond": "slope_beyond", "below": "slope_below"}  # as a sag has them
-_BLOCKS, _STUDENT = 10, 2.262  # of the motion; the 97.5 % point of Student's t distribution of one fewer
 
 
 class Bent(NamedTuple):
@@ -189,17 +188,16 @@ class _Search:
         return self._wholes[key]
 
     def sag_half(self, kinds: Sequence[str]) -> dict[str, float]:
-        """Half the 95 % interval of each number of the sag of the whole arm, by the scatter over blocks of the motion.
-
-        What an arm leaves is correlated: a block counts as one observation (see :mod:`pumafuse.identification.verify`).
-        """
-        arm, halves = self.whole(kinds), dict[str, float]()
+        """Half the 95 % interval of each number of the sag of the whole arm."""
+        arm = self.whole(kinds)
         (names, limits), noise = self._coordinates(arm, kinds), self.measured.white(arm)
-        for name in (name for name in SAG if name in names):
-            size = partial(Arm.coordinate, name=name)
-            _, variance = self.measured.variances(arm, names, noise, limits, _BLOCKS, size)
-            halves[_SLOPES.get(name, name)] = _STUDENT * math.sqrt(variance * _BLOCKS / (_BLOCKS - 1))
-        return halves
+        return {
+            _SLOPES.get(name, name): self.measured.half_width(
+                arm, names, noise, limits, partial(Arm.coordinate, name=name)
+            )
+            for name in SAG
+            if name in names
+        }
 
     def off(self, kinds: Sequence[str]) -> FloatArray:
         """The mean square [m²] that each half leaves of an arm that was fitted to the other, (2,)."""

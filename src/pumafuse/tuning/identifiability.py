@@ -215,12 +215,8 @@ def shared_times(
     for axis in axes:
         joined = [group for group in groups if group[1] & {*sensors[axis]}]
         groups = [group for group in groups if group not in joined]
-        groups.append(
-            (
-                {axis}.union(*(axes_there for axes_there, _ in joined)),
-                {*sensors[axis]}.union(*(names_there for _, names_there in joined)),
-            )
-        )
+        together = {axis}.union(*(axes_there for axes_there, _ in joined))
+        groups.append((together, {*sensors[axis]}.union(*(names_there for _, names_there in joined))))
     moved = set[str]().union(*(names for _, names in groups))
     unidentifiable = [
         NotIdentifiable((latency.key,), latency.key) for name, latency in latencies.items() if name not in moved

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +29,6 @@ _HALVINGS = 26
 _LAG_STEP = 1e-5  # of a coordinate
 _UNLIMITED = 10.0  # s; an interval of a lag as wide as this is none
 _SHARES = (0.5, 1.0, 1.5)  # of the way from the best to an end of the interval: points that are drawn
-_SAME = 1e-6  # relative, of distances
 _VALLEY = 0.3  # log-likelihood between two maxima below the lower one, from which they are two
 _NEXT_TO_NONE = 1e-2  # of the upper end, from which a noise's interval is drawn from 0
 _FALLEN = 1.2  # times 1.96 standard deviations, from which a maximum may be another one than that inside
@@ -255,16 +253,8 @@ class _Side:
 
     def root(self, distance: float) -> float:
         """The standard deviations that the drop of the profile at a distance stands for."""
-        distance = next(
-            (
-                distance_before
-                for distance_before in self._maxima
-                if math.isclose(distance_before, distance, rel_tol=_SAME)
-            ),
-            distance,
-        )
         if distance not in self._maxima:
-            inner = max(distance_before for distance_before in self._maxima if distance_before < distance)
+            inner = max(before for before in self._maxima if before < distance)
             maximum = self._maximum(distance, self._expected(distance))
             if _root(maximum.drop) > _FALLEN * Z95:  # another maximum, perhaps: the one inside goes on
                 beside = self._maximum(distance, self._maxima[inner].others)
@@ -312,10 +302,7 @@ class _Side:
 
     def _expected(self, distance: float) -> FloatArray:
         """The other coordinates at a distance by those that are known: between two, or onwards from the last."""
-        inner, outer = (
-            [distance_before for distance_before in sorted(self._maxima) if (distance_before > distance) == beyond]
-            for beyond in (False, True)
-        )
+        inner, outer = ([at for at in sorted(self._maxima) if (at > distance) == beyond] for beyond in (False, True))
         last, at = inner[-1], self._maxima[inner[-1]].others
         if outer:
             return at + (distance - last) / (outer[0] - last) * (self._maxima[outer[0]].others - at)
@@ -367,11 +354,7 @@ def lag_intervals(likelihood: Likelihood, best: Point, free: Sequence[Parameter]
     if not slopes:
         return {}
     bounds = [parameter.at_bound(best.config) for parameter in free]
-    inside = [
-        n
-        for n, (parameter, bound) in enumerate(zip(free, bounds, strict=True))
-        if bound is None or parameter.fit == "delay"
-    ]
+    inside = [n for n, bound in enumerate(bounds) if bound is None or free[n].fit == "delay"]
     some = [free[n] for n in inside]
     _, information, scatter = derivatives(likelihood, best, some)
     cov = covariance(information, some)

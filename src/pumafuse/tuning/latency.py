@@ -225,7 +225,7 @@ class Latency:
         """All of it as JSON, in the units of the names."""
         tree = toml.reported(self.details)
         tree["axes"] = {axis: toml.reported(lag, lag.kind) for axis, lag in self.details.axes.items()}
-        return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode() + "\n"
+        return toml.json_text(tree) + "\n"
 
 
 def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
@@ -548,14 +548,7 @@ def _sensors(
         if alignment is None:
             notes.append(_APART.format(name, trusted))
             continue
-        lags[name] = SensorLag(
-            latency=alignment.latency,
-            latency_ci95=alignment.latency_ci95,
-            latency_sd=alignment.latency_sd,
-            scale=alignment.scale,
-            scale_ci95=alignment.scale_ci95,
-            steps=[LatencyStep(time=step.time, before=step.before, after=step.after) for step in alignment.steps],
-        )
+        lags[name] = msgspec.convert(alignment, SensorLag, from_attributes=True)
         notes += alignment.doubts(name, trusted)
         sd = sensor.sd if isinstance(sensor.sd, dict) else {}
         better = msgspec.structs.replace(

@@ -159,10 +159,8 @@ class Likelihood:
         }
         self.config = config
         self.axes = tuple(axis for axis in config.arm.axes if any(axis in segment.axes for segment in built))
-        self._segments, self._runs = (
-            [_decided(segment, until, latest) for segment in built],
-            [name for name, _ in named],
-        )
+        self._segments = [_decided(segment, until, latest) for segment in built]
+        self._runs = [name for name, _ in named]
         every = sum(int(np.count_nonzero(part.measurement_rows.codes == Outcome.FUSED)) for part in self._segments)
         if every > _MOST:
             self._segments = [_liveliest(segment, _MOST / every) for segment in self._segments]

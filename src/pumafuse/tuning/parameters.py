@@ -240,12 +240,10 @@ def parameters(
             continue
         if parameter.is_noise:
             of = str(parameter.sensor), str(parameter.axis)
-            parameter = replace(
-                parameter, bounds=(max(resolution.get(of, 0.0), parameter.bounds[0]), parameter.bounds[1])
-            )
-            parameter = (
-                replace(parameter, prior=(parameter.coordinate(believed[of]), BELIEF)) if of in believed else parameter
-            )
+            least, most = parameter.bounds
+            parameter = replace(parameter, bounds=(max(resolution.get(of, 0.0), least), most))
+            if of in believed:
+                parameter = replace(parameter, prior=(parameter.coordinate(believed[of]), BELIEF))
         free.append(parameter)
     return free
 
@@ -275,11 +273,9 @@ def _belongs(parameter: Parameter, config: FusionConfig, axes: Iterable[str]) ->
     if parameter.fit == "bias" and parameter.sensor is not None:
         drift = config.sensors[parameter.sensor].bias_drift_sd
         if isinstance(drift, dict):  # one for each axis
-            return (
-                drift.get(parameter.axis, 0.0) > 0.0
-                if parameter.axis is not None
-                else parameter.path[-1] == "bias_time"
-            )
+            if parameter.axis is None:
+                return parameter.path[-1] == "bias_time"
+            return drift.get(parameter.axis, 0.0) > 0.0
         return parameter.axis is None and drift > 0.0
     if parameter.fit == "delay":
         shares = [axis for axis in axes if config.arm.axes[axis].delay is None]

@@ -225,10 +225,8 @@ def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[s
     for axis, plain_here in plain.items():
         if plain_here is not None:
             configured = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
-            doubt, ends = (
-                Doubt(plain_here, off(plain_here.measured, configured), configured.total),
-                (*plain_here.lag_ci95, plain_here.delayed.total),
-            )
+            doubt = Doubt(plain_here, off(plain_here.measured, configured), configured.total)
+            ends = *plain_here.lag_ci95, plain_here.delayed.total
             allowed = min(ends) <= configured.total <= max(ends)
             if doubt.is_worse or not (allowed or configured.play or configured.max_speed or configured.slope):
                 doubts_by_axis[axis] = doubt

@@ -53,7 +53,6 @@ MODELS = tuple(Model(*pair) for pair in product((1, 2), GAINS))
 class Entry:
     """The most likely arm of a model with one delay."""
 
-    delay: float  # the delay [s]
     arm: Arm  # the arm
     log_density: float  # of the delay and the model, with Laplace's approximation for the other numbers
     means: Mapping[Quantity, float]  # of each quantity that the model has
@@ -70,7 +69,7 @@ class Branch:
     @property
     def delays(self) -> FloatArray:
         """Of the entries [s], (n,)."""
-        return np.array([entry.delay for entry in self.entries])
+        return np.array([entry.arm.delay for entry in self.entries])
 
     @property
     def log_density(self) -> FloatArray:
@@ -79,17 +78,14 @@ class Branch:
 
     def at(self, delays: FloatArray) -> FloatArray:
         """The log-density at delays, (m,): beyond the ends as it falls there; where it does not, that is not known."""
-        delays_here, logs = self.delays, self.log_density
-        if len(delays_here) < 2:
-            return np.where(np.abs(delays - delays_here[0]) < SHORTEST, logs[0], -np.inf)
-        middle = np.interp(delays, delays_here, logs)
-        low, high = (
-            (logs[1] - logs[0]) / (delays_here[1] - delays_here[0]),
-            (logs[-1] - logs[-2]) / (delays_here[-1] - delays_here[-2]),
-        )
-        below = logs[0] + low * (delays - delays_here[0]) if low > 0.0 else -np.inf
-        above = logs[-1] + high * (delays - delays_here[-1]) if high < 0.0 else -np.inf
-        return np.where(delays < delays_here[0], below, np.where(delays > delays_here[-1], above, middle))
+        here, logs = self.delays, self.log_density
+        if len(here) < 2:
+            return np.where(np.abs(delays - here[0]) < SHORTEST, logs[0], -np.inf)
+        low, high = (logs[1] - logs[0]) / (here[1] - here[0]), (logs[-1] - logs[-2]) / (here[-1] - here[-2])
+        below = logs[0] + low * (delays - here[0]) if low > 0.0 else -np.inf
+        above = logs[-1] + high * (delays - here[-1]) if high < 0.0 else -np.inf
+        middle = np.interp(delays, here, logs)
+        return np.where(delays < here[0], below, np.where(delays > here[-1], above, middle))
 
 
 class Mixture(NamedTuple):
@@ -107,8 +103,8 @@ class Mixture(NamedTuple):
         chosen_weight, others = (float(self.weight[some].sum()) for some in (models, ~models))
         return math.log(max(chosen_weight, _NEVER)) - math.log(max(others, _NEVER))
 
-    def quantiles(self, quantity: Quantity, chosen: Callable[[Model], bool], share: float = 0.95) -> tuple[float, ...]:
-        """The ends of the middle ``share`` of a quantity under the models that are chosen."""
+    def quantiles(self, quantity: Quantity, chosen: Callable[[Model], bool]) -> tuple[float, ...]:
+        """The ends of the middle 95 % of a quantity under the models that are chosen."""
         from scipy.special import ndtr  # takes a while to import
 
         models = np.array([chosen(model) for model in MODELS])
@@ -119,7 +115,7 @@ class Mixture(NamedTuple):
         if len(grid) > _GRID:
             grid = grid[np.linspace(0, len(grid) - 1, _GRID).astype(np.int64)]
         below = ndtr((grid[:, None] - mean) / sd) @ weight / weight.sum()
-        return tuple(float(np.interp(0.5 + sign * 0.5 * share, below, grid)) for sign in (-1.0, 1.0))
+        return tuple(float(np.interp(0.5 + sign * 0.475, below, grid)) for sign in (-1.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -177,33 +173,23 @@ class AxisPosterior:
 # ---- axes together --------------------------------------------------------------------------------------------------
 
 
-def sharing(posteriors: Mapping[str, AxisPosterior]) -> list[str]:
-    """The axes that share one delay: all but those whose measurements are likelier with one of their own.
+def sharing(posteriors: Mapping[str, AxisPosterior]) -> tuple[list[str], dict[str, float]]:
+    """The axes that share one delay, and by how much the measurements of each axis are likelier with one of its own.
 
-    The delays of axes that do not share one are taken to lie within some 50 ms of each other.
+    Those share one to which an own one is not worth it. The delays of axes that do not are taken to lie within some
+    50 ms of each other.
     """
-    if len(posteriors) < 2:
-        return []
-    gain = _gain_of_sharing(posteriors)
-    shares: list[str] = list(posteriors)
-    while len(shares) > 1:
-        fewer: list[list[str]] = [[axis for axis in shares if axis != left_out] for left_out in shares]
-        best = max(fewer, key=gain)
-        if gain(shares) >= gain(best):
-            return shares
-        shares = best
-    return []
-
-
-def own_worth(posteriors: Mapping[str, AxisPosterior], shares: Sequence[str]) -> dict[str, float]:
-    """By how much each axis's measurements are likelier with a delay of its own than with the shared one."""
-    if not shares:
-        return {}
-    gain = _gain_of_sharing(posteriors)
-    return {
-        axis: gain(other for other in shares if other != axis) - gain(dict.fromkeys([*shares, axis]))
-        for axis in posteriors
-    }
+    gain, shares = _gain_of_sharing(posteriors) if len(posteriors) > 1 else None, list(posteriors)
+    while gain and len(shares) > 1:
+        worth = {
+            axis: gain(other for other in shares if other != axis) - gain(dict.fromkeys([*shares, axis]))
+            for axis in posteriors
+        }
+        alone = max(shares, key=lambda axis: worth[axis])
+        if worth[alone] <= 0.0:
+            return shares, worth
+        shares.remove(alone)
+    return [], {}
 
 
 def _gain_of_sharing(posteriors: Mapping[str, AxisPosterior]) -> Callable[[Iterable[str]], float]:

@@ -264,19 +264,15 @@ class Search:
         return config
 
 
-def arm_searches(
-    likelihood: Likelihood, config: FusionConfig, free: FreeOf, believed: bool, searched: Mapping[str, ArmSearch]
-) -> dict[str, ArmSearch]:
+def arm_searches(likelihood: Likelihood, config: FusionConfig, free: FreeOf, believed: bool) -> dict[str, ArmSearch]:
     """The arm of each axis as far as it is free, and what it leaves, by sensors whose latency is known and steady.
 
-    ``believed``: the sensors' noise, to be what second differences show; ``searched``: arms of an earlier search.
+    ``believed``: the sensors' noise, to be what second differences show.
     """
     late = {parameter.sensor for parameter in free(config) if parameter.fit == "latency"}
     late |= {name for name, sensor in config.sensors.items() if sensor.latency_sd}
 
     def of(axis: str) -> ArmSearch:
-        if axis in searched:
-            return searched[axis]
         names = [name for name in likelihood.sensors[axis] if name not in late] or list(likelihood.sensors[axis])
         least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
         measured = likelihood.measured(axis, config, names)

@@ -77,16 +77,10 @@ class Stage:
     arms: Mapping[str, ArmSearch]  # the arms that were looked for, by axis
 
 
-def run_stage(
-    runs: Sequence[Run],
-    config: FusionConfig,
-    plan: Plan,
-    notify: Notify = ignore,
-    earlier: Mapping[str, ArmSearch] | None = None,
-) -> Stage:
+def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Notify = ignore) -> Stage:
     """Fit the parameters of a plan; where a combination is not identifiable, fix one of it and go on.
 
-    ``earlier``: the arms of axes that were searched for already. Raises a PumafuseError where nothing can be fitted.
+    Raises a PumafuseError where nothing can be fitted.
     """
     likelihood = likelihood_of(runs, config, plan)
     excited, fixed = excited_axes(likelihood, config), list[NotIdentifiable]()
@@ -109,7 +103,7 @@ def run_stage(
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
-    arms = arm_searches(likelihood, start, free, plan.sd_prior, earlier or {})
+    arms = arm_searches(likelihood, start, free, plan.sd_prior)
     searched = {axis: search for axis, search in arms.items() if search.freedom.free}
     if plan.sd_prior:
         believed |= likelihood.scatter
@@ -123,11 +117,8 @@ def run_stage(
             best, notes = maximise_with_gates(likelihood, biased, free(biased), notify), [*notes, *more]
     best = _identified(likelihood, best, free, config, fixed, notify)
     used = {name for names in likelihood.sensors.values() for name in names}
-    notes += [
-        f"{axis}: does not move; only its noise at rest was fitted"
-        for axis in likelihood.sensors
-        if axis not in excited
-    ]
+    still = [axis for axis in likelihood.sensors if axis not in excited]
+    notes += [f"{axis}: does not move; only its noise at rest was fitted" for axis in still]
     notes += [
         f"{name}: was fitted with a gate of {_GATE:g}, not of {sensor.gate:g}: outliers must not count, good"
         " measurements must"

@@ -189,8 +189,7 @@ def encode(summary: TuningSummary) -> str:
     tree = msgspec.to_builtins(summary) | {"biases": [toml.reported(bias, bias.kind) for bias in summary.biases]}
     if summary.validation is not None:
         tree["validation"] = [toml.reported(check, check.kind) for check in summary.validation]
-    encoder = msgspec.json.Encoder(decimal_format="number")
-    return msgspec.json.format(encoder.encode(tree), indent=2).decode() + "\n"
+    return toml.json_text(tree) + "\n"
 
 
 def fitted(

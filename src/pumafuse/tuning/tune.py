@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Literal, TypeAlias, cast
@@ -19,7 +19,6 @@ from ..fusion.placing import with_tool
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..units import MS
-from .arm_search import ArmSearch
 from .identifiability import FEWEST, TuneError, correlations, excited_axes, least_count
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, Point
@@ -155,7 +154,7 @@ def tune(
             held, start = replace(plan, fixed=[*fixed, *(f"axes.{axis}" for axis in refuted)]), config
             for axis in refuted:
                 start = with_plain_arm(start, axis, doubted_axes[axis].plain.arm)
-            pipeline = Pipeline(runs, start, plans(start, held, trust), progress, pipeline.arms_but(refuted))
+            pipeline = Pipeline(runs, start, plans(start, held, trust), progress)
             pipeline.fit()
         if validate is not None:
             validation = check(validate, config, pipeline.result())
@@ -258,17 +257,8 @@ def plans(config: FusionConfig, whole: Plan, trust: str | None) -> list[Plan]:
 class Pipeline:
     """Stages one after the other, each from where the last one ended; the best is there at any moment."""
 
-    def __init__(
-        self,
-        runs: Sequence[Run],
-        config: FusionConfig,
-        plans: Sequence[Plan],
-        progress: Progress,
-        searched: Sequence[Mapping[str, ArmSearch]] = (),
-    ) -> None:
-        """``searched``: of each stage, the arms of axes that were searched for already."""
+    def __init__(self, runs: Sequence[Run], config: FusionConfig, plans: Sequence[Plan], progress: Progress) -> None:
         self.runs, self.config, self.plans, self.progress = runs, config, plans, progress
-        self._searched = searched or [{} for _ in plans]
         self.whole = likelihood_of(runs, config, plans[-1])  # of all measurements
         self.best = config  # so far, with the gates of the search and all digits
         self.stages: list[Stage] = []  # that are complete; none where the configuration as given is the result
@@ -286,8 +276,8 @@ class Pipeline:
             self.best, self.stages = point.config, stages
             self.progress("searching", point.log_likelihood)
 
-        for plan, searched in zip(self.plans, self._searched, strict=True):
-            stages.append(run_stage(self.runs, config, plan, notify, searched))
+        for plan in self.plans:
+            stages.append(run_stage(self.runs, config, plan, notify))
             config = stages[-1].best.config
         if not any(stage.free for stage in stages):
             why = [str(combination) for stage in stages for combination in stage.not_identifiable]
@@ -307,10 +297,6 @@ class Pipeline:
     def log_likelihood(self) -> float:
         """Of the best configuration."""
         return _evaluated(self.whole, self.best).log_likelihood
-
-    def arms_but(self, axes: Collection[str]) -> list[dict[str, ArmSearch]]:
-        """The arms that each stage searched for, but for those of some axes."""
-        return [{axis: search for axis, search in stage.arms.items() if axis not in axes} for stage in self.stages]
 
     def doubts(self) -> dict[str, Doubt]:
         """Of the arms that were fitted: see :func:`.plain.doubts`."""
