@@ -271,18 +271,19 @@ class Measured:
     def jitter(self, arm: Arm) -> FloatArray:
         """White noise of each sensor [m], (s,), by second differences of what an arm leaves where it is calm."""
         sds = np.full(len(self.sensors), float(self.white(arm).sd[0]))
-        moved = self.responses(arm)
+        responses = self.responses(arm)
         for number in range(len(sds)):
-            chosen = [(recording.source == number) & (recording.weight > 0.0) for recording in self.recordings]
-            paths = [path[rows] for path, rows in zip(moved, chosen, strict=True) if rows.sum() > 2]
-            seen = [
-                recording.value[rows] for recording, rows in zip(self.recordings, chosen, strict=True) if rows.sum() > 2
-            ]
-            if paths:
-                bends = np.concatenate([np.abs(np.diff(z - r, 2)) for z, r in zip(seen, paths, strict=True)])
-                ways = np.concatenate([np.ptp([r[:-2], r[1:-1], r[2:]], axis=0) for r in paths])
-                calm = ways <= np.quantile(ways, _CALM)
-                sds[number] = max(float(np.median(bends[calm])) / _BEND, _SMALLEST)
+            bends, ways = list[FloatArray](), list[FloatArray]()
+            for recording, moved in zip(self.recordings, responses, strict=True):
+                rows = (recording.source == number) & (recording.weight > 0.0)
+                if rows.sum() > 2:
+                    path = moved[rows]
+                    bends.append(np.abs(np.diff(recording.value[rows] - path, 2)))
+                    ways.append(np.ptp([path[:-2], path[1:-1], path[2:]], axis=0))
+            if ways:
+                way = np.concatenate(ways)
+                calm = np.concatenate(bends)[way <= np.quantile(way, _CALM)]
+                sds[number] = max(float(np.median(calm)) / _BEND, _SMALLEST)
         return sds
 
     def gated(self, arm: Arm, noise: NoiseModel, gate: float) -> Measured:

@@ -276,12 +276,8 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
         lags[axis] = _doubted(lags[axis], doubt, doubt.sentence(config, axis))
         if doubt.refutes:
             config = with_plain_arm(config, axis, doubt.plain.arm)
-    pairs = {
-        name: sensor_guess.pair
-        for _, each in guesses
-        for name, sensor_guess in each.items()
-        if sensor_guess.pair and len(every) == 1
-    }
+    looked_at = [each for _, each in guesses] if len(every) == 1 else []
+    pairs = {name: one_guess.pair for each in looked_at for name, one_guess in each.items() if one_guess.pair}
     best, sensors, said = _sensors(every, config, trusted, pairs)
     lags, clock = _with_courses(likelihood, config, lags, searches)
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
@@ -377,16 +373,13 @@ def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> st
     if REFERENCE in config.sensors:
         return REFERENCE
 
+    travel = dict.fromkeys(config.arm.axes, 0.0)
+    for run in runs:
+        for axis, value in run.command.values.items():
+            travel[axis] = max(travel.get(axis, 0.0), float(np.ptp(value[np.isfinite(value)])))
+
     def rank(name: str) -> tuple[int, float]:
         sd = config.sensors[name].sd
-        travel = {
-            axis: max(
-                float(np.ptp(run.command.values[axis][np.isfinite(run.command.values[axis])]))
-                for run in runs
-                if axis in run.command.values
-            )
-            for axis in config.arm.axes
-        }
         shares = [sd_here / max(travel[axis], 1e-12) for axis, sd_here in sd.items()] if isinstance(sd, dict) else [sd]
         return -len(shares), float(np.median(shares))
 

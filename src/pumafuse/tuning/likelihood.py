@@ -277,9 +277,8 @@ class Likelihood:
         """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis."""
         by_axis: dict[str, list[float]] = {axis: [] for axis in self.axes}
         for (name, axis), parts in self.apart(config).items():
-            apart = SD_OF_MEDIAN * float(
-                np.median(np.abs(np.concatenate([apart_here - np.median(apart_here) for apart_here in parts])))
-            )
+            left = np.concatenate([part - np.median(part) for part in parts])
+            apart = SD_OF_MEDIAN * float(np.median(np.abs(left)))
             by_axis[axis].append(max(apart / abs(config.sensors[name].scale), _SMALLEST))
         return {axis: min(apart, default=_SMALLEST) for axis, apart in by_axis.items()}
 

@@ -174,10 +174,7 @@ def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
     If both are equally good, the sum has a variance of about Σ gain² (Vuong, Econometrica 57, 1989).
     """
     old, new = _of_axis(before, axis), _of_axis(after, axis)
-    keys = [
-        np.rint(components.stamp * 1e6).astype(np.int64) * len(components.sensors) + components.sensor
-        for components in (old, new)
-    ]
+    keys = [np.rint(part.stamp * 1e6).astype(np.int64) * len(part.sensors) + part.sensor for part in (old, new)]
     _, elsewhere, here = np.intersect1d(keys[0], keys[1], return_indices=True)
     return _bounded(new)[here] - _bounded(old)[elsewhere]
 
