@@ -321,13 +321,18 @@ class Estimates:
 
     def busiest(self, length: float) -> tuple[float, float]:
         """Start and end of the interval of ``length`` with the most motion [s]; every axis has the same weight."""
-        travelled = np.zeros(len(self.time))
-        for axis in self.axes.values():
-            steps = np.abs(np.diff(axis.position, prepend=axis.position[0]))
-            travelled += np.cumsum(steps) / max(float(steps.sum()), 1e-12)
-        ends = np.minimum(np.searchsorted(self.time, self.time + length), len(self.time) - 1)
-        start = float(self.time[np.argmax(travelled[ends] - travelled)])
-        return start, start + length
+        return busiest(self.time, self.positions, length)
+
+
+def busiest(time: FloatArray, positions: Mapping[str, FloatArray], length: float) -> tuple[float, float]:
+    """Start and end of the interval of a length in which positions at times (n,) move most [s], as a share of all."""
+    travelled = np.zeros(len(time))
+    for position in positions.values():
+        steps = np.abs(np.diff(position, prepend=position[0]))
+        travelled += np.cumsum(steps) / max(float(steps.sum()), 1e-12)
+    ends = np.minimum(np.searchsorted(time, time + length), len(time) - 1)
+    start = float(time[np.argmax(travelled[ends] - travelled)])
+    return start, start + length
 
 
 def points(

@@ -16,7 +16,7 @@ from ..arrays import NO_STAMP, FloatArray, known_rows
 from ..filter.outcome import Outcome
 from ..filter.response import response
 from ..fusion.consistency import LAGS, Consistency, consistency
-from ..fusion.estimates import Estimates, Measurements
+from ..fusion.estimates import Estimates, Measurements, busiest
 from ..fusion.results import Result
 from ..fusion.score import Z95, ReferenceTrack, interpolated, score
 from ..fusion.verdicts import sentence
@@ -75,9 +75,9 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
     Left the whole run, right the busiest two seconds of the first result; differences are from the first result.
     """
     first = next(iter(results.values()))
-    start = _busiest(first.time, _travelled(first), _ZOOM_S)
     colour = dict(zip(results, colours.several(len(results)), strict=True))
     positions = {name: result.positions(first.config) for name, result in results.items()}
+    start, end = busiest(first.time, first.positions(first.config), _ZOOM_S)
     with drawing(2, 2 * len(first.axes), width=13.0, height=2.4, sharex="col") as figure:
         for number, axis in enumerate(first.axes):
             screen = first.config.arm.screen_of(axis)
@@ -105,8 +105,8 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
                 axes.set_ylim(-limit, limit)
                 axes.set_ylabel(f"{axis}: {what} [{screen.unit}]")
             for axes in (zoom, left_zoom):
-                axes.set_xlim(start, start + _ZOOM_S)
-            _fit_height(zoom, start, start + _ZOOM_S)
+                axes.set_xlim(start, end)
+            _fit_height(zoom, start, end)
         for axes in figure.axes[-2:]:
             axes.set_xlabel(_TIME)
         legend(figure)
@@ -240,13 +240,13 @@ def lag_figures(latency: Latency) -> Markup:
             apart = value - scale * moved[np.searchsorted(fine, stamp)]
             value = (value - float(np.median(apart))) / scale
             time, seen, length = seconds(told_at, origin), seconds(stamp, origin), max(_ZOOM_S, 8.0 * lag.lag)
-            begin = _busiest(time, command, length)
+            begin, end = busiest(time, {axis: command}, length)
             motion.step(time, command * screen.scale, where="post", color=colours.COMMAND, lw=1, label="command")
             motion.plot(seen, value * screen.scale, ".", ms=4, color=colour, label=summary.sensor)
             motion.plot(seconds(fine, origin), moved * screen.scale, color=colours.ESTIMATE, lw=1.2, label="model")
-            shown = command[(time >= begin - 1.0) & (time <= begin + length)] * screen.scale
+            shown = command[(time >= begin - 1.0) & (time <= end)] * screen.scale
             margin = 0.08 * float(np.ptp(shown)) + 1e-3
-            motion.set(xlim=(begin, begin + length), ylim=(float(shown.min()) - margin, float(shown.max()) + margin))
+            motion.set(xlim=(begin, end), ylim=(float(shown.min()) - margin, float(shown.max()) + margin))
             motion.set_title(f"{axis}: {lag.lag * MS:.1f} ms late", loc="left")
             motion.set_ylabel(f"{axis} [{screen.unit}]")
             if lag.course:
@@ -258,12 +258,6 @@ def lag_figures(latency: Latency) -> Markup:
             column.set_xlabel(_TIME)
         figure.axes[0].legend(loc="best", ncols=3, frameon=False)
         return svg(figure)
-
-
-def _busiest(time: FloatArray, value: FloatArray, length: float) -> float:
-    """Where the part of a length [s] begins in which a command moves most."""
-    travel = np.append(0.0, np.cumsum(np.abs(np.diff(value))))
-    return float(time[int(np.argmax(np.interp(time + length, time, travel) - travel))])
 
 
 def innovations(axes: Axes, est: Estimates, sensor: str, axis: str, colour: str) -> FloatArray:
@@ -300,12 +294,6 @@ def _figure(est: Estimates, rows: int, labels: Sequence[str], ratios: Sequence[f
         used = [name for name in est.measurements.sensors if name in est.config.sensors]
         sensors = ", ".join(used) or "commands only"
         figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
-
-
-def _travelled(result: Result) -> FloatArray:
-    """How far all axes have moved until each estimate, each in units of its range."""
-    parts = [axis.position / max(float(np.ptp(axis.position)), 1e-12) for axis in result.axes.values()]
-    return np.sum([np.cumsum(np.abs(np.diff(part, prepend=part[0]))) for part in parts], axis=0)
 
 
 def _fit_height(axes: Axes, start: float, end: float) -> None:

@@ -12,8 +12,6 @@ shows both as one. Its entities are below ``pumafuse/``, on the recording's time
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -34,21 +32,9 @@ from .scene import by_kind, send_scene, views
 from .styles import Sink
 
 _OPENING_S = 4.0
-_LEGEND = (0.35, 0.6)  # of a plot's width and height, that a legend covers
 _TWO_COLUMNS = 4  # axes
 _SILENT, _SILENT_S = 10.0, 0.5  # times the median interval, and s: a sensor that is quiet for longer is silent
-_BY_GRAVITY = (
-    Outcome.FUSED,
-    Outcome.REACQUIRED,
-    Outcome.DUPLICATE,
-    Outcome.BEFORE_START,
-    Outcome.TOO_LATE,
-    Outcome.INVALID,
-    Outcome.UNKNOWN,
-    Outcome.HELD,
-    Outcome.STRAY,
-    Outcome.REJECTED,
-)
+_BY_GRAVITY = sorted(Outcome, key=lambda outcome: outcome is Outcome.REJECTED)  # a rejected row is the worst
 
 
 def to_rerun(est: Estimates, run: Run, sink: str | Path | rr.RecordingStream) -> None:
@@ -180,16 +166,12 @@ def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:
     """
     start, end = est.busiest(_OPENING_S)
     whole = float(est.time[0]), float(est.time[-1])
-    spans = {
-        name: _span(axis.position[(est.time >= start) & (est.time <= end)], est.config.arm.screen_of(name))
-        for name, axis in est.axes.items()
-    }
-    legend = _free_corner(est, start, end, spans)
+    shown = (est.time >= start) & (est.time <= end)
     positions, innovations, residuals = (dict[str, rrb.View]() for _ in range(3))
-    for name, span in spans.items():
-        unit, limit = est.config.arm.screen_of(name).unit, _residual_span(est, name)
-        corner = legend[1] if name == legend[0] else None
-        positions[name] = _plot(f"/{name}", f"{name} [{unit}]", (start, end), span, corner)
+    for name, axis in est.axes.items():
+        screen, limit = est.config.arm.screen_of(name), _residual_span(est, name)
+        span, unit = _span(axis.position[shown], screen), screen.unit
+        positions[name] = _plot(f"/{name}", f"{name} [{unit}]", (start, end), span, legend=not positions)
         if name in _measured(est):
             title = f"{name}: innovation / its standard deviation, ±2"
             innovations[name] = _plot(f"/innovation/{name}", title, whole, (-5.0, 5.0))
@@ -223,13 +205,14 @@ def _plot(
     name: str,
     time: tuple[float, float],
     span: tuple[float, float],
-    legend: rrb.Corner2D | None = None,
+    *,
+    legend: bool = False,
 ) -> rrb.TimeSeriesView:
-    """A plot over a time [s], with its legend in a corner if there is one."""
+    """A plot over a time [s]."""
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
-        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
         axis_x=rrb.TimeAxis(view_range=_range(time)),
         axis_y=rrb.ScalarAxis(range=span),
     )
@@ -237,24 +220,6 @@ def _plot(
 
 def _range(time: tuple[float, float]) -> rrb.TimeRange:
     return rrb.TimeRange(*(rrb.TimeRangeBoundary.absolute(seconds=edge) for edge in time))
-
-
-def _free_corner(
-    est: Estimates, start: float, end: float, spans: Mapping[str, tuple[float, float]]
-) -> tuple[str, rrb.Corner2D]:
-    """The axis and the corner of its plot in which a legend covers the least of the estimates."""
-    shown = (est.time >= start) & (est.time <= end)
-    across = (est.time[shown] - start) / max(end - start, 1e-9)
-
-    def covered(axis: str, corner: rrb.Corner2D) -> int:
-        low, high = spans[axis]
-        up = (est[axis].position[shown] * est.config.arm.screen_of(axis).scale - low) / (high - low)
-        beside = across > 1.0 - _LEGEND[0] if "Right" in corner.name else across < _LEGEND[0]
-        level = up > 1.0 - _LEGEND[1] if "Top" in corner.name else up < _LEGEND[1]
-        return int(np.count_nonzero(beside & level))
-
-    corners = (rrb.Corner2D.RightTop, rrb.Corner2D.LeftTop, rrb.Corner2D.RightBottom, rrb.Corner2D.LeftBottom)
-    return min(product(spans, corners), key=lambda corner: covered(*corner))
 
 
 def _span(position: FloatArray, screen: Screen) -> tuple[float, float]:
