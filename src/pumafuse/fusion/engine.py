@@ -15,7 +15,7 @@ from ..filter.outcome import Outcome
 from .config import FusionConfig
 from .estimates import AxisEstimate, Bias, Mode
 from .segments import Segment
-from .setup import axes_of, filter_model, sensors_of
+from .setup import filter_model
 
 Engine = Literal["compiled", "filterpy"]
 _NO_TIMES = np.zeros(0, dtype=np.int64)
@@ -100,32 +100,20 @@ def linearised(
     results = _undecided(events)
     results.outcome[index] = outcome
     model = _certain(model_of(segment, config))
-    tangents = [_slope(segment, config, model, *each) for each in beside]
+    tangents = [_slope(segment, *each) for each in beside]
     d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
     return results.rows(index), d_nu[:, index], d_s[:, index]
 
 
-def _slope(
-    segment: Segment, config: FusionConfig, model: Model, low: FusionConfig, high: FusionConfig, width: float
-) -> Model:
+def _slope(segment: Segment, low: FusionConfig, high: FusionConfig, width: float) -> Model:
     """How every number of a model changes from one configuration to another, ``width`` of a parameter apart."""
 
     def of(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         change = (b.view(np.float64) - a.view(np.float64)) / width
         return np.nan_to_num(change).view(a.dtype)  # NaN where there is none: no level, no sd
 
-    ends = [_model_beside(segment, config, model, end) for end in (low, high)]
-    return Model(*(np.zeros_like(a) if a is b else of(a, b) for a, b in zip(*ends, strict=True)))
-
-
-def _model_beside(segment: Segment, config: FusionConfig, model: Model, other: FusionConfig) -> Model:
-    """The same of another configuration; what the two share is as in ``model``, and not computed again."""
-    if other.sensors is not config.sensors:
-        biased = biased_sensors(segment, other)
-        model = Model(model.axis, *sensors_of(other, segment.axes, segment.sensors, biased))
-    if other.arm is config.arm and other.process is config.process and other.start is config.start:
-        return model
-    return _certain(model._replace(axis=axes_of(other, segment.axes, segment.start)))
+    ends = [_certain(model_of(segment, end)) for end in (low, high)]
+    return Model(*(of(a, b) for a, b in zip(*ends, strict=True)))
 
 
 def model_of(segment: Segment, config: FusionConfig) -> Model:

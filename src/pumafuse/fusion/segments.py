@@ -47,7 +47,7 @@ _REASONS = {
     Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one",
 }
 WHOLE = ALWAYS, NEVER
-_Kept: TypeAlias = dict[tuple[int, ...], tuple[Events, IntArray]]  # by delays and latencies, or groups of delays
+_Kept: TypeAlias = dict[tuple[int, ...], tuple[Events, IntArray]]  # by delays and latencies
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,6 @@ class Segment:
     counts: Mapping[str, Mapping[str, int]]
     ends: tuple[int, int] = (ALWAYS, NEVER)
     _latest: _Kept = field(default_factory=_Kept, init=False, repr=False, compare=False)
-    _tables: _Kept = field(default_factory=_Kept, init=False, repr=False, compare=False)
 
     def events(self, config: FusionConfig) -> tuple[Events, IntArray]:
         """The events in their total order, by the delays and latencies of ``config``.
@@ -90,15 +89,10 @@ class Segment:
         Returns:
             The events; and where among them each of ``measurement_rows`` is.
         """
-        times = (*self._delay(config), *self._latency(config).tolist())
+        times = (*self._delay(config).tolist(), *self._latency(config).tolist())
         cached = self._latest.get(times)  # a search asks for many configurations of the same times
         if cached is None:
-            groups = self._groups(config)
-            table = self._tables.get(groups)
-            if table is None:
-                self._tables.clear()  # threads share it
-                table = self._tables[groups] = self._joined(groups)
-            events, order = self._ordered(config, *table)
+            events, order = self._ordered(config)
             index = np.empty(len(order), dtype=np.int64)
             index[order] = np.arange(len(order))
             cached = self._latest[times] = events, index[len(order) - len(self.measurement_rows.time) :]
@@ -108,34 +102,25 @@ class Segment:
 
     def events_once(self, config: FusionConfig) -> Events:
         """The events in their order where nobody will ask again: nothing of them is kept here."""
-        return self._ordered(config, *self._joined(self._groups(config)))[0]
+        return self._ordered(config)[0]
 
-    def _delay(self, config: FusionConfig) -> list[int]:
-        """Of each axis, int ns."""
-        return [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes]
-
-    def _groups(self, config: FusionConfig) -> tuple[int, ...]:
-        """Which of the distinct delays each axis has."""
-        distinct = sorted(set(self._delay(config)))
-        return tuple(distinct.index(group) for group in self._delay(config))
-
-    def _ordered(self, config: FusionConfig, unordered: Events, moves: IntArray) -> tuple[Events, IntArray]:
-        """Events in their order, and that."""
-        distinct, latency = sorted(set(self._delay(config))), self._latency(config)
-        missing, shift = unordered.stamp == NO_STAMP, np.concatenate([distinct, -latency])
-        time = np.where(missing, NO_STAMP, unordered.stamp + shift[moves])
+    def _ordered(self, config: FusionConfig) -> tuple[Events, IntArray]:
+        """Events in their order, and that: of commands one for each group of axes that share a delay."""
+        delay, rows, measured = self._delay(config), self.command_rows, self.measurement_rows
+        parts, shift = list[Events](), list[IntArray]()
+        for group in sorted(set(delay.tolist())):
+            codes = np.where(delay == group, rows.codes, np.uint8(ABSENT))
+            parts.append(rows._replace(codes=codes).where(on_any_axis(codes, Outcome.FUSED)))
+            shift.append(np.full(len(parts[-1].time), group))
+        unordered = joined([*parts, measured])
+        time = unordered.stamp + np.concatenate([*shift, -self._latency(config)[measured.source]])
+        time[unordered.stamp == NO_STAMP] = NO_STAMP
         order = np.argsort(time, kind="stable")  # each source is in its order: commands, then the sensors'
         return unordered._replace(time=time).rows(order), order
 
-    def _joined(self, groups: tuple[int, ...]) -> tuple[Events, IntArray]:
-        """Commands, one event for each group of axes that share a delay, then measurements; which time moves each."""
-        rows, measured, parts, moves = self.command_rows, self.measurement_rows, list[Events](), list[IntArray]()
-        for group in sorted(set(groups)):
-            codes = np.where(np.array(groups) == group, rows.codes, np.uint8(ABSENT))
-            parts.append(rows._replace(codes=codes).where(on_any_axis(codes, Outcome.FUSED)))
-            moves.append(np.full(len(parts[-1].time), group))
-        sensors = max(groups) + 1 + measured.source.astype(np.int64)
-        return joined([*parts, measured]), np.concatenate([*moves, sensors])
+    def _delay(self, config: FusionConfig) -> IntArray:
+        """Of each axis, int ns."""
+        return np.array([round(config.arm.delay_of(axis) * 1e9) for axis in self.axes])
 
     def commands_of(self, axis: str) -> tuple[TimeArray, FloatArray]:
         """Stamps [int64 ns] and values [m] of the commands of one axis, (n,)."""

@@ -29,10 +29,10 @@ def filter_model(
     ``start`` has the level u₀ [m] of each axis where it is known, ``biased`` for each the sensors whose bias is in its
     state; None: of no sensor.
     """
-    return Model(axes_of(config, axes, start or {}), *sensors_of(config, axes, names, biased))
+    return Model(_axes_of(config, axes, start or {}), *_sensors_of(config, axes, names, biased))
 
 
-def axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, float]) -> Record:
+def _axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, float]) -> Record:
     """What the filter knows of axes, (A,), with the level u₀ [m] of each where it is known."""
     arm, axis = config.arm, np.zeros(len(axes), AXIS)
     for number, name in enumerate(axes):
@@ -48,7 +48,7 @@ def axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, floa
     return axis
 
 
-def sensors_of(
+def _sensors_of(
     config: FusionConfig, axes: Sequence[str], names: Sequence[str], biased: Sequence[Sequence[str]] | None
 ) -> tuple[Record, Record]:
     """What it knows of sensors, (S,), and of what each sees of axes, (S, A), with biases as in :func:`filter_model`."""
