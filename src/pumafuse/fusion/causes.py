@@ -19,7 +19,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
+from itertools import accumulate, product
 from operator import add
 from typing import NamedTuple, TypeAlias, cast
 
@@ -511,17 +511,12 @@ def _slower(model: AxisModel, factor: float) -> AxisModel:
 
 def _with_play(drive: FloatArray, half: float) -> FloatArray:
     """Where a tool is that its drive takes along at either end of its play, (m,)."""
-    position, driven = float(drive[0]), list[float]()
-    for at in drive.tolist():
-        position = min(max(position, at - half), at + half)
-        driven.append(position)
-    return np.array(driven)
+    pushed = accumulate(drive.tolist(), lambda tool, at: min(max(tool, at - half), at + half))
+    return np.fromiter(pushed, dtype=np.float64)
 
 
 def _limited(drive: FloatArray, farthest: FloatArray) -> FloatArray:
     """Where an axis is that follows, but in each interval no farther than that, (m,)."""
-    position, driven = float(drive[0]), list[float]()
-    for at, step in zip(drive.tolist(), farthest.tolist(), strict=True):
-        position = min(max(at, position - step), position + step)
-        driven.append(position)
-    return np.array(driven)
+    moves = zip(drive[1:].tolist(), farthest[1:].tolist(), strict=True)
+    driven = accumulate(moves, lambda now, move: min(max(move[0], now - move[1]), now + move[1]), initial=drive[0])
+    return np.fromiter(driven, dtype=np.float64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
@@ -75,37 +76,34 @@ def fuse(
     """
     if rate is not None and not 0.0 < rate < np.inf:
         raise ValueError(f"rate must be positive and finite, got {rate}")
-    if engine not in get_args(Engine):
-        raise ValueError(f"no engine '{engine}'; there are: {', '.join(get_args(Engine))}")
-    if mode not in get_args(Mode):
-        raise ValueError(f"no mode '{mode}'; there are: {', '.join(get_args(Mode))}")
+    for what, chosen, accepted in (("engine", engine, get_args(Engine)), ("mode", mode, get_args(Mode))):
+        if chosen not in accepted:
+            raise ValueError(f"no {what} '{chosen}'; there are: {', '.join(accepted)}")
     if engine == "filterpy" and mode != "filtered":
         raise ValueError(f"the filterpy engine gives filtered estimates only; mode '{mode}' needs the compiled one")
-    chosen = None if sensors is None else config.sensor_names(sensors)
+    selected = None if sensors is None else config.sensor_names(sensors)
     in_place, placed, config = in_base(run, config)
     logged, jumps = segments(in_place)
     parts, clocks, faults, moving = list[Part](), list[str](), list[Fault](), list[str]()
-
-    def filtered(number: int, part: Run) -> Part:
-        asked = [name for name in config.sensor_names(chosen) if name in part.sensors]
-        clocks.extend(clock_faults(part, config.arm.update_period, asked))
-        segment = build(part, config, chosen)
-        faults.extend(sensor_faults(segment, config))
-        moving.extend(starts_in_motion(segment, config))
+    for part in logged:
+        measuring = [name for name in config.sensor_names(selected) if name in part.sensors]
+        clocks += clock_faults(part, config.arm.update_period, measuring)
+        segment = build(part, config, selected)
+        faults += sensor_faults(segment, config)
+        moving += starts_in_motion(segment, config)
         times = output_times(segment, config, rate, mode == "as-live")
-        share = None if progress is None else _share(progress, number, len(logged))
+        share = None if progress is None else partial(_share, progress, len(parts), len(logged))
         asked = segment.asked(times, rate is not None)
-        segment_result = filter_segment(segment, config, times, mode, engine, share, asked)
-        return Part(part, segment.without_measurements(), times, segment_result)  # found has them
-
-    parts += [filtered(number, part) for number, part in enumerate(logged)]
+        filtered = filter_segment(segment, config, times, mode, engine, share, asked)
+        parts.append(Part(part, segment.without_measurements(), times, filtered))  # the result has them
+        del segment
     est = estimates_of(run, in_place, placed, config, parts, mode, engine)
     notes = [*clocks, *(fault.sentence for fault in faults), *found_by(est, parts), *moving]
     notes += latency_questions(config, parts[0].segment.sensors)
     notes += [*jumps, *_uncovered(est), *config.arm.validity.excess(est.speed, est.radius)]
     notes += overrun_notes([overruns(part.segment, config.arm) for part in parts], config.arm, est.origin)
     parts.clear()  # their tables are as large as what est has of them
-    est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen, faults=by_axis(faults))
+    est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=selected, faults=by_axis(faults))
     warn(f"run '{run.name}': {note}" for note in est.notes)
     return est
 
@@ -181,8 +179,8 @@ def found_by(est: Estimates, parts: Sequence[Part]) -> list[str]:
     return sentences
 
 
-def _share(progress: Callable[[float], None], number: int, count: int) -> Callable[[float], None]:
-    return lambda done: progress((number + done) / count)
+def _share(progress: Callable[[float], None], number: int, count: int, done: float) -> None:
+    progress((number + done) / count)
 
 
 def _joined(parts: Iterable[npt.NDArray[S]]) -> npt.NDArray[S]:
