@@ -84,10 +84,7 @@ def _show(name: str, registered: RegisteredSensor) -> None:
     if registered.latency is not None:
         rows.append(["latency_ms", f"{registered.latency * MS:.2f}", _limits(registered.latency_ci95, MS, ".2f")])
     print_tables([table(["number", "found", "95 % interval"], rows)])
-    if registered.latency is not None and registered.latency_ci95 == (
-        registered.latency,
-        registered.latency,
-    ):
+    if registered.latency is not None and registered.latency_ci95 == (registered.latency, registered.latency):
         say(taken(name, registered.latency))
 
 

@@ -487,10 +487,7 @@ def _shapes(part: _Part) -> Iterator[tuple[Tried, FloatArray]]:
         yield Tried(Cause.LIMIT, which=share), scale * (_limited(led, farthest) - led)
     for factor in (each for times in _FASTER for each in (times, 1.0 / times) if model.max_speed is not None):
         faster = msgspec.structs.replace(model, max_speed=factor * (model.max_speed or 0.0))
-        yield (
-            Tried(Cause.FASTEST, which=factor - 1.0),
-            scale * (part.position(faster, time) - led) / (factor - 1.0),
-        )
+        yield (Tried(Cause.FASTEST, which=factor - 1.0), scale * (part.position(faster, time) - led) / (factor - 1.0))
     for number in used if len(used) > 1 else ():
         name, rows = measured.sensors[number], measured.sensor == number
         for which, x in lags.items():

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import NO_STAMP, TimeArray
 from ..errors import warn
 from ..filter.events import COMMAND
 from ..filter.outcome import ABSENT, Outcome
@@ -140,10 +140,10 @@ def estimates_of(
         run=run.name,
         time=seconds(_joined(times), origin),
         axes=axes,
-        cartesian=_cartesian(placed, {axis: estimate.position for axis, estimate in axes.items()}),
+        cartesian=placed and placed.in_log({axis: estimate.position for axis, estimate in axes.items()}),
         measurements=_measurements(cut, filtered),
         biases=filtered[-1].biases,
-        reference=track and replace(track, cartesian=_cartesian(placed, track.position)),
+        reference=track and replace(track, cartesian=placed and placed.in_log(track.position)),
         origin=origin,
         segment=np.repeat(np.arange(len(parts)), [len(part) for part in times]),
         segments=cut,
@@ -206,18 +206,6 @@ def _uncovered(est: Estimates) -> list[str]:
     time = est.reference.time[np.any(is_known, axis=0)] if is_known else np.empty(0)
     apart = not len(time) or time.max() < est.time.min() or time.min() > est.time.max()
     return [UNCOVERED] if apart else []
-
-
-def _cartesian(placed: Placed | None, position: Mapping[str, FloatArray]) -> dict[str, FloatArray] | None:
-    """The log's x, y and z [m] of positions of axes, those that these give; None without a frame."""
-    if placed is None:
-        return None
-    cartesian: dict[str, FloatArray] = {}
-    if "tangential" in position and "radial" in position:
-        cartesian["x"], cartesian["y"] = placed.to_log(position["tangential"], position["radial"])
-    if "vertical" in position:
-        cartesian["z"] = position["vertical"].copy()
-    return cartesian
 
 
 def _highest_speeds(cut: Sequence[Segment], arm: ArmModel) -> dict[Kind, float]:

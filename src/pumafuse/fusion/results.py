@@ -154,11 +154,7 @@ def check_fused(counts: Mapping[str, Mapping[str, int]], config: FusionConfig) -
 
 
 def write(
-    est: Estimates,
-    folder: Path,
-    force: bool,
-    extras: Callable[[Path], None] | None = None,
-    run_toml: str | None = None,
+    est: Estimates, folder: Path, force: bool, extras: Callable[[Path], None] | None = None, run_toml: str | None = None
 ) -> Summary:
     """Write a result folder: complete, or not at all; with what ``extras`` write, and the ``run.toml`` of a run."""
     check_writable(folder, force, run_toml is not None)

@@ -462,13 +462,7 @@ def _measurement_rows(
 
 
 def _hold(
-    rows: Events,
-    commands: Events,
-    config: FusionConfig,
-    name: str,
-    label: str,
-    axes: Sequence[str],
-    origin: int,
+    rows: Events, commands: Events, config: FusionConfig, name: str, label: str, axes: Sequence[str], origin: int
 ) -> list[str]:
     """Mark what one sensor says again and again as held; a sentence on each axis where it does."""
     notes = list[str]()

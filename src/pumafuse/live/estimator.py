@@ -204,9 +204,7 @@ class LiveEstimator:
                 if stamp - fused > self._stale_ns:
                     stale.append(axis)
         reason = "now" if stamp == now else "filtered" if stamp < now else "predicted, the last command held"
-        placed = None
-        if self._frame_start.placed is not None:
-            placed = self._frame_start.in_log({axis: now.position for axis, now in axes.items()})
+        placed = self._frame_start.in_log({axis: now.position for axis, now in axes.items()})
         orientation = None
         if self._tool is not None:
             orientation = self._tool.orientation([axes[axis].position for axis in TURNING if axis in axes])

@@ -65,10 +65,5 @@ class FrameStart:
         """Convert axis positions [m] back to x, y, z [m], as far as they give these; None before the start is known."""
         if self.placed is None:
             return None
-        levels: dict[str, float] = {}
-        if "tangential" in positions and "radial" in positions:
-            x, y = self.placed.to_log(*(np.array([positions[axis]]) for axis in ("tangential", "radial")))
-            levels["x"], levels["y"] = float(x[0]), float(y[0])
-        if "vertical" in positions:
-            levels["z"] = positions["vertical"]
-        return levels
+        in_log = self.placed.in_log({axis: np.array([position]) for axis, position in positions.items()})
+        return {name: float(level[0]) for name, level in in_log.items()}

@@ -7,6 +7,7 @@ the start level. ``rotated``: a fixed rotation about z, for small motions.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Literal, TypeAlias
@@ -133,6 +134,14 @@ class Placed:
             return radial * cos - across * sin, radial * sin + across * cos
         theta = self.angle + tangential / self._lever
         return self.frame.base[0] + radial * np.cos(theta), self.frame.base[1] + radial * np.sin(theta)
+
+    def in_log(self, position: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """The log's x, y and z [m] of positions of axes [m], those that these give."""
+        in_log = {"z": position["vertical"].copy()} if "vertical" in position else {}
+        if "tangential" in position and "radial" in position:
+            x, y = self.to_log(position["tangential"], position["radial"])
+            in_log = {"x": x, "y": y} | in_log
+        return in_log
 
     def jacobian(self, tangential: FloatArray, radial: FloatArray) -> FloatArray:
         """How the log's x and y change with the tangential and the radial position [m], (n, 2, 2)."""

@@ -202,8 +202,7 @@ def _logged(scenario: Scenario, moved: Mapping[str, FloatArray], *, in_axes: boo
         placed = Placed(frame, level["radial"], scenario.start_azimuth)
     else:
         placed = Placed(frame, 1.0, frame.azimuth)
-    x, y = placed.to_log(positions["tangential"], positions["radial"])
-    return {"x": x, "y": y} | ({"z": positions["vertical"]} if "vertical" in positions else {})
+    return placed.in_log(positions)
 
 
 def _stream(seed: int, *purpose: str) -> np.random.Generator:

@@ -201,12 +201,7 @@ def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:
 
 
 def _plot(
-    origin: str,
-    name: str,
-    time: tuple[float, float],
-    span: tuple[float, float],
-    *,
-    legend: bool = False,
+    origin: str, name: str, time: tuple[float, float], span: tuple[float, float], *, legend: bool = False
 ) -> rrb.TimeSeriesView:
     """A plot over a time [s]."""
     return rrb.TimeSeriesView(
