@@ -125,7 +125,9 @@ def verdict(compared: Sequence[Compared]) -> tuple[str | None, str]:
         return None, ""
     if len({(summary.from_s, summary.to_s) for summary in every}) > 1:
         return None, "nothing is chosen: the results are of different parts of the run"
-    by_error = _shared([_errors(result.scores) for result in compared])
+    by_error = _shared(
+        [{axis: math.log(score.rmse) for axis, score in each.scores.items() if score.rmse > 0.0} for each in compared]
+    )
     if by_error is not None:
         return _least(compared, by_error, "its error against the reference (RMSE, mean over the axes) is")
     if all(_measured(result.result) == _measured(compared[0].result) for result in compared):
@@ -172,11 +174,6 @@ def _measured(result: Result) -> dict[tuple[str, str], tuple[int, float | None]]
         for axis, part in result.summary.axes.items()
         for name, sensor in part.sensors.items()
     }
-
-
-def _errors(scores: Mapping[str, ScoreSummary]) -> dict[str, float]:
-    """Logarithms of the errors against the reference, by axis."""
-    return {axis: math.log(score.rmse) for axis, score in scores.items() if score.rmse > 0.0}
 
 
 def _predictions(result: Result) -> dict[str, float]:

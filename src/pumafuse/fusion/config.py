@@ -350,18 +350,16 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
     return ArmModel.load(beside)
 
 
-def with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str, path: str = "") -> dict[str, Any]:
+def with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
     """The tables of a ``fusion.toml`` (SI numbers) with the key names for lengths, where those of angles are."""
     lengths = dict(tree)
     if isinstance(lengths.get("process"), dict):
-        lengths["process"] = by_axis(lengths["process"], Process, arm, where, f"{path}process")
+        lengths["process"] = by_axis(lengths["process"], Process, arm, where, "process")
     if "start" in lengths:
-        lengths["start"] = of_all_axes(lengths["start"], Start, arm, where, f"{path}start", ["offset_sd_mm"])
+        lengths["start"] = of_all_axes(lengths["start"], Start, arm, where, "start", ["offset_sd_mm"])
     if isinstance(sensors := lengths.get("sensors"), dict):
         named = cast(dict[str, Any], sensors)
-        lengths["sensors"] = {
-            name: _sensor(table, arm, where, f"{path}sensors.{name}") for name, table in named.items()
-        }
+        lengths["sensors"] = {name: _sensor(table, arm, where, f"sensors.{name}") for name, table in named.items()}
     return lengths
 
 
@@ -400,32 +398,30 @@ def of_all_axes(
     """A table for all axes of the arm as one of lengths; where axes are of both kinds, with a number for each axis."""
     if not isinstance(table, dict):
         return table
-    of_all_axes, types = (
-        cast(dict[str, Any], table).copy(),
-        {field.encode_name: field.type for field in msgspec.structs.fields(kind)},
-    )
+    lengths = cast(dict[str, Any], table).copy()
+    types = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
     for key in per_axis:
         each: dict[str, Any] = {}
         for of in KINDS:
             name = of_kind(key, of)
-            if name not in of_all_axes:
+            if name not in lengths:
                 continue
-            value = _by_axis(of_all_axes.pop(name), of, arm)
+            value = _by_axis(lengths.pop(name), of, arm)
             if of not in arm.kinds:
                 right = of_kind(key, arm.kinds[0])
                 raise ConfigError(f"{where}: {path}.{name}: no axis of the arm is {AN[of]}; give {right}")
             toml.check(value, types[key], where, f"{path}.{name}")
             if len(arm.kinds) == 1:
-                of_all_axes[key] = value
+                lengths[key] = value
             else:
                 axes_of_kind = [axis for axis, model in arm.axes.items() if model.kind == of]
                 each |= cast(dict[str, Any], value) if isinstance(value, dict) else dict.fromkeys(axes_of_kind, value)
         if each:
             same = len(each) == len(arm.axes) and len(set(each.values())) == 1
-            of_all_axes[key] = next(iter(each.values())) if same else each
-    for key in of_all_axes.keys() - types.keys():
+            lengths[key] = next(iter(each.values())) if same else each
+    for key in lengths.keys() - types.keys():
         raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, _accepted(kind, arm, per_axis))}")
-    return of_all_axes
+    return lengths
 
 
 def _sensor(table: Any, arm: ArmModel, where: str, path: str) -> Any:
@@ -473,10 +469,8 @@ def with_kinds(table: Mapping[str, Any], arm: ArmModel, per_axis: Sequence[str])
         else:
             each = cast(dict[str, Any], value)
             for of in KINDS:
-                if axes_of_kind := {
-                    axis: value for axis, value in each.items() if arm.kind_of.get(axis, "length") == of
-                }:
-                    with_kinds[of_kind(key, of)] = axes_of_kind
+                if of_axes := {axis: size for axis, size in each.items() if arm.kind_of.get(axis, "length") == of}:
+                    with_kinds[of_kind(key, of)] = of_axes
     return with_kinds
 
 

@@ -57,26 +57,21 @@ def with_tool(config: FusionConfig, run: Run) -> FusionConfig:
 
 
 def _still(_: str, source: Source) -> Source:
-    """A source without the axes of its orientation, for an arm that has none."""
     return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
 class Placing:
-    """What a sensor in a frame of its own tells of the tool, row by row: no bit of a row depends on other rows.
-
-    Attributes:
-        has_marker: Whether the tool's orientation is needed to know where it is.
-        is_oriented: Whether the orientation that it tells is used: not without any noise of it, where the commands tell
-            one. Some attitudes do not belong to their positions.
-    """
+    """What a sensor in a frame of its own tells of the tool, row by row: no bit of a row depends on other rows."""
 
     def __init__(self, sensor: Sensor, arm: ArmModel) -> None:
         """Take where the sensor stands, what it sees, and its noise."""
+        # Whether the orientation that it tells is used: not without any noise of it, where the commands tell one. Some
+        # attitudes do not belong to their positions.
         self.is_oriented = sensor.sd_of(TURNING[0]) is not None or not set(TURNING) <= set(arm.axes)
         frame, marker = sensor.frame or _HERE, sensor.marker or _HERE
         self._at, self._turn = np.array(frame.at), rotations.of_vectors(np.array([frame.rotation]))
         self._marker, self._back = np.array([marker.at]), rotations.of_vectors(-np.array([marker.rotation]))
-        self.has_marker = any(marker.at)
+        self.has_marker = any(marker.at)  # whether the tool's orientation is needed to know where it is
         self._variance = float(np.mean([(sensor.sd_of(axis) or 0.0) ** 2 for axis in TURNING]))
         self._sd = {axis: sd for axis in CARTESIAN if (sd := sensor.sd_of(axis))}
 

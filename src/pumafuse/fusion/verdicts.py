@@ -34,18 +34,15 @@ _TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
 def sensor_problems(est: Estimates) -> list[str]:
     """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows."""
     sentences, measured = list[str](), est.measurements
-    order, begin = measured.grouped
-    outcome, ends = measured.outcome.take(order), begin.tolist()
-    count = np.diff(begin).reshape(len(measured.sensors), len(measured.axes))
-    alone = np.count_nonzero(count.any(axis=1)) < 2
+    alone = np.count_nonzero(np.bincount(measured.sensor)) < 2
     for number, name in enumerate(measured.sensors):
-        if not count[number].any():
+        rows = np.flatnonzero(measured.sensor == number)
+        if not len(rows):
             continue
-        rows = slice(ends[number * len(measured.axes)], ends[(number + 1) * len(measured.axes)])
-        rejected = np.count_nonzero(outcome[rows] == int(Outcome.REJECTED)) / count[number].sum()
-        reacquired = len(set(measured.time[order[rows][outcome[rows] == int(Outcome.REACQUIRED)]].tolist()))
-        of_axes = [each for each, some in zip(measured.axes, count[number].tolist(), strict=True) if some]
-        kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
+        outcome, axes = measured.outcome[rows], np.flatnonzero(np.bincount(measured.axis[rows])).tolist()
+        rejected = np.count_nonzero(outcome == int(Outcome.REJECTED)) / len(rows)
+        reacquired = len(set(measured.time[rows[outcome == int(Outcome.REACQUIRED)]].tolist()))
+        kinds: dict[Kind, None] = {est.config.arm.axes[measured.axes[axis]].kind: None for axis in axes}
         sd, bias_sd, offset_sd = (
             "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")
         )

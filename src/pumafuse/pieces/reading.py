@@ -30,18 +30,13 @@ _UNSETTLED = 2  # rows at the end of what is read, which may prove stray
 
 
 class Log:
-    """A run whose tables are read some rows at a time.
-
-    Attributes:
-        rows: How many rows all of its tables have.
-        done: How many of them are read.
-    """
+    """A run whose tables are read some rows at a time."""
 
     def __init__(self, path: Path) -> None:
         """Open a folder with ``run.toml``, ``run.toml`` itself, or one table; see :func:`rows_of`."""
         self._listed = None if path.suffix == ".parquet" else manifest.load(manifest.file_of(path))
         self._folder = path if path.is_dir() else path.parent
-        self.done, self._cut = 0, ALWAYS
+        self.done, self._cut = 0, ALWAYS  # rows that are read
         if self._listed is None:
             self._tables: dict[tuple[str, ...], _Rows] = {(): _Rows(path)}
         else:
@@ -51,7 +46,7 @@ class Log:
                 rows: _Rows(self._folder / entry.file, entry, fields[rows], command if command.rows == rows else None)
                 for rows, entry in entries.items()
             }
-        self.rows = sum(tables.row_count(table.path) for table in self._tables.values())
+        self.rows = sum(tables.row_count(table.path) for table in self._tables.values())  # that there are
 
     @property
     def ended(self) -> bool:

@@ -75,11 +75,7 @@ _LONGEST_END = 2.0  # s
 
 
 class LiveView:
-    """Plots of the events and estimates of a live estimator.
-
-    Attributes:
-        dropped: How many frames were left out because others waited.
-    """
+    """Plots of the events and estimates of a live estimator."""
 
     def __init__(self, mode: str, config: FusionConfig, notify: Callable[[str], None]) -> None:
         """Start to draw."""
@@ -87,7 +83,7 @@ class LiveView:
             raise ConfigError(f"--rerun: no mode '{mode}'; there are: {', '.join(MODES)}")
         if os.name != "posix":
             raise ConfigError("--rerun: the live view needs Linux or macOS; a result folder can be drawn everywhere")
-        self.dropped = 0
+        self.dropped = 0  # frames that were left out because others waited
         self._notify = notify
         self._framed = config.frame is not None
         self._space = CARTESIAN if self._framed else in_space(config.arm)  # of a position in space

@@ -164,15 +164,11 @@ class Tool:
 
 
 class Recent:
-    """The last seconds of rows that begin with their time [s].
-
-    Attributes:
-        rows: By columns: time and what belongs to it, (k, n).
-    """
+    """The last seconds of rows that begin with their time [s]."""
 
     def __init__(self, width: int) -> None:
         """Rows of so many numbers."""
-        self.rows: FloatArray = np.empty((width, 0))
+        self.rows: FloatArray = np.empty((width, 0))  # by columns: time and what belongs to it, (k, n)
 
     def add(self, rows: FloatArray) -> None:
         """Add rows (k, n); what is old goes, and what would be later than the newest, as after a jump of the clock."""

@@ -41,11 +41,7 @@ _MISDIRECTED = b"HTTP/1.1 421 Misdirected Request\r\nContent-Length: 0\r\nConnec
 
 
 class Viewer:
-    """The viewer, or the server of its page.
-
-    Attributes:
-        url: Where rerun-sdk draws.
-    """
+    """The viewer, or the server of its page."""
 
     def __init__(self, header: Header, report: Callable[[str], None]) -> None:
         """Start a viewer or a server, unless one is there; on free ports where the usual ones are taken."""
@@ -58,7 +54,7 @@ class Viewer:
             self._awaited.append(_free(0))
         if self._mode != "connect":
             self._process = _start(_arguments(self._mode, *self._awaited), keep=self._mode == "spawn")
-        self.url = _url(port)
+        self.url = _url(port)  # where rerun-sdk draws
 
     def wait(self) -> bool:
         """Wait until the viewer listens, and report where it is; whether it ever will."""
