@@ -114,16 +114,16 @@ def _fuse(
         options |= {"--rrd": "fused.rrd" in how.extras, "--figures": "fused.png" in how.extras}
         needed = next((option for option, wanted in options.items() if wanted), None) or needs_whole(path, config)
         if needed is None:
-            long = partial(fuse_to, path, folder, config, force=force, progress=progress)
-            return long(sensors=how.sensors, rate=how.rate, part=how.part)
+            return fuse_to(path, folder, how, force, progress)
         if rows > MOST_IN_MEMORY:
             raise RunError(
                 f"{path}: {needed} needs the whole run in memory, and {rows / 1e6:.0f} million rows are too many: do"
                 " without, or cut the log into shorter runs"
             )
     recorded = Run.read(path).between(*how.part)
-    whole = partial(fuse, recorded, config, sensors=how.sensors, rate=how.rate)
-    est = whole(mode=how.mode, engine=how.engine, progress=progress)
+    est = fuse(
+        recorded, config, sensors=how.sensors, rate=how.rate, mode=how.mode, engine=how.engine, progress=progress
+    )
     results.check_fused(est.counts, est.config)
 
     def more(new: Path) -> None:

@@ -165,6 +165,7 @@ def latency_questions(config: FusionConfig, names: Iterable[str]) -> list[str]:
 
 _Positions: TypeAlias = Mapping[str, Mapping[str, Rows]]  # when valid, and without the scale, by sensor and axis
 _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
+_Led: TypeAlias = tuple[FloatArray, FloatArray]  # where the commands lead an axis, and where they had shortly before
 
 
 def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
@@ -219,13 +220,11 @@ def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) ->
                 some[name] = valid[chosen][alike], position[chosen][alike]
         led = _led_at(segment, config, axis, [valid for valid, _ in some.values()])
         for (name, rows), ends in zip(some.items(), led, strict=True):
-            trackings[name][axis] = _tracking(segment, config, name, axis, *rows, *ends)
+            trackings[name][axis] = _tracking(segment, config, name, axis, rows, ends)
     return trackings
 
 
-def _led_at(
-    segment: Segment, config: FusionConfig, axis: str, valid: Sequence[TimeArray]
-) -> list[tuple[FloatArray, FloatArray]]:
+def _led_at(segment: Segment, config: FusionConfig, axis: str, valid: Sequence[TimeArray]) -> list[_Led]:
     """Where the commands lead an axis at the instants of several sensors, and where they had led shortly before."""
     if not valid:
         return []
@@ -236,16 +235,8 @@ def _led_at(
     return list(zip(parts, parts, strict=True))
 
 
-def _tracking(
-    segment: Segment,
-    config: FusionConfig,
-    name: str,
-    axis: str,
-    valid: TimeArray,
-    position: FloatArray,
-    led: FloatArray,
-    before: FloatArray,
-) -> Tracking:
+def _tracking(segment: Segment, config: FusionConfig, name: str, axis: str, rows: Rows, ends: _Led) -> Tracking:
+    (valid, position), (led, before) = rows, ends
     sensor, process = config.sensors[name], config.process[axis]
     of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_drift_sd_of(axis)) / abs(sensor.scale)
     noise = math.hypot(of_sensor, process.disturbance_sd)

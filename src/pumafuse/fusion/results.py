@@ -95,12 +95,17 @@ class Making:
     """How results are made: all that makes them differ, but for the log."""
 
     config: FusionConfig
-    sensors: Sequence[str] | None  # those that are asked for; None: all
-    rate: float | None  # of the even grid of estimates [Hz]; None: one for each command
-    mode: Mode
-    engine: Engine
-    part: tuple[float | None, float | None]  # where the part of the run to use begins and ends [s]
-    extras: Sequence[str]  # files that are made beside the usual ones
+    sensors: Sequence[str] | None = None  # those that are asked for; None: all
+    rate: float | None = None  # of the even grid of estimates [Hz]; None: one for each command
+    mode: Mode = "filtered"
+    engine: Engine = "compiled"
+    part: tuple[float | None, float | None] = None, None  # where the part of the run to use begins and ends [s]
+    extras: Sequence[str] = ()  # files that are made beside the usual ones
+
+    @property
+    def selected(self) -> tuple[str, ...] | None:
+        """The sensors that are asked for, in the order of the configuration."""
+        return None if self.sensors is None else self.config.sensor_names(self.sensors)
 
     def made(self, folder: Path, log: Path) -> Summary | None:
         """The summary of a result that is there and was made so from the log as it is; None where nothing is."""
@@ -108,14 +113,13 @@ class Making:
             return None
         check_writable(folder, force=True)
         summary = _summary(folder)
-        asked = None if self.sensors is None else list(self.config.sensor_names(self.sensors))
         differs = {
             f"pumafuse {summary.pumafuse}": summary.pumafuse != version("pumafuse"),
             "another fusion.toml": (folder / "fusion.toml").read_text(encoding="utf-8") != self.config.to_toml(),
             "another arm.toml": (folder / "arm.toml").read_text(encoding="utf-8") != self.config.arm.to_toml(),
             "another mode": (summary.mode, summary.engine) != (self.mode, self.engine),
             "another --rate": summary.rate_hz != self.rate,
-            "other --sensors": summary.sensors != asked,
+            "other --sensors": summary.sensors != (self.selected and list(self.selected)),
             "another --from or --to": (summary.from_s, summary.to_s) != self.part,
             **{f"no {name}": not (folder / name).exists() for name in self.extras},
             "other files of the run": not (now := manifest.stamps_of(log)) or _stamps(folder) != now,

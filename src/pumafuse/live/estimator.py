@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -38,6 +38,7 @@ _ABSENT = bytes((ABSENT,))
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
 _STRAY, _HELD = Outcome.STRAY, Outcome.HELD
 _REJECTED = "its measurements are rejected"
+_Values: TypeAlias = Mapping[str, Any]  # of an event, by axis or joint
 
 
 class _Event(NamedTuple):
@@ -45,7 +46,7 @@ class _Event(NamedTuple):
 
     stamp: int
     sensor: str | None
-    values: Mapping[str, Any]
+    values: _Values
 
 
 class _Counted(NamedTuple):
@@ -308,7 +309,7 @@ class LiveEstimator:
         """No event stamped before is taken [ns]."""
         return max(self._clock.sure - self._clock.window, self._window.port.floor)
 
-    def _take(self, t: Time, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
+    def _take(self, t: Time, sensor: str | None, values: _Values) -> UpdateResult:
         """Put an event where its stamp says, if that can be."""
         try:
             event = _Event(nanoseconds(t), sensor, values)
@@ -332,7 +333,7 @@ class LiveEstimator:
             return self._watch_clocks(event, result)
         return result
 
-    def _take_in_time(self, event: _Event, parsed: Mapping[str, Any]) -> UpdateResult:
+    def _take_in_time(self, event: _Event, parsed: _Values) -> UpdateResult:
         """Take an event whose stamp is right, as it came and as it is used."""
         stamp, sensor, values = event
         if sensor is not None:
@@ -366,7 +367,7 @@ class LiveEstimator:
         self._log.write("clock", told)
         return self._begin_segment(self._behind)
 
-    def _parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _parsed(self, sensor: str | None, values: _Values) -> _Values:
         """An event's values with a pose in the place of joints, and a commanded orientation as axes."""
         if self._joints is not None and (told := self._joints.told(values)) is not None:
             values = self._joints.posed(values, told)
@@ -393,7 +394,7 @@ class LiveEstimator:
                 settled[stamp] = self._enter_command(stamp, values)
         return settled
 
-    def _enter_command(self, stamp: int, values: Mapping[str, Any]) -> UpdateResult:
+    def _enter_command(self, stamp: int, values: _Values) -> UpdateResult:
         """Take a command that is to be used; one in joints changes the poses of others, where joints are later."""
         oldest = self._oldest()
         if self._joints is None or (told := self._joints.told(values)) is None:
@@ -412,7 +413,7 @@ class LiveEstimator:
             self._enter(other, None, pose, again=True)
         return result
 
-    def _enter(self, stamp: int, sensor: str | None, values: Mapping[str, Any], again: bool = False) -> UpdateResult:
+    def _enter(self, stamp: int, sensor: str | None, values: _Values, again: bool = False) -> UpdateResult:
         """Take an event that is to be used; ``again``: in the place of a command of the same stamp."""
         if self._early is None:
             return self._feed(stamp, sensor, values, judged=again)
@@ -528,7 +529,7 @@ class LiveEstimator:
         self._early.append(event)
         return self._feed(*event, judged=again)
 
-    def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any], judged: bool = False) -> UpdateResult:
+    def _feed(self, stamp: int, sensor: str | None, values: _Values, judged: bool = False) -> UpdateResult:
         """Give an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
         window, counts, bits, stranger = self._window, self._counts, 0, ""
         new, told, noise, tool = window.value, None, 1.0, self._tool
@@ -659,7 +660,7 @@ class LiveEstimator:
             window.amend(self._sensors[sensor], stamps, before, now)
         window.spread[:] = self._no_spread
 
-    def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any], noise: float = 1.0) -> int:
+    def _turned(self, stamp: int, sensor: str | None, values: _Values, noise: float = 1.0) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
         window, bits, near = self._window, 0, None
         if sensor is not None:
@@ -709,9 +710,7 @@ class LiveEstimator:
             return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
         return self._answers.setdefault(codes, result)
 
-    def _refuse_late(
-        self, stamp: int, sensor: str | None, values: Mapping[str, Any], outcomes: IntArray
-    ) -> UpdateResult:
+    def _refuse_late(self, stamp: int, sensor: str | None, values: _Values, outcomes: IntArray) -> UpdateResult:
         """Count an event that is behind the window; how late it is shows which window it would take."""
         if sensor is not None:
             self._counts.came(self._sensors[sensor], stamp, self._clock.now)
@@ -722,12 +721,7 @@ class LiveEstimator:
         return self._refuse(sensor, values, _TOO_LATE, why, outcomes)
 
     def _refuse(
-        self,
-        sensor: str | None,
-        values: Mapping[str, Any],
-        outcome: Outcome,
-        reason: str,
-        outcomes: IntArray | None = None,
+        self, sensor: str | None, values: _Values, outcome: Outcome, reason: str, outcomes: IntArray | None = None
     ) -> UpdateResult:
         """Count an event that never comes into the window, a measurement for each of its axes, among ``outcomes``."""
         outcomes, result = self._refused if outcomes is None else outcomes, refused(axes_of(values), outcome, reason)

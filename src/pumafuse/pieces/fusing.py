@@ -7,7 +7,7 @@ the last bit. What the neighbourhood of a row says in words (notes, skill) is sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +25,7 @@ from ..fusion.estimates import Estimates
 from ..fusion.faults import by_axis, latency_questions, sensor_faults, starts_in_motion
 from ..fusion.offline import Part, estimates_of, found_by
 from ..fusion.placing import in_base
+from ..fusion.results import Making
 from ..fusion.segments import Segment, build, no_estimates, output_times
 from ..fusion.setup import filter_model
 from ..fusion.summary import Summary, encode
@@ -43,15 +44,7 @@ _IN_ORDER = "so long a run is fused piece by piece, in the order of time: cut th
 
 
 def fuse_to(
-    path: Path,
-    folder: Path,
-    config: FusionConfig,
-    *,
-    sensors: Iterable[str] | None = None,
-    rate: float | None = None,
-    part: tuple[float | None, float | None] = (None, None),
-    force: bool = False,
-    progress: Callable[[float], None] | None = None,
+    path: Path, folder: Path, how: Making, force: bool = False, progress: Callable[[float], None] | None = None
 ) -> Summary:
     """Fuse a long run, filtered, into a result folder that is written as it goes: complete, or not at all."""
     results.check_writable(folder, force)
@@ -62,7 +55,7 @@ def fuse_to(
         with ExitStack() as files:
             names = results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE
             write = [files.enter_context(tables.appending(new / name)) for name in names]
-            for est, span, done in _pieces(Log(path), config, sensors, rate, part):
+            for est, span, done in _pieces(Log(path), how):
                 write[0](results.estimates_table(est))
                 write[1](results.measurements_table(est))
                 if est.reference is not None:
@@ -72,36 +65,29 @@ def fuse_to(
                 if progress is not None:
                     progress(done)
         if not any(digest.estimates for digest in digests):
-            raise no_estimates(rate)
+            raise no_estimates(how.rate)
         summary = merged(digests)
-        results.check_fused(summary.rows, config)
-        config.save(new)
+        results.check_fused(summary.rows, how.config)
+        how.config.save(new)
         (new / results.SUMMARY).write_bytes(encode(summary))
     warn(f"run '{summary.run}': {note}" for note in summary.notes)
     return summary
 
 
-def _pieces(
-    log: Log,
-    config: FusionConfig,
-    sensors: Iterable[str] | None,
-    rate: float | None,
-    part: tuple[float | None, float | None],
-) -> Iterator[tuple[Estimates, tuple[int, int], float]]:
+def _pieces(log: Log, how: Making) -> Iterator[tuple[Estimates, tuple[int, int], float]]:
     """The estimates of each piece, after and until which instants [ns], and which share of the run is done by then."""
-    chosen = None if sensors is None else config.sensor_names(sensors)
-    ahead, overlap = _margins(config)
+    ahead, overlap = _margins(how.config)
     begun, after, until = None, ALWAYS, ALWAYS
     while until < NEVER:
         cut = log.read_on(PIECE)
         run = log.run()
         if run is None or cut - ahead <= after:
             continue
-        run = run.between(*part)
-        begun = begun or _begin(run, config, chosen)
+        run = run.between(*how.part)
+        begun = begun or _begin(run, how.config, how.selected)
         over = cut - ahead > run.ends(begun[0].origin)[1] + overlap
         until = NEVER if cut == NEVER or over else cut - ahead
-        est = _piece(run, config, chosen, rate, *begun, (after, until))
+        est = _piece(run, how, *begun, (after, until))
         yield est, (after, until), 1.0 if until == NEVER else log.done / log.rows
         told_at = [est.segments[0].commands_of(axis)[0] for axis in est.axes]
         log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in told_at]))
@@ -132,25 +118,17 @@ def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> tupl
     return segment, Filter(model, segment.origin)
 
 
-def _piece(
-    run: Run,
-    config: FusionConfig,
-    chosen: tuple[str, ...] | None,
-    rate: float | None,
-    begun: Segment,
-    core: Filter,
-    span: tuple[int, int],
-) -> Estimates:
+def _piece(run: Run, how: Making, begun: Segment, core: Filter, span: tuple[int, int]) -> Estimates:
     """The estimates of the rows after and until the instants ``span`` [int ns], with notes."""
     moved, steps = going_on(run)
     if moved is not run:
         raise RunError(f"{steps[0]}; {_IN_ORDER}")
-    in_place, placed, config = in_base(run, config, whole=False)
+    in_place, placed, config = in_base(run, how.config, whole=False)
     lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
         raise RunError(f"{label}: the clock is set back by {lag.max():.3f} s; {_IN_ORDER}")
-    segment = build(in_place, config, chosen, begun, span)
-    times = output_times(segment, config, rate, span=span)
+    segment = build(in_place, config, how.selected, begun, span)
+    times = output_times(segment, config, how.rate, span=span)
     filtered = filter_piece(segment, core, config, times, span)
     first = span[0] == ALWAYS
     if not first:  # for those who ask where the commands lead: the arm rests at what was commanded before
@@ -163,4 +141,4 @@ def _piece(
     if first:
         notes += [*starts_in_motion(segment, config), *latency_questions(config, segment.sensors)]
     notes += sensor_problems(est)
-    return replace(est, notes=tuple(notes), rate=rate, selected=chosen, faults=by_axis(faults))
+    return replace(est, notes=tuple(notes), rate=how.rate, selected=how.selected, faults=by_axis(faults))
