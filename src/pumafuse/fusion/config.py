@@ -372,22 +372,15 @@ def by_axis(
     """
     names = {of: {of_kind(field.encode_name, of) for field in msgspec.structs.fields(kind)} for of in KINDS}
     keys = names["length"] | names["angle"]
-    numbers_of_axis: dict[str, dict[str, Any]] = {
-        key: value for key, value in table.items() if isinstance(value, dict) and key not in keys
-    }
-    _known_axes(f"{where}: {path}", numbers_of_axis, arm)
-    common = {key: value for key, value in table.items() if key not in numbers_of_axis}
-    needless = {key: value for key, value in common.items() if not any(key in names[of] for of in arm.kinds)}
-    toml.struct(needless, kind, where, path, arm.kinds[0])
-    of_kinds: dict[Kind, dict[str, Any]] = {
-        of: {key: value for key, value in common.items() if key in names[of]} for of in arm.kinds
-    }
-    for of, shared in of_kinds.items():
-        toml.struct(shared, kind, where, path, of)
+    of_axes: dict[str, Any] = {k: value for k, value in table.items() if isinstance(value, dict) and k not in keys}
+    _known_axes(f"{where}: {path}", of_axes, arm)
+    common = {k: value for k, value in table.items() if k not in of_axes}
+    of_arm = set[str]().union(*(names[of] for of in arm.kinds))
     numbers_by_axis: dict[str, dict[str, Any]] = {}
     for axis, model in arm.axes.items():
-        numbers = {**of_kinds[model.kind], **numbers_of_axis.get(axis, {})}
-        toml.struct(numbers, kind, where, f"{path}.{axis}", model.kind)
+        numbers = {k: value for k, value in common.items() if k in names[model.kind] or k not in of_arm}
+        numbers |= of_axes.get(axis, {})
+        toml.struct(numbers, kind, where, f"{path}.{axis}" if axis in of_axes else path, model.kind)
         numbers_by_axis[axis] = toml.as_lengths(numbers, kind)
     return numbers_by_axis
 
