@@ -74,23 +74,23 @@ def reference_track(parts: Sequence[Source], origin: int) -> ReferenceTrack:
     )
 
 
-@dataclass(frozen=True)
-class Score:
-    """Errors of one axis against a reference, in m for positions and m/s for velocities.
+class Score(toml.Reported, frozen=True, kw_only=True):
+    """Errors of one axis against a reference, in m or rad for positions, those in a second for velocities.
 
     Attributes:
         rmse: Root mean square error.
         bias: Mean of estimate − reference.
         coverage: Share of errors within 1.96 standard deviations.
-        nees: Mean of error² / variance; 1 for a consistent filter. Estimates known exactly and right do not count.
+        nees: Mean of error² / variance; 1 for a consistent filter. Estimates known exactly and right do not count. None
+            where a variance is 0.
         rows: Estimates scored.
         left_out: Estimates with no reference near enough.
     """
 
-    rmse: float
-    bias: float
+    rmse: float = msgspec.field(name="rmse_mm")
+    bias: float = msgspec.field(name="bias_mm")
     coverage: float
-    nees: float
+    nees: float | None = msgspec.field(name="nees_mean")
     rows: int
     left_out: int
 
@@ -203,12 +203,12 @@ def _score(error: FloatArray, variance: FloatArray) -> Score | None:
     error, variance = error[is_known], variance[is_known]
     counted = (variance > 0.0) | (error != 0.0)  # what is known exactly and right says nothing about the error bars
     with np.errstate(divide="ignore"):
-        nees = error[counted] ** 2 / variance[counted]
+        nees = float(np.mean(error[counted] ** 2 / variance[counted])) if counted.any() else 1.0
     return Score(
         rmse=float(np.sqrt(np.mean(error**2))),
         bias=float(np.mean(error)),
         coverage=float(np.mean(np.abs(error) <= Z95 * np.sqrt(variance))),
-        nees=float(np.mean(nees)) if len(nees) else 1.0,
+        nees=nees if np.isfinite(nees) else None,
         rows=len(error),
         left_out=left_out,
     )

@@ -21,7 +21,7 @@ from ..units import SCREEN, Kind, to_si
 from .causes import Evidence, Suspect, evidence_of
 from .consistency import Consistency, chi_square_band, consistency, log_likelihood
 from .estimates import AxisEstimate, Bias, Estimates
-from .score import OrientationScore, ReferenceTrack, score, score_orientation, score_velocity
+from .score import OrientationScore, ReferenceTrack, Score, score, score_orientation, score_velocity
 from .skill import Skill, skill
 from .verdicts import in_words, sentence
 
@@ -92,29 +92,22 @@ class SensorSummary(toml.Reported, frozen=True, kw_only=True):
     skill: Skill | None = None
 
 
-class ScoreSummary(toml.Reported, frozen=True, kw_only=True):
+class ScoreSummary(Score, frozen=True, kw_only=True):
     """One axis against the reference.
 
     Attributes:
-        rmse: Root mean square error [m or rad].
-        bias: Mean of estimate − reference [m or rad].
-        coverage: Share of errors within 1.96 standard deviations.
-        nees_mean: Mean of error²/variance; 1 for a consistent filter; null where a variance is 0.
-        rows: Estimates scored.
-        left_out: Estimates with no reference near enough.
         velocity_rmse: Root mean square error of the mean velocity over the coming update period; null for smoothed
             estimates, which have none.
         velocity_coverage: Share of its errors within 1.96 standard deviations; null likewise.
     """
 
-    rmse: float = msgspec.field(name="rmse_mm")
-    bias: float = msgspec.field(name="bias_mm")
-    coverage: float
-    nees_mean: float | None
-    rows: int
-    left_out: int
     velocity_rmse: float | None = msgspec.field(name="velocity_rmse_mm_s", default=None)
     velocity_coverage: float | None = None
+
+    @property
+    def nees_mean(self) -> float | None:
+        """As the file calls it."""
+        return self.nees
 
 
 class AxisSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -331,16 +324,8 @@ def score_axis(
     if position is None:
         return None
     velocity = score_velocity(time, segment, estimate.velocity, estimate.velocity_sd, reference, axis, period)
-    return ScoreSummary(
-        rmse=position.rmse,
-        bias=position.bias,
-        coverage=position.coverage,
-        nees_mean=position.nees if math.isfinite(position.nees) else None,
-        rows=position.rows,
-        left_out=position.left_out,
-        velocity_rmse=None if velocity is None else velocity.rmse,
-        velocity_coverage=None if velocity is None else velocity.coverage,
-    )
+    rmse, coverage = (None, None) if velocity is None else (velocity.rmse, velocity.coverage)
+    return ScoreSummary(**msgspec.structs.asdict(position), velocity_rmse=rmse, velocity_coverage=coverage)
 
 
 def axis_summary(est: Estimates, axis: str) -> AxisSummary:
