@@ -149,8 +149,7 @@ class Estimates:
         origin: Stamp of the first command, int ns.
         segment: 0, and one more after each time the log's clock was set back.
         segments: The commands of each segment as the filter was given them.
-        mode: Which measurements an estimate uses: all that are valid by then (``filtered``), only those that had
-            arrived (``as-live``), or all of the run (``smoothed``).
+        mode: Which measurements an estimate uses, as :func:`pumafuse.fuse` has it.
         engine: Which engine computed it.
         config: The configuration as used.
         speed: Highest commanded speed for each kind of axis [m/s or rad/s].

@@ -42,13 +42,11 @@ class ReferenceTrack:
     def between(self, after: float, until: float) -> ReferenceTrack:
         """The rows after one instant and until another [s]."""
         rows = (self.time > after) & (self.time <= until)
-        return ReferenceTrack(
-            self.time[rows],
-            {axis: position[rows] for axis, position in self.position.items()},
-            {axis: sd[rows] for axis, sd in self.sd.items()},
-            self.segment[rows],
-            None if self.cartesian is None else {name: x[rows] for name, x in self.cartesian.items()},
+        position, sd, cartesian = (
+            {name: value[rows] for name, value in by_axis.items()}
+            for by_axis in (self.position, self.sd, self.cartesian or {})
         )
+        return ReferenceTrack(self.time[rows], position, sd, self.segment[rows], cartesian or None)
 
     def __repr__(self) -> str:
         return f"ReferenceTrack({len(self.time):,} of {', '.join(self.position)})"

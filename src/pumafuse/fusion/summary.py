@@ -156,8 +156,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         pumafuse: Version that wrote it.
         run: The run's name.
         arm: The arm's name.
-        mode: Which measurements an estimate uses: ``filtered`` (all valid by then), ``as-live`` (those that had
-            arrived) or ``smoothed`` (all of the run).
+        mode: Which measurements an estimate uses, as :func:`pumafuse.fuse` has it.
         engine: Which engine computed it.
         origin_ns: Stamp of the first command: time 0 of every table.
         from_s: Where the part of the run that was used begins, since the first command; null: with the run.
@@ -168,8 +167,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         estimates: How many.
         segments: 1, and one more for each time the log's clock was set back.
         commands: How many rows of the commands were ``used``, and of the others how many were left out for what.
-        rows: Of each sensor how many rows were ``fused``, ``rejected``, ``reacquired`` or left out for what; of a row
-            of several axes the best that became of any.
+        rows: Of each sensor, as ``counts`` of :class:`pumafuse.Estimates`.
         axes: By axis.
         orientation: Of axes rx, ry, rz together, against the reference; null without one.
         validity: Commands against the arm model's limits.

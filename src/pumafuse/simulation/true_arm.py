@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -95,19 +95,13 @@ class TrueArm(Imperfections, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         Raises:
             ConfigError: A parameter of the other plant is given, or one of a new plant is missing.
         """
-        recovery = model.gain_recovery if self.gain_recovery is None else self.gain_recovery
-        max_speed = model.max_speed if self.max_speed is None else self.max_speed
-        imperfections = {name: getattr(self, name) for name in Imperfections.__struct_fields__}
-        imperfections["backlash"] = (model.play or 0.0) if self.backlash is None else self.backlash
-        return TrueAxis(
-            plant=self._plant(model.plant, where),
-            gain=model.gain if self.gain is None else self.gain,
-            gain_recovery=None if recovery == "never" else recovery,
-            delay=delay if self.delay is None else self.delay,
-            max_speed=None if max_speed == "none" else max_speed,
-            sag=model.sag if self.sag is None else self.sag,
-            **imperfections,
-        )
+        shared = {name: getattr(model, name) for name in ("gain", "gain_recovery", "max_speed", "sag")}
+        different = {name: value for name in TrueAxis.__struct_fields__ if (value := getattr(self, name)) is not None}
+        true: dict[str, Any] = {"delay": delay, "backlash": model.play or 0.0} | shared | different
+        for name in ("gain_recovery", "max_speed"):
+            true[name] = None if isinstance(true[name], str) else true[name]  # "never", "none"
+        true["plant"] = self._plant(model.plant, where)
+        return TrueAxis(**true)
 
     def _plant(self, model: PLANTS, where: str) -> PLANTS:
         kind = self.plant or model.__struct_config__.tag

@@ -4,13 +4,10 @@ The drawing is done by a process of its own (:mod:`pumafuse.views.live_drawer`),
 through a pipe. Whatever becomes of it, of the viewer or of the connection between them, the estimator does not wait:
 a thread writes into the pipe, and a frame that comes while others wait is left out.
 
-Entities: ``<axis>/command``, ``/estimate`` with its variance, ``/<sensor>`` and ``/<sensor>/rejected``;
-``residual/<axis>/<sensor>``, the measurement minus the estimate, about ``residual/<axis>/estimate``, 0 with the
-estimate's variance; ``path/command``, ``path/estimate``, ``path/tool`` in 3D, and with a frame ``path/<sensor>``;
-``nis/<sensor>``, ``rate/<sensor>``; ``log``, the faults that begin and end. Of a tool that turns ``path`` has the
-entities of a recorded result (:mod:`pumafuse.views.scene`). All against seconds since the first event, positions in mm
-or degrees. With a frame, commands and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its
-mean distance from the estimate.
+Entities are those of a recorded result (:mod:`pumafuse.views.rerun`, :mod:`pumafuse.views.scene`), with a frame
+``path/<sensor>``, and ``nis/<sensor>``, ``rate/<sensor>``; ``log``, the faults that begin and end. All against seconds
+since the first event, positions in mm or degrees. With a frame, commands and measurements in x, y, z are in 3D only. A
+sensor with a bias is drawn less its mean distance from the estimate.
 """
 
 from __future__ import annotations
