@@ -111,18 +111,8 @@ class Measurements:
 
     def of(self, sensor: str, axis: str) -> Measurements:
         """The components of one sensor on one axis."""
-        order, begin = self.grouped
-        group = self.sensors.index(sensor) * len(self.axes) + self.axes.index(axis)
-        return self.where(order[begin[group] : begin[group + 1]])
-
-    @cached_property
-    def grouped(self) -> tuple[IntArray, IntArray]:
-        """Components by sensor and axis, (m,), and where each of these groups begins."""
-        count = len(self.sensors) * len(self.axes)
-        small = np.min_scalar_type(count)  # which is sorted ten times as fast
-        group = self.sensor.astype(small) * len(self.axes) + self.axis.astype(small)
-        order = np.argsort(group, kind="stable")
-        return order, np.searchsorted(group.take(order), np.arange(count + 1, dtype=small))
+        of_sensor = self.sensor == self.sensors.index(sensor)
+        return self.where(np.flatnonzero(of_sensor & (self.axis == self.axes.index(axis))))
 
     def where(self, chosen: BoolArray | IntArray) -> Measurements:
         """The components that a mask (m,) or their places select."""

@@ -54,9 +54,7 @@ def fused_figure(est: Estimates) -> Figure:
                 axes.plot(est.time, position * screen.scale, color=colours.ESTIMATE, lw=1.0, label="estimate")
                 _reference(axes, est.reference, name, screen.scale)
                 axes.set_ylabel(f"{name} [{screen.unit}]")
-                low, high = float(shown.min()) * screen.scale, float(shown.max()) * screen.scale
-                margin = 0.1 * (high - low) + 0.5
-                axes.set_ylim(low - margin, high + margin)
+                axes.set_ylim(_span(shown * screen.scale))
             for axes in (left, left_zoom):
                 _residuals(axes, est, name)
                 axes.set_ylabel(f"{name}: measured\n− estimate [{screen.unit}]")
@@ -78,26 +76,27 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
     colour = dict(zip(results, colours.several(len(results)), strict=True))
     positions = {name: result.positions(first.config) for name, result in results.items()}
     start, end = busiest(first.time, first.positions(first.config), _ZOOM_S)
+    zoomed = (first.time >= start) & (first.time <= end)
     with drawing(2, 2 * len(first.axes), width=13.0, height=2.4, sharex="col") as figure:
         for number, axis in enumerate(first.axes):
             screen = first.config.arm.screen_of(axis)
+            of_axis = {name: position[axis] for name, position in positions.items() if axis in position}
             whole, zoom, left, left_zoom = figure.axes[4 * number : 4 * number + 4]
             for axes in (whole, zoom):
-                for name, result in results.items():
-                    if axis in result.axes:
-                        position = positions[name][axis] * screen.scale
-                        axes.plot(result.time, position, lw=1.0, color=colour[name], label=name)
+                for name, position in of_axis.items():
+                    axes.plot(results[name].time, position * screen.scale, lw=1.0, color=colour[name], label=name)
                 _reference(axes, reference, axis, screen.scale)
                 axes.set_ylabel(f"{axis} [{screen.unit}]")
             what, shown = "difference", [np.zeros(1)]
-            for name, result in results.items():
-                if axis not in result.axes or (reference is None and result is first):
+            for name, position in of_axis.items():
+                result = results[name]
+                if reference is None and result is first:
                     continue
                 if reference is not None and axis in reference.position:
                     what, apart = "error", interpolated(result.time, result.segment, reference, axis)
                 else:
                     apart = np.interp(result.time, first.time, first.axes[axis].position)
-                shown.append(positions[name][axis] - apart)
+                shown.append(position - apart)
                 for axes in (left, left_zoom):
                     axes.plot(result.time, shown[-1] * screen.scale, lw=0.8, color=colour[name])
             limit = _reach(np.concatenate(shown)) * screen.scale
@@ -106,7 +105,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
                 axes.set_ylabel(f"{axis}: {what} [{screen.unit}]")
             for axes in (zoom, left_zoom):
                 axes.set_xlim(start, end)
-            _fit_height(zoom, start, end)
+            zoom.set_ylim(_span(first.axes[axis].position[zoomed] * screen.scale))
         for axes in figure.axes[-2:]:
             axes.set_xlabel(_TIME)
         legend(figure)
@@ -116,9 +115,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
 
 def path_figure(est: Estimates, run: Run) -> Figure | None:
     """Draw where the tool was commanded to be and was, in the log's x, y, z; None where it has not all three."""
-    positions = (
-        {name: axis.position for name, axis in est.axes.items()} if in_space(est.config.arm) == CARTESIAN else {}
-    )
+    positions = est.positions if in_space(est.config.arm) == CARTESIAN else {}
     estimated, command = est.cartesian or positions, run.command.values
     if not all(name in estimated for name in CARTESIAN):
         return None
@@ -296,13 +293,10 @@ def _figure(est: Estimates, rows: int, labels: Sequence[str], ratios: Sequence[f
         figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
 
 
-def _fit_height(axes: Axes, start: float, end: float) -> None:
-    """Let an axis reach as far as its lines do between two times."""
-    time, value = np.concatenate([np.asarray(line.get_xydata(), dtype=np.float64) for line in axes.lines]).T
-    inside = value[(time >= start) & (time <= end) & np.isfinite(value)]
-    if len(inside):
-        margin = 0.1 * float(np.ptp(inside)) + 0.5
-        axes.set_ylim(float(inside.min()) - margin, float(inside.max()) + margin)
+def _span(values: FloatArray) -> tuple[float, float]:
+    """Limits of an axis that shows all values."""
+    margin = 0.1 * float(np.ptp(values)) + 0.5
+    return float(values.min()) - margin, float(values.max()) + margin
 
 
 def _reach(values: FloatArray) -> float:
