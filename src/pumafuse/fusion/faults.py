@@ -165,7 +165,6 @@ def latency_questions(config: FusionConfig, names: Iterable[str]) -> list[str]:
 
 _Positions: TypeAlias = Mapping[str, Mapping[str, Rows]]  # when valid, and without the scale, by sensor and axis
 _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
-_Led: TypeAlias = tuple[FloatArray, FloatArray]  # where the commands lead an axis, and where they had shortly before
 
 
 def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
@@ -210,33 +209,26 @@ def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) ->
     """
     trackings: dict[str, dict[str, Tracking]] = {name: {} for name in positions}
     every, until = segment.rows_by_sensor(), int(segment.commands[-1]) + _TAIL_NS
-    for number, axis in enumerate(segment.axes):
-        some: dict[str, Rows] = {}
-        for name, (valid, position) in ((name, axes[axis]) for name, axes in positions.items() if axis in axes):
+    for name, axes in positions.items():
+        for axis, (valid, position) in axes.items():
             count = int(np.searchsorted(valid, until - round(config.sensors[name].latency * 1e9), side="right"))
-            if count >= max(_FEW, np.count_nonzero(every[name].codes[:, number] != ABSENT) / 2):
+            codes = every[name].codes[:, segment.axes.index(axis)]
+            if count >= max(_FEW, np.count_nonzero(codes != ABSENT) / 2):
                 chosen = slice(None, count, 1 + count // _ENOUGH)
                 alike = without_spikes(position[chosen])
-                some[name] = valid[chosen][alike], position[chosen][alike]
-        led = _led_at(segment, config, axis, [valid for valid, _ in some.values()])
-        for (name, rows), ends in zip(some.items(), led, strict=True):
-            trackings[name][axis] = _tracking(segment, config, name, axis, rows, ends)
+                rows = valid[chosen][alike], position[chosen][alike]
+                trackings[name][axis] = _tracking(segment, config, name, axis, rows)
     return trackings
 
 
-def _led_at(segment: Segment, config: FusionConfig, axis: str, valid: Sequence[TimeArray]) -> list[_Led]:
-    """Where the commands lead an axis at the instants of several sensors, and where they had led shortly before."""
-    if not valid:
-        return []
-    every = np.concatenate([part for stamps in valid for part in (stamps, stamps - round(SMALL_SHIFT * 1e9))])
-    order, position = np.argsort(every, kind="stable"), np.empty(len(every))  # which merges what is in order
-    position[order] = segment.led(config.arm, axis, every[order])
-    parts = iter(np.split(position, np.cumsum([len(stamps) for stamps in valid for _ in range(2)])[:-1]))
-    return list(zip(parts, parts, strict=True))
+def _led_at(segment: Segment, config: FusionConfig, axis: str, valid: TimeArray) -> tuple[FloatArray, FloatArray]:
+    """Where the commands lead an axis at some instants, and where they had led shortly before."""
+    early = segment.led(config.arm, axis, valid - round(SMALL_SHIFT * 1e9))
+    return segment.led(config.arm, axis, valid), early
 
 
-def _tracking(segment: Segment, config: FusionConfig, name: str, axis: str, rows: Rows, ends: _Led) -> Tracking:
-    (valid, position), (led, before) = rows, ends
+def _tracking(segment: Segment, config: FusionConfig, name: str, axis: str, rows: Rows) -> Tracking:
+    (valid, position), (led, before) = rows, _led_at(segment, config, axis, rows[0])
     sensor, process = config.sensors[name], config.process[axis]
     of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_drift_sd_of(axis)) / abs(sensor.scale)
     noise = math.hypot(of_sensor, process.disturbance_sd)
@@ -567,7 +559,7 @@ def _turned_frame(
     valid, value = valid[alike], value[alike]
     if len(valid) < _FEW:
         return None
-    ends = [_led_at(segment, config, axis, [valid])[0] for axis in axes]
+    ends = [_led_at(segment, config, axis, valid) for axis in axes]
     led, before = (np.column_stack(part) for part in zip(*ends, strict=True))
     over = round(_MOVE / max(float(np.median(np.diff(valid))), 1.0))
     if not 1 <= over < len(valid) // _PARTS:
