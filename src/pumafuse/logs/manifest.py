@@ -286,6 +286,19 @@ def is_error(column: str) -> bool:
     return _ERROR_WORD.search(leaf(column)) is not None
 
 
+def refuse_twice(path: Path) -> None:
+    """Refuse a ``run.toml`` in which one column, or sum of some, is what the arm is told and what a sensor measures."""
+    listed = load(path)
+    told = {frozenset(map(repr, columns)): axis for axis, columns in listed.command.axes.items()}
+    for name, entry in listed.sensors.items() if told else ():
+        for axis, columns in entry.axes.items() if entry.rows == listed.command.rows else ():
+            if twice := told.get(frozenset(map(repr, columns))):
+                raise ConfigError(
+                    f"{path}: sensors.{name}.{axis} is the column '{columns[0].column}' of {entry.label}, and so is"
+                    f" command.{twice}: give each the column of its own, what the arm is told and what is measured"
+                )
+
+
 def of_tables(tree: dict[str, Any], where: str = "run.toml") -> Manifest:
     """What the tables of a ``run.toml`` say, with every number in SI."""
     kinds = {"command": CommandEntry, "reference": ReferenceEntry}
