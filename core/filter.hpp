@@ -62,7 +62,7 @@ struct Known {
 template <int N>
 struct Entry {
     Time time;
-    double q, drift;  // in force until then
+    double q, drift, scale;  // in force until then
     int sensor = NOBODY;
     double nu = 0.0, R = 0.0, widened = 0.0;
     ByDoubt<> d_nu{};
@@ -188,7 +188,7 @@ class Filter {
         state.response.predict(axis.arm, acts);
         const double maneuver = state.response.command(axis.arm, event.value[a]);
         if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
-        if (history) (*history)[a].push_back({event.time, value_of(xi.q), value_of(xi.drift)});
+        if (history) (*history)[a].push_back({event.time, value_of(xi.input()), value_of(xi.drifting()), value_of(xi.scale)});
         xi.set_noise(axis.noise, maneuver);
     }
 
@@ -269,7 +269,9 @@ class Filter {
         const Vector<N, Real> K = xi.update(h, along, nu, d_nu, R);
         state.gates[a].fuse(event.source, event.time);
         if constexpr (std::is_same_v<Real, double>)
-            if (history) (*history)[a].push_back({event.time, xi.q, xi.drift, event.source, nu, R, widened, d_nu, K});
+            if (history)
+                (*history)[a].push_back({event.time, xi.input(), xi.drifting(), xi.scale, event.source, nu, R, widened, d_nu, K});
+        if (fate.outcome[a] != PF_REACQUIRED) xi.learn(axes[a].noise, nu, along.S, R);
     }
 
     // Whether a row beyond its gate re-acquires; if not, it is remembered, and whom it contradicts noted.
@@ -303,7 +305,7 @@ class Filter {
         const Time between = event.time - before.rejected_at;
         if (double(between) < axis.arm.period * 1e9) return Agreement::too_soon;
         Residual<N, Real> moved;  // from what is known, by noise alone
-        moved.q = xi.q, moved.drift = xi.drift;
+        moved.q = xi.q, moved.drift = xi.drift, moved.scale = xi.scale;
         moved.predict(axis.arm.plant, axis.noise, {between, 0.0});
         const Real motion =
             xi.variance(axis.noise.motion(axis.arm.plant, double(between) / 1e9)) + moved.variance(axis.noise.position);

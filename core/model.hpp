@@ -19,6 +19,7 @@ struct Axis {  // the fields of pf_axis
     Real period, delay, time_constant, natural_frequency, damping, slope, intercept, recovery;
     Real max_speed, play, sag_offset, sag_slope, sag_knee, sag_slope_beyond, sag_knee_below, sag_slope_below;
     Real input_noise, drift, maneuver_noise, maneuver_drift, disturbance_sd, disturbance_time, smoothness;
+    Real adaptation;
     Real offset_sd, lag_sd, gain_sd, start;
 };
 

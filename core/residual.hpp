@@ -75,9 +75,10 @@ Vector<N, Real> joseph(Matrix<N, Real>& M, const Vector<N, Real>& H, const Along
 // What is known of the residual of one axis.
 template <int N, class Real>
 struct Noise {
-    Real input_noise, drift, maneuver_noise, maneuver_drift;  // as pf_axis has them
-    bool maneuvers;                                           // whether commands change these
-    bool doubted;                                             // whether lag or gain of the response are
+    Real input_noise, drift, maneuver_noise, maneuver_drift, adaptation;  // as pf_axis has them
+    bool maneuvers;  // whether commands change these
+    bool adapts;     // whether innovations do
+    bool doubted;    // whether lag or gain of the response are
     Smoothness smoothness = Smoothness::none;
     Plant<Real> disturbance;      // a smooth one is a plant with a double pole, driven by white noise
     Real density = 0.0;           // of that noise
@@ -90,9 +91,9 @@ struct Noise {
 
     explicit Noise(const Axis<Real>& axis)
         : input_noise(axis.input_noise), drift(axis.drift), maneuver_noise(axis.maneuver_noise),
-          maneuver_drift(axis.maneuver_drift),
+          maneuver_drift(axis.maneuver_drift), adaptation(axis.adaptation),
           maneuvers(value_of(maneuver_noise) != 0.0 || value_of(maneuver_drift) != 0.0),
-          doubted(value_of(axis.lag_sd) != 0.0 || value_of(axis.gain_sd) != 0.0) {
+          adapts(value_of(adaptation) != 0.0), doubted(value_of(axis.lag_sd) != 0.0 || value_of(axis.gain_sd) != 0.0) {
         variance[OFFSET] = square(axis.offset_sd), position[PLANT] = position[OFFSET] = 1.0;
         if (value_of(axis.disturbance_sd) == 0.0) return;
         smoothness = value_of(axis.smoothness) > 1.0 ? Smoothness::smooth : Smoothness::rough;
@@ -101,6 +102,11 @@ struct Noise {
         if (smoothness == Smoothness::rough) return;
         add(lambda, square(lambda * axis.disturbance_sd));
         disturbance = {lambda, 1.0, 0.0}, density = 4.0 * square(axis.disturbance_sd) / lambda;
+    }
+
+    // Of what a state reverts to: biases are the sensors', and do not change with an arm's unrest.
+    Real variance_of(int i, const Real& scale) const {
+        return i == DISTURBANCE && smoothness == Smoothness::rough ? scale * variance[i] : variance[i];
     }
 
     bool smooth() const { return DISTURBANCE + 1 < N && smoothness == Smoothness::smooth; }
@@ -137,6 +143,8 @@ struct Residual {
     Instant<Real> until;        // commands that change these have been taken into account until then:
     Driven<Real> since;         // Phi and Q of the plant from `time` on, Q with the noise that there was
     Real drifted = 0.0;         // what that has added to the offset's variance
+    Real unrest = 0.0;          // logarithm of how many times as large its variances are as configured,
+    Real scale = 1.0;           // and how many times: so until the next measurement
 
     Residual() = default;
 
@@ -156,6 +164,7 @@ struct Residual {
         const Real dt = seconds(until, to);
         if (is_zero(dt)) return;
         const Driven<Real>& f = plant.driven_over(dt);
+        const Real q = input();
         Driven<Real>& s = since;
         if (until.ns == time.ns && is_zero(until.shift - time.shift)) {  // the first: Phi_s is 1
             s = {f, q * f.q11, q * f.q12, q * f.q22};
@@ -170,8 +179,11 @@ struct Residual {
             s.f21 = f.f21 * s.f11 + f.f22 * s.f21, s.f22 = f.f21 * s.f12 + f.f22 * s.f22;
             s.f11 = f11, s.f12 = f12;
         }
-        drifted = drifted + drift * dt, until = to;
+        drifted = drifted + drifting() * dt, until = to;
     }
+
+    Real input() const { return scale * q; }         // densities squared as they are now
+    Real drifting() const { return scale * drift; }
 
     // x <- F x and P <- F P F^T + Q.
     void predict(const Plant<Real>& plant, const Noise<N, Real>& noise, const Instant<Real>& to) {
@@ -186,14 +198,15 @@ struct Residual {
         int i = DISTURBANCE;
         if (noise.smooth()) {
             const Driven<Real>& d = noise.disturbance.driven_over(dt);
-            move(i, d), add(i, noise.density * d.q11, noise.density * d.q12, noise.density * d.q22);
+            const Real density = scale * noise.density;
+            move(i, d), add(i, density * d.q11, density * d.q12, density * d.q22);
             i += 2;
         }
         for (; i < noise.size; ++i) {
             if (value_of(noise.reverting[i]) == 0.0) continue;
             const Real lost = expm1(-noise.reverting[i] * dt);
             fade(i, 1.0 + lost);
-            P[i][i] = P[i][i] - noise.variance[i] * lost * (2.0 + lost);
+            P[i][i] = P[i][i] - noise.variance_of(i, scale) * lost * (2.0 + lost);
         }
         time = to;
     }
@@ -234,7 +247,20 @@ struct Residual {
         return K;
     }
 
+    // Towards what a measurement says of the noise before it, by the score of its likelihood. (Creal, Koopman & Lucas,
+    // "Generalized autoregressive score models with applications", J. Appl. Econometrics 28(5), 2013.)
+    void learn(const Noise<N, Real>& noise, const Real& nu, const Real& S, const Real& R) {
+        using std::exp;
+        if (!noise.adapts) return;
+        const Real score = (1.0 - R / S) * (square(nu) / S - 1.0);
+        unrest = unrest + noise.adaptation * (value_of(score) < MOST ? score : Real(MOST));
+        if (value_of(unrest) < 0.0) unrest = 0.0;
+        scale = exp(unrest);
+    }
+
   private:
+    static constexpr double MOST = 10.0;  // of a score: an outlier that passed the gate is no unrest
+
     void each_doubt(auto work) {
         if constexpr (std::is_same_v<Real, double>)
             for (int k = 0; doubted && k < DOUBTS; ++k) work(by[k], k);

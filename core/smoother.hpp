@@ -21,15 +21,16 @@ struct Later {
     std::array<Vector<N, double>, COLUMNS> eta{};
     Matrix<N, double> M{};
 
-    void over_interval(const Arm<double>& arm, const Noise<N, double>& noise, double dt, double q, double drift) {
+    void over_interval(const Arm<double>& arm, const Noise<N, double>& noise, double dt, double q, double drift,
+                       double scale) {
         over_pair(PLANT, arm.plant.driven_over(dt), q);
         through_noise(OFFSET, std::sqrt(drift * dt));
         int i = DISTURBANCE;
-        if (noise.smooth()) over_pair(i, noise.disturbance.driven_over(dt), noise.density), i += 2;
+        if (noise.smooth()) over_pair(i, noise.disturbance.driven_over(dt), scale * noise.density), i += 2;
         for (; i < noise.size; ++i) {
             if (noise.reverting[i] == 0.0) continue;
             const double fading = -noise.reverting[i] * dt, left = std::exp(fading);
-            through_noise(i, std::sqrt(-noise.variance[i] * std::expm1(2.0 * fading)));
+            through_noise(i, std::sqrt(-noise.variance_of(i, scale) * std::expm1(2.0 * fading)));
             for (int c = 0; c < COLUMNS; ++c) eta[c][i] *= left;
             for (int j = 0; j < N; ++j) M[i][j] *= left, M[j][i] *= left;
         }
@@ -157,7 +158,7 @@ void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& h
         Time here = entry->time;
         const auto back_to = [&](Time there) {
             const double dt = double(std::exchange(here, there) - there) / 1e9;
-            if (dt > 0.0) later.over_interval(axis.arm, axis.noise, dt, entry->q, entry->drift);
+            if (dt > 0.0) later.over_interval(axis.arm, axis.noise, dt, entry->q, entry->drift, entry->scale);
         };
         const Time before = entry + 1 != history.rend() ? entry[1].time : origin;
         for (; k >= 0 && times[k] >= before; smoothed()) back_to(times[k]);

@@ -219,7 +219,7 @@ def test_the_header_has_the_numbers_that_live_has(tmp_path: Path) -> None:
     model = window.call_args.args[0]
     done = subprocess.run([compiled(tmp_path, source)], capture_output=True, check=True)
     expected = np.concatenate([part.ravel().view(np.float64) for part in model])
-    assert len(expected) == 2 * 27 + 2 * 5 + 4 * 5
+    assert len(expected) == 2 * 28 + 2 * 5 + 4 * 5
     np.testing.assert_array_equal(np.frombuffer(done.stdout), expected)
     assert np.count_nonzero(np.isnan(expected)) == 3
     assert done.stderr == b"1 1"

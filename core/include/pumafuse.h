@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 10             /* of this interface: a program and its library must agree */
+#define PF_VERSION 11             /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -61,6 +61,7 @@ typedef struct {
     double maneuver_noise, maneuver_drift; /* what each m/s of maneuver adds to them, likewise */
     double disturbance_sd, disturbance_time; /* [m], 0: there is none; [s] */
     double smoothness;                     /* of the disturbance: 1.5 (Matern) or 0.5 (Ornstein-Uhlenbeck) */
+    double adaptation;                     /* how fast all these follow what innovations show; 0: they stay */
     double offset_sd;                      /* prior of the offset [m] */
     double lag_sd, gain_sd;                /* how well the response is known: its lag [s], its size, of 1 */
     double start;                          /* u0 [m]: where it rests before its first command; NaN: not known */

@@ -28,7 +28,10 @@ AXES = {
 }
 CONFIG = pf.FusionConfig(
     arm=pf.ArmModel(name="an arm", update_period=0.028, delay=0.06, axes=AXES),
-    process=dict.fromkeys(AXES, pf.Process(maneuver_noise=1e-3, maneuver_drift=1e-2)),
+    process={
+        "radial": pf.Process(maneuver_noise=1e-3, maneuver_drift=1e-2, adaptation=0.1),
+        "vertical": pf.Process(maneuver_noise=1e-3, maneuver_drift=1e-2),
+    },
     sensors={
         "tracker": pf.Sensor(sd=1e-4, latency=0.008, gate=3.0),
         "camera": pf.Sensor(sd=5e-4, latency=0.1, latency_sd=0.002, gate=3.0, gate_rows=False, bias_sd=1e-3),

@@ -28,7 +28,7 @@ WRONG = (np.nan, np.inf, -np.inf, 1e300, -3.4e38, 1e6)
 def empty(delays: tuple[float, ...]) -> Window:
     axes = {f"axis {n}": pf.AxisModel(plant=PLANTS[n % 2], delay=delay) for n, delay in enumerate(delays)}
     arm = pf.ArmModel(name="any", update_period=0.028, delay=0.06, axes=axes)
-    process = dict.fromkeys(axes, pf.Process(maneuver_noise=1e-3, maneuver_drift=1e-2))
+    process = dict.fromkeys(axes, pf.Process(maneuver_noise=1e-3, maneuver_drift=1e-2, adaptation=0.1))
     config = pf.FusionConfig(arm=arm, sensors=SENSORS, process=process)
     return Window(filter_model(config, tuple(axes), tuple(SENSORS), None, [["vision", "ahead"]] * len(axes)))
 

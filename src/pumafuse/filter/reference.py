@@ -37,6 +37,7 @@ GIVEN, ACTS, MEASURED, ASKED = range(4)  # what happens, in the order of one ins
 RECENT = 500_000_000  # ns; a sensor fused within this time stands for what is believed
 SETTLED = 5_000_000_000  # ns; all sensors in agreement for so long: what was before is forgotten
 NEVER, NOBODY = math.inf, -1
+MOST = 10.0  # of a score: an outlier that passed the gate is no unrest
 
 
 class Innovation(NamedTuple):
@@ -108,7 +109,7 @@ class Axis:
 
     def __init__(self, plant: Plant, axis: Record, sensors: Record, views: Record, origin: int, in_flight: int) -> None:
         self.axis, self.sensors, self.views, self.gate = axis, sensors, views, Gate()
-        self.period, self.time, self.step = float(axis["period"]), origin, 0.0
+        self.period, self.time, self.step, self.unrest = float(axis["period"]), origin, 0.0, 0.0
         self.in_flight: list[int] = []  # when each command acts that is given and does not act yet [ns]
 
         A, B, C = plant.state_space()
@@ -130,6 +131,7 @@ class Axis:
         fading = d, *(slice(i, i + 1) for i in range(drifting.start, drifting.stop))
         self.parts = [slice(OFFSET, 1), *(part for part in fading if sd[part].any()), slice(x.start, self.u + 1)]
         self.set_noise(maneuver=0.0)
+        self.of_arm = np.array([i not in range(drifting.start, drifting.stop) for i in range(size)])  # not of a sensor
 
         self.h = np.zeros(size)  # the position is h x
         self.h[OFFSET], self.h[DISTURBANCE], self.h[x] = 1.0, 1.0, C
@@ -154,9 +156,9 @@ class Axis:
 
     def over(self, ns: int) -> tuple[FloatArray, FloatArray]:
         """F and Q over an interval in which no command is given or acts."""
-        F, Q = self.unit.copy(), np.zeros_like(self.unit)
+        F, Q, L = self.unit.copy(), np.zeros_like(self.unit), self.L * np.exp(0.5 * self.unrest * self.of_arm)
         for part in self.parts:
-            F[part, part], Q[part, part] = discretized(self.A[part, part], self.L[part, part], ns / 1e9)
+            F[part, part], Q[part, part] = discretized(self.A[part, part], L[part, part], ns / 1e9)
         Q[self.e :, :] = Q[:, self.e :] = 0.0  # it is, but for rounding
         return F, Q
 
@@ -208,7 +210,15 @@ class Axis:
         self.by = self.by + np.outer(missed, self.kf.K)
         self.kf.P = 0.5 * (self.kf.P + self.kf.P.T)  # or rounding leads away from symmetry, over a million steps
         self.gate.fuse(s, innovation.time, reacquires)
+        if not reacquires:
+            self.learn(innovation)
         return math.sqrt(self.kf.S[0, 0])
+
+    def learn(self, innovation: Innovation) -> None:
+        """The arm's noise follows what a measurement says of it, by the score of the likelihood."""
+        nu, S, R = innovation.nu, innovation.S, innovation.R
+        score = min((1.0 - R / S) * (nu**2 / S - 1.0), MOST)
+        self.unrest = max(self.unrest + self.axis["adaptation"] * score, 0.0)
 
     def moved_by(self) -> FloatArray:
         """How the position by commands alone changes with its lag [m/s] and with its size [m], (2,)."""

@@ -43,6 +43,7 @@ def _axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, flo
         record["maneuver_noise"], record["maneuver_drift"] = process.maneuver_noise, process.maneuver_drift
         record["disturbance_sd"], record["disturbance_time"] = process.disturbance_sd, process.disturbance_time
         record["smoothness"] = _SMOOTHNESS[process.disturbance_kind]
+        record["adaptation"] = process.adaptation
         record["offset_sd"] = config.start.offset_sd_of(name)
         record["lag_sd"], record["gain_sd"] = _sd_of(model.lag_ci95, arm.lag_of(name)), _gain_sd_of(model)
     return axis

@@ -422,6 +422,7 @@ def with_noise(config: FusionConfig, axis: str, noise: NoiseModel, sensors: Sequ
         disturbance_sd=rounded(noise.disturbance_sd),
         disturbance_time=rounded(noise.disturbance_time),
         disturbance_kind="matern" if noise.smoothness > 1.0 else "ou",
+        adaptation=config.process[axis].adaptation,
     )
     for name, sd in zip(sensors, noise.sd.tolist(), strict=True):
         config = changed(config, ("sensors", name, "sd", axis), rounded(sd))
