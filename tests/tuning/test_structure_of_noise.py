@@ -91,6 +91,25 @@ def test_a_disturbance_is_found_with_its_sd_and_time(kind: str, seed: int) -> No
         assert high < 3.0 * low
 
 
+def test_noise_adapts_but_of_an_arm_that_is_known_to_be_steady() -> None:
+    """A walk that is eightfold in its second half, and a steady one of 40 s: the likelihood speaks for the first alone.
+
+    What is configured stays.
+    """
+    config, command, path = moving()
+    steps = 1e-3 * np.sqrt(PERIOD) * np.random.default_rng(7).standard_normal(COUNT)
+    livelier = np.cumsum(np.where(np.arange(COUNT) < COUNT // 2, steps / 8.0, steps))
+    found, process = fitted(measured(command, path + livelier, 1), config)
+    assert process.adaptation == 0.1
+    assert "noise: adapts (+" in found.orders["tip"]
+    steady = measured(command, path + np.cumsum(steps), 1)
+    found, process = fitted(steady, config)
+    assert process.adaptation == 0.0
+    assert "adapts" not in found.orders["tip"]
+    _, process = fitted(steady, with_process(config, adaptation=0.05))
+    assert process.adaptation == 0.05
+
+
 @pytest.mark.long
 def test_no_disturbance_is_invented() -> None:
     """White noise alone, and a random walk beside it: of ten runs each, at most one has a disturbance."""

@@ -7,6 +7,7 @@ is worth its numbers is taken.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
@@ -16,7 +17,6 @@ import numpy as np
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
-from ..fusion.score import Z95
 from .arm_search import SMOOTHER, WANDERS, ArmSearch, Freedom, chosen_arms
 from .arms import BENDS, Arm
 from .identifiability import covariance
@@ -45,7 +45,7 @@ _NARROWEST = 3.0  # gate: below it rejecting good measurements pays
 _SLOW = 2.0  # s, of a disturbance that is large at first
 # Of noise that follows innovations: by likelihood 0.1 to 0.3 on servos, loads and a trunk, at 30 to 100 Hz.
 _ADAPTATION = 0.1
-_SAYS_LITTLE = 0.5 * Z95**2  # in log-likelihood
+_BELIEVED = math.log(20.0)  # odds that it adapts: bars of loaded servos and a trunk hold better so in another motion
 _QUIET = 0.03  # share of what the rest is, that other noise begins with
 _CALM, _KINDS = "none", {"matern": "smooth (Matérn)", "ou": "rough (Ornstein-Uhlenbeck)"}  # of disturbances
 _HANDICAPS = {_CALM: WANDERS, _KINDS["matern"]: SMOOTHER, _KINDS["ou"]: 0.0}  # log-likelihood
@@ -87,7 +87,7 @@ class Search:
         for start in self._noise_models(config):
             if points:  # an arm that is likeliest under one noise is near that under another
                 start = self._with_arm_of(start, points[0].config)
-            points.append(self._maximum(start))
+            points.append(self._maximum(start) if points else self._with_delay(self._maximum(start)))
         likeliest = self._likeliest(points)
         smooth = self._smoothly_disturbed(likeliest)
         if self._likeliest([*points, *smooth]) != likeliest:
@@ -215,6 +215,22 @@ class Search:
             at = maximise(self.likelihood, at, free(at), self.notify, tolerance=_ROUGHLY).config  # trades with noise
         return point(self.likelihood, at, self._of_axes(at))
 
+    def _with_delay(self, peak: Point) -> Point:
+        """The higher of a maximum without a delay and of what half of the lag as delay leads to.
+
+        Delay and plant are a ridge with several tops. Its end is one, and last digits decided whether a search left it.
+        """
+        config = peak.config
+        for parameter in self.free(config):
+            if parameter.fit == "delay" and parameter.at_bound(config) == "lower":
+                axes = self.likelihood.axes if parameter.axis is None else [parameter.axis]
+                config = parameter.put(config, 0.5 * min(config.arm.lag_of(axis) for axis in axes))
+        if config == peak.config:
+            return peak
+        other = self._maximum(config)
+        best = _best_by_axis(self.likelihood, [peak, other], [peak.posteriors, other.posteriors])
+        return point(self.likelihood, best, self._of_axes(best))
+
     def _from_wider_gates(self, config: FusionConfig) -> FusionConfig:
         """The higher maximum of each axis, this one or that reached by way of wider gates, where any are rejected."""
         best = point(self.likelihood, config, self._of_axes(config))
@@ -282,9 +298,9 @@ class Search:
         peak = point(self.likelihood, adapting, self.free(adapting))
         gains = peak.posteriors - best.posteriors
         for axis, gain in zip(self.likelihood.axes, gains.tolist(), strict=True):
-            if axis in self.reasons:
-                self.reasons[axis].append(f"noise: {'adapts' if gain > -_SAYS_LITTLE else 'steady'} ({gain:+.1f})")
-        config = _best_by_axis(self.likelihood, [best, peak], [np.zeros_like(gains), gains + _SAYS_LITTLE])
+            if axis in self.reasons and gain > -_BELIEVED:
+                self.reasons[axis].append(f"noise: adapts ({gain:+.1f})")
+        config = _best_by_axis(self.likelihood, [best, peak], [np.zeros_like(gains), gains + _BELIEVED])
         return point(self.likelihood, config, self.free(config))
 
 
