@@ -188,7 +188,9 @@ class Filter {
         state.response.predict(axis.arm, acts);
         const double maneuver = state.response.command(axis.arm, event.value[a]);
         if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
-        if (history) (*history)[a].push_back({event.time, value_of(xi.input()), value_of(xi.drifting()), value_of(xi.scale)});
+        if (history)
+            (*history)[a].push_back(
+                {event.time, value_of(xi.input()), value_of(xi.drifting()), value_of(xi.scale)});
         xi.set_noise(axis.noise, maneuver);
     }
 
@@ -270,7 +272,8 @@ class Filter {
         state.gates[a].fuse(event.source, event.time);
         if constexpr (std::is_same_v<Real, double>)
             if (history)
-                (*history)[a].push_back({event.time, xi.input(), xi.drifting(), xi.scale, event.source, nu, R, widened, d_nu, K});
+                (*history)[a].push_back(
+                    {event.time, xi.input(), xi.drifting(), xi.scale, event.source, nu, R, widened, d_nu, K});
         if (fate.outcome[a] != PF_REACQUIRED) xi.learn(axes[a].noise, nu, along.S, R);
     }
 

@@ -112,3 +112,9 @@ def test_an_outlier_is_no_unrest() -> None:
     config = config_of(with_(WALK, drift=0.3e-3, adaptation=0.5), gate=5.0)
     sd = pf.fuse(run, config)["x"].position_sd
     assert sd[[*range(205, 230), *range(310, 330)]].max() < 1.3 * sd[100:200].max()
+
+
+def test_a_step_beyond_the_whole_score_is_refused() -> None:
+    """A million of it would leave no number behind."""
+    with pytest.raises(pf.ConfigError, match=r"process\.x\.adaptation: must be <= 1"):
+        pf.fuse(run_of(np.zeros(60)), config_of(with_(WALK, adaptation=1e6)))

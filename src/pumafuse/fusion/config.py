@@ -77,7 +77,7 @@ class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         disturbance_time: How long it lasts [s].
         disturbance_kind: ``matern``: of smoothness 3/2, or ``ou``: Ornstein-Uhlenbeck, of smoothness 1/2.
         adaptation: How fast all of these follow what innovations show, a step of the logarithm of their variances;
-            0: they stay as they are.
+            0: they stay as they are, 1: the most.
     """
 
     input_noise: NotNegative = msgspec.field(name="input_noise_mm_rtHz", default=0.03e-3)
@@ -87,7 +87,7 @@ class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     disturbance_sd: NotNegative = msgspec.field(name="disturbance_sd_mm", default=0.0)
     disturbance_time: Time = msgspec.field(name="disturbance_time_ms", default=0.3)
     disturbance_kind: Literal["matern", "ou"] = "matern"
-    adaptation: NotNegative = 0.0
+    adaptation: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 
 PROCESS: dict[Kind, Process] = {  # what is not configured
