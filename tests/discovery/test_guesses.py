@@ -129,10 +129,12 @@ def test_a_camera_whose_latency_steps_tells_nothing_of_the_arms_lag(tmp_path: Pa
     folder = mount(tmp_path / "mount", t, command=(u, 1), encoder=(encoder, 1), camera=(seen, 3))
     found = survey(folder)
     _, sensors = guess(found)
-    (doubt,) = sensors["camera"].doubts
+    pair = sensors["camera"].pair
+    assert pair is not None
+    (doubt,) = pair.alignment.doubts("camera", pair.other)
     assert doubt.startswith("the latency of camera steps from ")
     assert [float(one) for one in re.findall(r"[\d.]+", doubt)][:3] == pytest.approx([40.0, 90.0, 18.0], abs=2.0)
-    assert sensors["camera"].latency_sd == pytest.approx(0.035, abs=0.002)  # RMS of 0 and 50 ms
+    assert pair.alignment.unsteadiness == pytest.approx(0.035, abs=0.002)  # RMS of 0 and 50 ms
     pumafuse("fuse", folder, "-o", tmp_path / "out")
     assert pf.ArmModel.load(tmp_path / "out" / "arm.toml").lag_of("z") == pytest.approx(LATE, abs=2e-3)
     for part, latency in (((None, 18.0), 0.04), ((18.0, None), 0.09)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ _HALVINGS = 26
 _LAG_STEP = 1e-5  # of a coordinate
 _UNLIMITED = 10.0  # s; an interval of a lag as wide as this is none
 _SHARES = (0.5, 1.0, 1.5)  # of the way from the best to an end of the interval: points that are drawn
+_SAME = 1e-6  # relative, of distances
 _VALLEY = 0.3  # log-likelihood between two maxima below the lower one, from which they are two
 _NEXT_TO_NONE = 1e-2  # of the upper end, from which a noise's interval is drawn from 0
 _FALLEN = 1.2  # times 1.96 standard deviations, from which a maximum may be another one than that inside
@@ -253,6 +255,8 @@ class _Side:
 
     def root(self, distance: float) -> float:
         """The standard deviations that the drop of the profile at a distance stands for."""
+        same = (before for before in self._maxima if math.isclose(before, distance, rel_tol=_SAME))
+        distance = next(same, distance)
         if distance not in self._maxima:
             inner = max(before for before in self._maxima if before < distance)
             maximum = self._maximum(distance, self._expected(distance))

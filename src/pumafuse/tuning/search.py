@@ -25,7 +25,7 @@ from .maximise import Notify, derivatives, maximise, maximise_by_axis, maximise_
 from .parameters import (
     LATENCIES,
     Parameter,
-    changed,
+    adapting,
     quickest,
     rings,
     with_arm,
@@ -43,8 +43,6 @@ _WELL_KNOWN = 1.0 / 8.0  # of a logarithm: without it some ½ · 8² would be lo
 _NARROWER, _WIDER = 0.6, 3.0  # times the gates
 _NARROWEST = 3.0  # gate: below it rejecting good measurements pays
 _SLOW = 2.0  # s, of a disturbance that is large at first
-# Of noise that follows innovations: by likelihood 0.1 to 0.3 on servos, loads and a trunk, at 30 to 100 Hz.
-_ADAPTATION = 0.1
 _BELIEVED = math.log(20.0)  # odds that it adapts: bars of loaded servos and a trunk hold better so in another motion
 _QUIET = 0.03  # share of what the rest is, that other noise begins with
 _CALM, _KINDS = "none", {"matern": "smooth (Matérn)", "ou": "rough (Ornstein-Uhlenbeck)"}  # of disturbances
@@ -73,6 +71,7 @@ class Search:
         self.likelihood, self.free, self.arms, self.notify = likelihood, free, arms, notify
         # for the order of the plant of an axis, its gain, its disturbance and whether it shares a delay
         self.reasons: dict[str, list[str]] = {axis: [] for axis in likelihood.sensors}
+        self.adapts: list[str] = []  # axes whose noise is to adapt, once all else is fitted
 
     def best(self, config: FusionConfig, one_delay: bool) -> tuple[Point, dict[str, str]]:
         """The best point from a configuration as given, and the reasons by axis.
@@ -94,7 +93,8 @@ class Search:
             points += smooth
         best = self._without_needless(self._from_wider_gates(self._likeliest(points, told=True)))
         likeliest = with_gates(best, config)
-        peak = self._adapting(maximise_with_gates(self.likelihood, likeliest, self.free(likeliest), self.notify))
+        peak = maximise_with_gates(self.likelihood, likeliest, self.free(likeliest), self.notify)
+        self._adapt(peak)
         for axis, why in self.reasons.items():
             if rings(peak.config, axis):
                 why.append("its plant rings: what holds the tool off is a disturbance, not noise that shakes the plant")
@@ -284,24 +284,19 @@ class Search:
             config = _best_by_axis(self.likelihood, peaks, scores)
         return config
 
-    def _adapting(self, best: Point) -> Point:
-        """With noise that grows where innovations show it, for each axis whose likelihood does not speak against it.
+    def _adapt(self, best: Point) -> None:
+        """Note which axes are to get noise that grows where innovations show it: those whose likelihood allows it.
 
         A recording of one motion hardly tells; real arms are livelier in others. What is not livelier is as tuned.
         """
-        adapting = best.config
-        for axis in self._may_be_disturbed(best.config):
-            if best.config.process[axis].adaptation == 0.0:
-                adapting = changed(adapting, ("process", axis, "adaptation"), _ADAPTATION)
-        if adapting == best.config:
-            return best
-        peak = point(self.likelihood, adapting, self.free(adapting))
-        gains = peak.posteriors - best.posteriors
+        with_adaptation, may = best.config, self._may_be_disturbed(best.config)
+        for axis in may:
+            with_adaptation = adapting(with_adaptation, axis)
+        gains = point(self.likelihood, with_adaptation, self.free(with_adaptation)).posteriors - best.posteriors
         for axis, gain in zip(self.likelihood.axes, gains.tolist(), strict=True):
-            if axis in self.reasons and gain > -_BELIEVED:
+            if axis in may and gain > -_BELIEVED and best.config.process[axis].adaptation == 0.0:
+                self.adapts.append(axis)
                 self.reasons[axis].append(f"noise: adapts ({gain:+.1f})")
-        config = _best_by_axis(self.likelihood, [best, peak], [np.zeros_like(gains), gains + _BELIEVED])
-        return point(self.likelihood, config, self.free(config))
 
 
 def arm_searches(likelihood: Likelihood, config: FusionConfig, free: FreeOf, believed: bool) -> dict[str, ArmSearch]:

@@ -75,6 +75,7 @@ class Stage:
     orders: dict[str, str]
     notes: Sequence[str]  # everything else noticed
     arms: Mapping[str, ArmSearch]  # the arms that were looked for, by axis
+    adapts: Sequence[str]  # axes whose noise is to adapt; all numbers are fitted with noise that does not
 
 
 def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Notify = ignore) -> Stage:
@@ -110,7 +111,8 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
         believed |= {
             (name, axis): noise for axis, search in arms.items() for name, noise in search.likely_noise.items()
         }
-    best, orders = Search(likelihood, free, arms, notify).best(start, plan.one_delay)
+    search = Search(likelihood, free, arms, notify)
+    best, orders = search.best(start, plan.one_delay)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
@@ -126,7 +128,7 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
     notes += few_measurements(likelihood, free(best.config))
-    return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched)
+    return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched, search.adapts)
 
 
 def refitted(stage: Stage, runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float) -> FusionConfig:

@@ -22,7 +22,7 @@ from ..units import MS
 from .identifiability import FEWEST, TuneError, correlations, excited_axes, least_count
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, Point
-from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
+from .parameters import Fit, Parameter, adapting, changed, check_fixed, kinds_of, parameters, rounded, with_gates
 from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, refitted, run_stage
 from .summary import (
@@ -341,6 +341,8 @@ class Pipeline:
         ):
             none = parameter.vanishes and parameter.at_bound(best) == "lower"
             best = parameter.put(best, 0.0 if none else parameter.clipped(number(parameter.get(best))))
+        for axis in (axis for stage in self.stages for axis in stage.adapts):
+            best = adapting(best, axis)
         return best
 
 

@@ -10,6 +10,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
+from ..arrays import FloatArray
 from ..fusion.consistency import Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.score import Z95
@@ -28,6 +29,7 @@ _COLUMNS = 5  # of profiles
 _WIDTH = 11.0  # inch; as wide as a page
 _TITLE = 32  # letters over a panel
 _WITHIN_REACH = 10.0  # last over first of a log scale, up to which its ticks are evenly spaced
+_SMOOTH = 100  # points of a profile's curve
 _DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number before
 
 
@@ -169,7 +171,7 @@ def _profile(axes: Axes, profile: Profile, fitted: Fitted) -> None:
     ends = [edge if end is None else end for end, edge in zip(fitted.ci95, (low, high), strict=True)]
     axes.axvspan(*ends, color=colours.ESTIMATE, alpha=0.15, lw=0)
     axes.axhline(-0.5 * Z95**2, color=colours.COMMAND, lw=0.8, ls="--")
-    axes.plot(profile.values, profile.drop, ".-", ms=3, color=colours.ESTIMATE, lw=1.2)
+    axes.plot(*_smooth(profile), color=colours.ESTIMATE, lw=1.2)
     before = fitted.before
     if before is not None and low <= before <= high:
         axes.plot([before, before], [_DEEPEST, -5.0], color=colours.REJECTED, lw=1.6)
@@ -184,6 +186,15 @@ def _profile(axes: Axes, profile: Profile, fitted: Fitted) -> None:
     axes.tick_params(labelsize=8)
     parts = profile.key.split(".")
     axes.set_title("\n".join(_cut(".".join(half)) for half in (parts[:2], parts[2:])), loc="left", fontsize=8)
+
+
+def _smooth(profile: Profile) -> tuple[FloatArray, FloatArray]:
+    """A curve through a profile's points: the root of its drop is nearly a straight line."""
+    peak = int(np.argmax(profile.drop))
+    root: FloatArray = np.sqrt(profile.drop[peak] - profile.drop) * np.sign(np.arange(len(profile.drop)) - peak)
+    places: FloatArray = np.log(profile.values) if profile.log else profile.values
+    at = np.linspace(float(places[0]), float(places[-1]), _SMOOTH)
+    return np.exp(at) if profile.log else at, profile.drop[peak] - np.interp(at, places, root) ** 2
 
 
 def _cut(text: str) -> str:
