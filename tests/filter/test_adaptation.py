@@ -118,3 +118,17 @@ def test_a_step_beyond_the_whole_score_is_refused() -> None:
     """A million of it would leave no number behind."""
     with pytest.raises(pf.ConfigError, match=r"process\.x\.adaptation: must be <= 1"):
         pf.fuse(run_of(np.zeros(60)), config_of(with_(WALK, adaptation=1e6)))
+
+
+def test_how_far_a_lively_arm_may_move_between_rejected_rows_adapts() -> None:
+    """A slip of 50 mm, then 5 mm more within two rows: eight times as lively as learnt that agrees, and re-acquires."""
+    run = run_of(livelier(8.0))
+    camera = run.sensors["camera"]
+    slipped = camera.values["x"].copy()
+    slipped[500:] += 0.05
+    slipped[502:] += 0.005
+    run = replace(run, sensors={"camera": replace(camera, values={"x": slipped})})
+    outcome = pf.fuse(run, config_of(WALK, gate=5.0)).measurements.outcome
+    assert outcome[499:503].tolist() == [
+        pf.Outcome.FUSED, pf.Outcome.REJECTED, pf.Outcome.REJECTED, pf.Outcome.REACQUIRED,
+    ]  # fmt: skip
