@@ -25,7 +25,7 @@ struct Event {
 
 // What became of an event's values.
 struct Fate {
-    double *innovation, *innovation_sd;  // (A,)
+    double *innovation, *innovation_sd, *noise_scale;  // (A,)
     Code* outcome;                       // (A,)
     std::int16_t* contradicts;
     double *d_innovation = nullptr, *d_variance = nullptr;  // by each of so many `lanes`, `stride` apart
@@ -47,8 +47,8 @@ struct Table {
 
     Fate fate(Time row) const {
         const Time at = row * axes;
-        const auto& [innovation, innovation_sd, outcome, contradicts] = *results;
-        return {innovation + at, innovation_sd + at, outcome + at, contradicts + row};
+        const auto& [innovation, innovation_sd, noise_scale, outcome, contradicts] = *results;
+        return {innovation + at, innovation_sd + at, noise_scale + at, outcome + at, contradicts + row};
     }
 };
 

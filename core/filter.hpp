@@ -232,7 +232,7 @@ class Filter {
             if (event.known[a] != PF_FUSED) continue;
             advance(state.axes[a], a, {event.time, value_of(sensor.latency) - sensor.latency});
             const Innovation& found = innovations[a] = innovation(state.axes[a], event, a);
-            store(fate, a, found.nu, found.along.S);
+            store(fate, a, found.nu, found.along.S), fate.noise_scale[a] = value_of(state.axes[a].residual.scale);
             beyond |= gate > 0.0 && far(a);
         }
         const bool reacquires = beyond && !given && this->reacquires(state, event, first, end, fate);

@@ -28,7 +28,7 @@ class Window final : public pf_live {
   public:
     Window(const Model<double>& model, Time room, Time most)
         : model(model), filter(model), state(filter.at_rest(0)), tried(state), rows(room, size(), state), most(most),
-          first(size(), PF_NEVER), numbers(6 * size(), 1.0), codes(2 * size()) {
+          first(size(), PF_NEVER), numbers(7 * size(), 1.0), codes(2 * size()) {
         double period = 0.0, latency = 0.0;
         for (const Axis<double>& axis : model.axes) period = std::max(period, axis.period);
         for (const Sensor<double>& sensor : model.sensors) latency = std::max(latency, sensor.latency);
@@ -59,7 +59,8 @@ class Window final : public pf_live {
         Time row = std::min({hidden, done, until});
         tried = row < done ? rows.at(row).before : state;
         std::int16_t contradicts;
-        const Fate unused{&numbers[4 * size()], &numbers[5 * size()], &codes[size()], &contradicts};
+        const Fate unused{&numbers[4 * size()], &numbers[5 * size()], &numbers[6 * size()], &codes[size()],
+                          &contradicts};
         for (; row < until; ++row)  // what is valid by then, without what is hidden
             if (rows[row].stamp <= (row < done ? after : stamped)) filter.step(tried, rows[row], unused);
         filter.estimate(tried, rows, until, end, time, stamped, outputs);
@@ -79,6 +80,7 @@ class Window final : public pf_live {
             std::copy_n(fate.outcome, size(), results.outcome + at);
             std::copy_n(fate.innovation, size(), results.innovation + at);
             std::copy_n(fate.innovation_sd, size(), results.innovation_sd + at);
+            std::copy_n(fate.noise_scale, size(), results.noise_scale + at);
         }
     }
 
@@ -119,7 +121,7 @@ class Window final : public pf_live {
         Time time, stamp;
         int source;
         std::int16_t contradicts;
-        std::vector<double> numbers;  // value, spread, innovation and its sd
+        std::vector<double> numbers;  // value, spread, innovation, its sd, noise scale
         std::vector<Code> codes;      // known and outcome
         State<N, double> before;
     };
@@ -131,7 +133,7 @@ class Window final : public pf_live {
 
         Ring(Time room, Time axes, const State<N, double>& state)
             : axes(axes), places(std::bit_ceil(std::uint64_t(std::max(room, 2 * SPARE * axes))),
-                                 {0, 0, 0, NOBODY, std::vector<double>(4 * axes), std::vector<Code>(2 * axes), state}) {}
+                                 {0, 0, 0, NOBODY, std::vector<double>(5 * axes), std::vector<Code>(2 * axes), state}) {}
 
         Time room() const { return Time(places.size()); }
         Row& at(Time row) const { return places[row & (room() - 1)]; }
@@ -145,7 +147,7 @@ class Window final : public pf_live {
         Fate fate(Time row) const {
             Row& found = at(row);
             double* number = found.numbers.data() + 2 * axes;
-            return {number, number + axes, found.codes.data() + axes, &found.contradicts};
+            return {number, number + axes, number + 2 * axes, found.codes.data() + axes, &found.contradicts};
         }
     };
 

@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 11             /* of this interface: a program and its library must agree */
+#define PF_VERSION 12             /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -105,7 +105,8 @@ typedef struct {
 /* What became of n events; the caller's arrays. Values that the filter does not decide on are not written. */
 typedef struct {
     double *innovation, *innovation_sd; /* nu and sqrt(S) [m], (n, A) */
-    uint8_t *outcome;                   /* (n, A) */
+    double *noise_scale; /* how many times as large as configured the arm's variances were, (n, A) */
+    uint8_t *outcome;    /* (n, A) */
     int16_t *contradicts; /* the sensor that a rejected row contradicts time after time, -1: none, (n,) */
 } pf_results;
 

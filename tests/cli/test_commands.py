@@ -76,7 +76,7 @@ def test_result_tables_have_the_documented_columns(with_tracker: Path) -> None:
     measurements = pq.read_table(with_tracker / "measurements.parquet")
     assert measurements.column_names == [
         *("time_s", "stamp_s", "sensor", "axis", "value_mm"),
-        *("innovation_mm", "innovation_sd_mm", "nis", "outcome"),
+        *("innovation_mm", "innovation_sd_mm", "nis", "noise_scale", "outcome"),
     ]
     axes = json.loads((with_tracker / "summary.json").read_text())["axes"].values()
     counted = sum(n for axis in axes for sensor in axis["sensors"].values() for n in sensor["outcomes"].values())

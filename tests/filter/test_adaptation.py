@@ -67,6 +67,7 @@ def test_noise_takes_a_step_along_the_score_of_each_measurement() -> None:
     gaps = np.diff(rows.time, prepend=0.0)
     S, scales = by_hand(rows.innovation, gaps)
     np.testing.assert_allclose(rows.innovation_sd, np.sqrt(S), rtol=1e-9)
+    np.testing.assert_allclose(rows.noise_scale, scales, rtol=1e-9)
     assert scales.max() > 8.0
     walked = np.minimum.outer(*[np.cumsum(scales * WALK.drift**2 * gaps)] * 2) + 2e-3**2
     gain = np.linalg.solve(walked + SD**2 * np.eye(len(gaps)), walked)

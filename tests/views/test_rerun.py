@@ -30,7 +30,9 @@ def fused() -> tuple[pf.Estimates, pf.Run]:
         (stamps, {"radial": np.full(140, 0.5)}),
     )
     config = pf.FusionConfig(
-        arm=pf.ArmModel.load("puma560-internal"), sensors={"camera": pf.Sensor(sd=1e-3, latency=0.005, gate=5.0)}
+        arm=pf.ArmModel.load("puma560-internal"),
+        process={"radial": pf.Process(drift=1e-4, adaptation=1.0)},
+        sensors={"camera": pf.Sensor(sd=1e-3, latency=0.005, gate=5.0)},
     )
     with pytest.warns(pf.PumafuseWarning, match="before_start"):
         return pf.fuse(run, config, rate=100.0), run
@@ -83,6 +85,8 @@ def test_everything_is_in_mm_on_one_clock(fused: tuple[pf.Estimates, pf.Run], re
         "innovation/radial/upper": (est.time[[0, -1]], np.full(2, 2.0)),
         "innovation/radial/lower": (est.time[[0, -1]], np.full(2, -2.0)),
     }
+    plain["innovation/radial/noise"] = measurements.time[used], np.sqrt(measurements.noise_scale[used])
+    assert measurements.noise_scale[used].max() > 1.1
     assert used.sum() == 139
     every = {*wanted, *plain, "outcome/camera"}
     assert entities(recorded) == {f"/{name}" for name in every}  # and no path: a position in space needs two axes

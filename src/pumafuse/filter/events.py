@@ -71,6 +71,7 @@ class Results(NamedTuple):
 
     innovation: FloatArray  # ν [m], (n, A)
     innovation_sd: FloatArray  # √S [m], (n, A)
+    noise_scale: FloatArray  # how many times as large as configured the arm's variances were, (n, A)
     outcome: CodeArray  # codes of Outcome, (n, A)
     contradicts: IndexArray  # the sensor that a rejected row contradicts time after time, −1 for none, (n,)
 
@@ -78,8 +79,8 @@ class Results(NamedTuple):
     def room(events: int, axes: int) -> Results:
         """Room for as many events, nothing decided."""
         shape = (events, axes)
-        nothing = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
-        return Results(*nothing, np.full(events, -1, dtype=np.int16))
+        nu, sd, scale = (np.full(shape, np.nan) for _ in range(3))
+        return Results(nu, sd, scale, np.full(shape, ABSENT, dtype=np.uint8), np.full(events, -1, dtype=np.int16))
 
     def rows(self, chosen: IntArray) -> Results:
         """What became of some of the events, in the order of ``chosen``."""

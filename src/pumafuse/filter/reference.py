@@ -355,6 +355,7 @@ class Filter:
             spread = events.spread[row, a] if len(events.spread) else 1.0
             innovations[a] = self.axes[a].innovation(s, events.value[row, a], spread)
             results.innovation[row, a], results.innovation_sd[row, a] = innovations[a].nu, math.sqrt(innovations[a].S)
+            results.noise_scale[row, a] = math.exp(self.axes[a].unrest)
         beyond = [a for a in axes if gate > 0.0 and abs(innovations[a].nu) > gate * math.sqrt(innovations[a].S)]
         agree = [self.axes[a].agrees(s, innovations[a]) for a in beyond]
         against = max((self.axes[a].gate.contradicted(s, time) for a in beyond), default=NOBODY)

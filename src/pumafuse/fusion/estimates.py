@@ -81,6 +81,7 @@ class Measurements:
         value: As logged [m].
         innovation: One step ahead [m], NaN where the filter did not use the component.
         innovation_sd: Predicted standard deviation of the innovation, √S [m].
+        noise_scale: How many times as large as configured the arm's variances were (``adaptation``).
         outcome: An :class:`Outcome` each.
         sensors: Sensor names.
         axes: Axis names.
@@ -94,11 +95,15 @@ class Measurements:
     value: FloatArray
     innovation: FloatArray
     innovation_sd: FloatArray
+    noise_scale: FloatArray
     outcome: CodeArray
     sensors: tuple[str, ...]
     axes: tuple[str, ...]
 
-    ARRAYS = ("time", "stamp", "sensor", "axis", "segment", "value", "innovation", "innovation_sd", "outcome")
+    ARRAYS = (
+        *("time", "stamp", "sensor", "axis", "segment"),
+        *("value", "innovation", "innovation_sd", "noise_scale", "outcome"),
+    )
 
     def __repr__(self) -> str:
         outcomes = ", ".join(f"{count:,} {word}" for word, count in self.counts().items()) or "none"

@@ -267,6 +267,7 @@ def measurements_table(est: Estimates) -> pa.Table:
             "axis": _names(r.axis, r.axes),
             **positions,
             "nis": _column_of(r.nis),
+            "noise_scale": _column_of(r.noise_scale),
             "outcome": _names(r.outcome, [outcome.word for outcome in Outcome]),
             **_segment_column(r.segment),
         }

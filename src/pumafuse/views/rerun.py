@@ -1,7 +1,8 @@
 """Rerun recordings of a fusion.
 
 Entities: ``<axis>/command``, ``/estimate`` with its variance, ``/<sensor>`` and ``/<sensor>/rejected``, and the
-``/reference``; ``innovation/<axis>/<sensor>``, divided by its standard deviation, with the band of ±2;
+``/reference``; ``innovation/<axis>/<sensor>``, divided by its standard deviation, with the band of ±2
+and, of an arm whose noise adapts, ``innovation/<axis>/noise``: how many times as large as configured its sd was;
 ``residual/<axis>/<sensor>``, the measurement minus the estimate, about ``residual/<axis>/estimate``, 0 with the
 estimate's variance; ``outcome/<sensor>``, a state; ``path``, in 3D (``scene.py``). All against seconds since the run's
 first command, positions in mm or degrees.
@@ -34,6 +35,7 @@ from .styles import Sink
 _OPENING_S = 4.0
 _TWO_COLUMNS = 4  # axes
 _SILENT, _SILENT_S = 10.0, 0.5  # times the median interval, and s: a sensor that is quiet for longer is silent
+_NOISE = "sd of the arm's noise / as configured"
 _BY_GRAVITY = sorted(Outcome, key=lambda outcome: outcome is Outcome.REJECTED)  # a rejected row is the worst
 
 
@@ -114,6 +116,10 @@ def _send(est: Estimates, run: Run, sink: Sink) -> None:
             path = f"innovation/{name}/{'upper' if edge > 0.0 else 'lower'}"
             line = styles.line(colours.BAND, f"{edge:+.0f}", width=0.7)
             sink.series(path, line, est.time[[0, -1]], np.full(2, edge))
+        if _adapts(est, name):
+            on_axis = est.measurements.where(est.measurements.axis == est.measurements.axes.index(name))
+            line = styles.line(colours.ESTIMATE, _NOISE, step=True)
+            sink.series(f"innovation/{name}/noise", line, on_axis.time, np.sqrt(on_axis.noise_scale))
     for sensor in est.measurements.sensors:
         _outcomes(sink, est, sensor)
     send_scene(sink, est, run)
@@ -122,6 +128,10 @@ def _send(est: Estimates, run: Run, sink: Sink) -> None:
 def _measured(est: Estimates) -> list[str]:
     """The axes that sensors give values for."""
     return [est.measurements.axes[number] for number in np.unique(est.measurements.axis)]
+
+
+def _adapts(est: Estimates, axis: str) -> bool:
+    return est.config.process[axis].adaptation > 0.0
 
 
 def _sensor(sink: Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
@@ -173,7 +183,7 @@ def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:
         span, unit = _span(axis.position[shown], screen), screen.unit
         positions[name] = _plot(f"/{name}", f"{name} [{unit}]", (start, end), span, legend=not positions)
         if name in _measured(est):
-            title = f"{name}: innovation / its standard deviation, ±2"
+            title = f"{name}: innovation / its standard deviation, ±2" + (f"; {_NOISE}" if _adapts(est, name) else "")
             innovations[name] = _plot(f"/innovation/{name}", title, whole, (-5.0, 5.0))
             title = f"{name}: measurement − estimate [{unit}]"
             residuals[name] = _plot(f"/residual/{name}", title, whole, (-limit, limit))

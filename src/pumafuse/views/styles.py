@@ -17,7 +17,7 @@ TIMELINE = "time"
 Marker = Literal["Circle", "Cross"]
 Style: TypeAlias = rr.SeriesLines | rr.SeriesPoints | rr.Measurements
 
-_NOT_OF_SENSORS = {"command", "estimate", "reference", "upper", "lower"}
+_NOT_OF_SENSORS = {"command", "estimate", "reference", "upper", "lower", "noise"}
 
 
 def entity(sensor: str) -> str:
