@@ -13,6 +13,7 @@ import pumafuse as pf
 from executable import pumafuse
 from pumafuse.fusion import results
 from pumafuse.fusion.score import ReferenceTrack, score_velocity
+from pumafuse.fusion.score import score as score_position
 
 PERIOD = 0.028
 
@@ -67,6 +68,34 @@ def test_error_bars_that_hold_have_95_percent_coverage() -> None:
     assert found.rmse == pytest.approx(np.hypot(3e-3, np.sqrt(2.0) * 1e-4 / PERIOD), rel=0.02)
     assert found.coverage == pytest.approx(0.95, abs=0.006)
     assert found.nees == pytest.approx(1.0, abs=0.04)
+
+
+def test_a_reference_between_whose_rows_an_estimate_lies_is_not_known_exactly() -> None:
+    """A line across 40 ms is up to 0.8 mm off this path: bars of 0.05 mm hold beside it as they do at its rows."""
+    rng = np.random.default_rng(2)
+    rows = np.sort(0.04 * np.arange(2_000) + rng.uniform(-0.005, 0.005, 2_000))
+    time = np.sort(np.concatenate([rows[5:-5], rng.uniform(rows[5], rows[-5], 4_000)]))
+    fast = 0.1 * np.sin(6.0 * time)
+    position, sd = fast + 5e-5 * rng.standard_normal(len(time)), np.full(len(time), 5e-5)
+    reference = track(rows, 0.1 * np.sin(6.0 * rows))
+    at_rows = np.isin(time, rows)
+    none = np.zeros(len(time), dtype=np.int64)
+    there = score_position(time[at_rows], none[at_rows], position[at_rows], sd[at_rows], reference, "radial")
+    between = score_position(time[~at_rows], none[~at_rows], position[~at_rows], sd[~at_rows], reference, "radial")
+    assert there.coverage == pytest.approx(0.95, abs=0.015)
+    assert there.nees == pytest.approx(1.0, abs=0.07)
+    assert between.coverage > 0.95
+    assert 0.5 < between.nees < 1.1
+
+
+def test_rows_of_a_noisy_reference_that_are_stamped_almost_alike_hide_no_error() -> None:
+    """Pairs 1 µs apart with 0.01 mm of noise would bend a path without end; an estimate 1 mm off is still seen."""
+    rng = np.random.default_rng(3)
+    rows = np.repeat(0.02 * np.arange(1_000), 2) + np.tile([0.0, 1e-6], 1_000)
+    time = 0.02 * np.arange(5, 990) + 0.01
+    reference = track(rows, path(rows) + 1e-5 * rng.standard_normal(len(rows)))
+    sd, none = np.full(len(time), 1e-4), np.zeros(len(time), dtype=np.int64)
+    assert score_position(time, none, path(time) + 1e-3, sd, reference, "radial").coverage < 0.01
 
 
 def estimates(*, smoothed: bool) -> pf.Estimates:

@@ -96,7 +96,10 @@ class Score(toml.Reported, frozen=True, kw_only=True):
 def score(
     time: FloatArray, segment: IntArray, position: FloatArray, sd: FloatArray, reference: ReferenceTrack, axis: str
 ) -> Score | None:
-    """Score the positions of one axis; the variance of the reference's own noise is added to the estimates'.
+    """Score the positions of one axis.
+
+    The variance of the reference's own noise is added to the estimates', and between its rows that of how far off a
+    line may be.
 
     Args:
         time: Of the estimates [s], (n,).
@@ -184,12 +187,7 @@ def interpolated(time: FloatArray, segment: IntArray | IndexArray, reference: Re
 
     A gap is an interval longer than twice the reference's median interval and longer than 50 ms.
     """
-    track = np.full(len(time), np.nan)
-    for number in set(segment.tolist()):
-        here = segment == number
-        rows = (reference.segment == number) & np.isfinite(reference.position[axis])
-        track[here] = _between(time[here], reference.time[rows], reference.position[axis][rows])
-    return track
+    return _interpolated(time, segment, reference, axis)[0]
 
 
 def _score(error: FloatArray, variance: FloatArray) -> Score | None:
@@ -213,18 +211,37 @@ def _score(error: FloatArray, variance: FloatArray) -> Score | None:
 
 
 def _true(time: FloatArray, segment: IntArray, reference: ReferenceTrack, axis: str) -> tuple[FloatArray, FloatArray]:
-    """The reference [m] at ``time``, and the variance of its own noise [m²], (n,)."""
+    """The reference [m] at ``time``, and the variance of its own noise and of its interpolation [m²], (n,)."""
     sd = np.interp(time, reference.time, reference.sd[axis]) if len(reference.time) else np.zeros(len(time))
-    return interpolated(time, segment, reference, axis), sd**2
+    track, off = _interpolated(time, segment, reference, axis)
+    return track, sd**2 + off**2
 
 
-def _between(time: FloatArray, at: FloatArray, value: FloatArray) -> FloatArray:
-    if not len(at):
-        return np.full(len(time), np.nan)
-    at, first = np.unique(at, return_index=True)
+def _interpolated(
+    time: FloatArray, segment: IntArray | IndexArray, reference: ReferenceTrack, axis: str
+) -> tuple[FloatArray, FloatArray]:
+    """The reference [m] at ``time`` as :func:`interpolated` has it, and how far off that may be [m], (n,)."""
+    track, off = np.full(len(time), np.nan), np.zeros(len(time))
+    for number in set(segment.tolist()):
+        here = segment == number
+        rows = (reference.segment == number) & np.isfinite(reference.position[axis])
+        at, first = np.unique(reference.time[rows], return_index=True)
+        if len(at):
+            track[here], off[here] = _between(time[here], at, reference.position[axis][rows][first])
+    return track, off
+
+
+def _between(time: FloatArray, at: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A line between rows leaves (t − a)(b − t)/2 of what the path bends there."""
     longest = max(2.0 * median(np.diff(at)) if len(at) > 1 else 0.0, _SHORTEST_GAP)
     after = np.searchsorted(at, time, side="right")
     right, left = np.minimum(after, len(at) - 1), np.maximum(after - 1, 0)
     inside = (time >= at[0]) & (time <= at[-1])
     near = (at[right] - at[left] <= longest) | (at[left] == time)
-    return np.where(inside & near, np.interp(time, at, value[first]), np.nan)
+    track = np.where(inside & near, np.interp(time, at, value), np.nan)
+    if len(at) < 2:
+        return track, np.zeros(len(time))
+    bend = np.abs(np.gradient(np.gradient(value, at), at))  # m/s²
+    step = np.abs(np.gradient(value))  # m; noise in rows stamped almost alike looks like a bend without end
+    off = 0.5 * (time - at[left]) * (at[right] - time) * np.interp(time, at, bend)
+    return track, np.where(inside, np.minimum(off, np.interp(time, at, step)), 0.0)
