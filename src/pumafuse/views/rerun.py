@@ -35,7 +35,7 @@ from .styles import Sink
 _OPENING_S = 4.0
 _TWO_COLUMNS = 4  # axes
 _SILENT, _SILENT_S = 10.0, 0.5  # times the median interval, and s: a sensor that is quiet for longer is silent
-_NOISE = "sd of the arm's noise / as configured"
+_NOISE = "arm's noise / as configured"  # standard deviations
 _BY_GRAVITY = sorted(Outcome, key=lambda outcome: outcome is Outcome.REJECTED)  # a rejected row is the worst
 
 
@@ -183,7 +183,7 @@ def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:
         span, unit = _span(axis.position[shown], screen), screen.unit
         positions[name] = _plot(f"/{name}", f"{name} [{unit}]", (start, end), span, legend=not positions)
         if name in _measured(est):
-            title = f"{name}: innovation / its standard deviation, ±2" + (f"; {_NOISE}" if _adapts(est, name) else "")
+            title = f"{name}: innovation / its sd, ±2" + (f"; {_NOISE}" if _adapts(est, name) else "")
             innovations[name] = _plot(f"/innovation/{name}", title, whole, (-5.0, 5.0))
             title = f"{name}: measurement − estimate [{unit}]"
             residuals[name] = _plot(f"/residual/{name}", title, whole, (-limit, limit))
