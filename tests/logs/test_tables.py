@@ -215,6 +215,39 @@ def test_one_table_however_laid_out(tmp_path: Path, layout: str) -> None:
     assert table.notes == ((f"log.csv: {note}",) if note else ())
 
 
+PRINTED: dict[str, tuple[str, list[str]]] = {
+    "{t:.2f} Soll: {a:.1f} | Ist: {b:.2f}": ("column 1", ["Soll", "Ist"]),
+    "uptime={t:.2f} wanted={a:.1f} got={b:.2f}": ("uptime", ["wanted", "got"]),
+    "ms:{ms:.0f}\tlift goal:{a:.1f}mm\tlift is:{b:.2f} mm": ("ms", ["lift goal [mm]", "lift is [mm]"]),
+    "08:15:{t:05.2f} -> q_d[0] = {a:.1f}°, q[0] = {b:.2f}°; ok": ("column 1", ["q_d[0] [°]", "q[0] [°]"]),
+    "[INFO] [1790000000.5]: n: {ms:.0f}, x(deg): {a:.1f}, y(deg): {b:.2f}.": ("n", ["x(deg)", "y(deg)"]),
+    '{{"t": {t:.2f}, "mode": auto, "to": {a:.1f}, "at": {b:.2f}}}': ("t", ["to", "at"]),
+}
+
+
+@pytest.mark.parametrize("line", PRINTED)
+@pytest.mark.parametrize("name", ["log.csv", "serial.log"])
+def test_values_behind_labels_are_columns_of_these_names(tmp_path: Path, line: str, name: str) -> None:
+    """As sketches print them to a serial line, whose first one is torn; others may be in between."""
+    told, seen = [70.0 - n for n in range(40)], [-1.25 * n for n in range(40)]
+    lines = [line.format(t=0.02 * n, ms=20 * n, a=a, b=b) for n, (a, b) in enumerate(zip(told, seen, strict=True))]
+    path = tmp_path / name
+    path.write_text("\n".join([lines[0][-9:], *lines[:20], "homing done", "", *lines[20:], ""]))
+    clock, columns = PRINTED[line]
+    table = tables.read(path)
+    assert tables.holds_numbers(path)
+    assert [table.plain(column)[0].tolist() for column in columns] == [told, seen]
+    assert clock in table.columns and len(table.columns[clock].drop_null()) == 40
+    (note,) = table.notes
+    assert "lines of labels and values" in note and "2 lines without these left out" in note
+
+
+def test_a_list_behind_a_label_is_a_column_of_lists(tmp_path: Path) -> None:
+    table = csv(tmp_path, "".join(f"t: 0.{n} target: [{n}.5, -2] pose: ({n}, 1e-3)\n" for n in range(1, 9)))
+    assert table.plain("target[0]")[0].tolist() == [n + 0.5 for n in range(1, 9)]
+    assert table.plain("pose[1]")[0].tolist() == [1e-3] * 8
+
+
 ABOVE: dict[str, tuple[str, list[str], str]] = {
     "LabVIEW: settings, then lines of channels": (
         "LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\nTime\t10:00:00.1\n***End_of_Header***\t\n\n"

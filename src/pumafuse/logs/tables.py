@@ -56,7 +56,17 @@ _COMMENT = re.compile(r"\s*(#|%|//)\s*")
 _NUMBER = re.compile(
     r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf|\d{4}-\d\d-\d\d|\d\d:\d\d:\d\d([.,]\d+)?", re.IGNORECASE
 )
-_UNIT = re.compile(r"[\[(]?(|-|[µunm]?s|[µum]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(mm|m|deg|rad|°)/s²?)[\])]?")
+_UNITS = r"[µunm]?s|[µum]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(?:mm|m|deg|rad|°)/s²?"
+_UNIT = re.compile(rf"[\[(]?(|-|{_UNITS})[\])]?")
+# What programs print: `Target X: 70.0 mm | q[0]=1.5 | mode: auto`. A label has up to four words, as in longer ones a
+# search would begin anew at each word of a line of prose.
+_WORD = r"[^\W\d][\w.]*(?:[\[(][\w°]+[\])])?"
+_PLAIN = r"\d\d?:\d\d:\d\d(?:[.,]\d+)?|[+-]?(?:\d+(?:[.,]\d+)?|[.,]\d+)(?:[eE][+-]?\d+)?"
+_LABELLED = re.compile(
+    rf"(?<![\w.])({_WORD}(?: [\w.]*{_WORD}){{0,3}})[\"']?[ \t]*[:=][ \t]*"
+    rf"(?:({_PLAIN})[ \t]*((?:{_UNITS})?)(?!\w|[.:]\w)|([\[(][^\[\]()]*[\])]|[^\W\d]\w*(?![\w[(]|[ \t]*[:=])))"
+)
+_DATED = re.compile(rf"(?:\d{{4}}-\d\d-\d\d[T ])?(?:{_PLAIN})")  # in front of the first label
 _ECHO = "%time,"  # begins the header that `rostopic echo -p` writes
 _TRANSFORMS = b"%time,field.transforms0."  # of /tf: a line has all transforms of a message, as many as it likes
 FIRST = "column 1"  # what the first column is called, if it has no name
@@ -203,9 +213,12 @@ def refuse_endless(path: Path) -> None:
 def holds_numbers(path: Path) -> bool:
     """Whether a file begins as a text with rows of numbers does, whatever it is called."""
     with one_line(path), path.open("rb") as file:
-        head = file.read(_HEAD)
-    lines = [] if b"\0" in head else head.decode("utf-8", errors="replace").splitlines()
-    return any(_begins(lines, row, _separator(lines[row])) for row in range(min(len(lines), _FIRST_ROWS)))
+        read = file.read(_HEAD)
+    head = "" if b"\0" in read else read.decode("utf-8", errors="replace")
+    lines = head.splitlines()
+    return bool(_labels(head)) or any(
+        _begins(lines, row, _separator(lines[row])) for row in range(min(len(lines), _FIRST_ROWS))
+    )
 
 
 def is_recording(path: Path) -> bool:
@@ -373,6 +386,7 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     if (match := _BARE_LIST.search(text, 0, _HEAD)) and b'"' not in text[: match.start()]:
         text = _BARE_LIST.sub(rb'"\1"', text)
     text = _transforms_apart(text) if text.startswith(_TRANSFORMS) else text
+    text, printed = _unlabelled(path, text)
     if (turned := _turned(text)) is not None:
         note = formats.turned_note(turned.num_columns, turned.num_rows)
         return turned, [], [f"{path.name}: {note}"]
@@ -380,7 +394,8 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     if layout.separator == " ":
         text = re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)|(?<=[ \t])[ \t]+", b"", text)
     wrong: list[pacsv.InvalidRow] = []
-    notes = [f"{path.name}: {counted(layout.above, 'line')} above the header left out"] if layout.above else []
+    above = [f"{path.name}: {counted(layout.above, 'line')} above the header left out"] if layout.above else []
+    notes = [*printed, *above]
     names, used = list[str](), list[str]()
     if choice is not None and layout.names is not None and len(layout.names) > _WIDE:
         names, twice = _numbered(path, layout.names)
@@ -425,6 +440,36 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     if table.num_rows == 0:  # not the kind of table that it should be
         raise RunError(f"{path}: the table has no rows; {note}")
     return table, names, [note, *notes]
+
+
+def _unlabelled(path: Path, text: bytes) -> tuple[bytes, list[str]]:
+    """What a program has printed, each value behind its label, as a CSV text, and a note; any other text as it is."""
+    if not (names := _labels(text[:_HEAD].decode("utf-8", errors="replace"))):
+        return text, []
+    rows = _labelled(text.decode("utf-8"))
+    kept = [";".join(cells) for header, cells in rows if header == names]
+    said = f"lines of labels and values, read as a table: {', '.join(filter(None, names))}"
+    left = f"; {counted(len(rows) - len(kept), 'line')} without these left out" if len(kept) < len(rows) else ""
+    return "\n".join([";".join(names), *kept, ""]).encode(), [f"{path.name}: {said}{left}"]
+
+
+def _labels(head: str) -> tuple[str, ...]:
+    """The labels that most lines of a text have, a number in front of them being without one; none of any other."""
+    rows = _labelled(head)
+    names, count = Counter(names for names, _ in rows).most_common(1)[0] if rows else ((), 0)
+    return names if 2 * count > len(rows) and len(names) > 1 else ()
+
+
+def _labelled(text: str) -> list[tuple[tuple[str, ...], list[str]]]:
+    """Of each full line of a text labels and values; a label has the unit that follows its value."""
+    rows = list[tuple[tuple[str, ...], list[str]]]()
+    for line in filter(str.strip, text.splitlines()):
+        pairs = list(_LABELLED.finditer(line))
+        stamp = _DATED.search(line, 0, pairs[0].start() if pairs else 0)
+        names = [f"{pair[1]} [{pair[3]}]" if pair[3] else pair[1] for pair in pairs]
+        cells = [pair[2] or f'"{pair[4]}"' for pair in pairs]
+        rows.append((("", *names), [stamp[0], *cells]) if stamp else (tuple(names), cells))
+    return rows
 
 
 def _turned(text: bytes) -> pa.Table | None:
