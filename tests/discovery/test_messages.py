@@ -105,6 +105,21 @@ def test_the_path_of_trajectories_is_the_commands(tmp_path: Path) -> None:
     assert np.array_equal(read.command.stamp, found.run.command.stamp)
 
 
+def test_a_plan_of_many_points_is_commands_as_one_of_few_is(tmp_path: Path) -> None:
+    """All moves in one message of 451 points, as planners write them; and a new one of 120 points every 0.1 s."""
+    time, since = np.arange(0.0, 11.0, 0.01), 0.02 * np.arange(451)
+    whole = [(1.0, trajectory(["boom", "wrist"], list(zip(since, moves(1.0 + since).tolist(), strict=True))))]
+    begins, ahead = np.arange(0.0, 10.0, 0.1), 0.02 * np.arange(1, 121)
+    anew = [
+        (t, trajectory(["boom", "wrist"], list(zip(ahead, moves(t + ahead).tolist(), strict=True)))) for t in begins
+    ]
+    for plans in (whole, anew):
+        sent = [("/arm/plan", TRAJECTORY, START + t, plan) for t, plan in plans]
+        found = survey(bag(tmp_path / "log.mcap", [*sent, *states(["boom", "wrist"], moves(time - LAG), time)]))
+        for axis in ("boom", "wrist"):
+            assert found.relations["joint_states", axis].lag == pytest.approx(LAG, abs=0.003)
+
+
 def path_of(file: Path, joint: str) -> tuple[FloatArray, FloatArray]:
     """Times since the start [s] and places of a joint on the path."""
     table = tables.read(file, topic="/go", fields=["path.time_ns", f"path.position[{joint}]"])

@@ -957,7 +957,8 @@ def _unread(topic: Topic) -> str:
     kind = topic.type.rpartition("/")[2]
     if kind in _VELOCITIES:
         return _ARE_VELOCITIES
-    if kind in _OTHER_TYPES or not (topic.fault or any(not names.no_position(name) for name in topic.fields)):
+    has_any = PATH_TIME in topic.fields or any(not names.no_position(name) for name in topic.fields)
+    if kind in _OTHER_TYPES or not (topic.fault or has_any):
         return "no positions in messages of this type"
     return topic.fault and f"{_UNDECODED} ({topic.fault})"
 
@@ -966,8 +967,9 @@ def _wanted(topic: Topic) -> list[str]:
     """The fields of a topic that may be positions or their stamps."""
     if topic.type.lower().endswith("/tfmessage"):  # of the first ROS: tf/tfMessage
         return _OF_FRAME
-    several, times = any("points[1]" in name for name in topic.fields), (topic.first or 0, topic.last or 0)
-    streamed = not several and times[1] - times[0] < _STREAM_NS * (topic.count - 1)
+    # Of many points none is listed.
+    single, several = (any(f"points[{n}]" in name for name in topic.fields) for n in (0, 1))
+    streamed = single and not several and (topic.last or 0) - (topic.first or 0) < _STREAM_NS * (topic.count - 1)
     if PATH_TIME in topic.fields and not streamed:
         return [PATH]
     wanted = [name for name in _likeliest(topic.fields) if may_be_part(name) or not names.no_position(name)]
