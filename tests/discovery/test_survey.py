@@ -2011,6 +2011,14 @@ def test_columns_without_words_are_what_their_file_is_called(log: Path) -> None:
     assert "measures where they lead: value (load, as measured_load.csv is called); value (torque, as torque" in said
 
 
+@pytest.mark.parametrize("name", ["ki07.txt", "delta_task2.csv", "good_mode_b.log"])
+def test_a_run_is_called_after_what_its_numbers_are_not(name: str, tmp_path: Path) -> None:
+    """A gain, a robot and a task in the name of a file without a header say nothing of its columns."""
+    t, u, z = recorded_at_once()
+    np.savetxt(tmp_path / name, np.column_stack([t, u[:, 0], z[:, 0]]))
+    assert [one.lag for one in survey(tmp_path / name).relations.values()] == pytest.approx([LAG], abs=0.005)
+
+
 def test_the_best_pairs_of_axes_come_first(tmp_path: Path) -> None:
     """Joints and their rates in deg/s, called otherwise than the commands: no rate takes the place of a joint."""
     t = 0.01 * np.arange(1500)

@@ -52,14 +52,17 @@ _SILENT = (
         " joint jnt dof qpos controller robot arm tool tcp ee flange coordinates axis"
     )
 )
-_NO_POSITIONS = words_in(
+_QUANTITIES = words_in(
     "velocity velocities vel speed speeds rate rates omega gyro dq qvel dot acceleration accelerations acc accel"
     " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tor tq tau moment moments force forces"
     " tension tensions wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts"
-    " power pwm duty load pressure kp ki kd mode scaling bits temperature temperatures temp quality confidence"
-    " covariance orientation rotation quaternion quat twist index id seq sequence count status valid std sd sigma"
-    " latency duration error err errs header stamp nanosec layout frame done reward task episode tick time timestamp"
-    " reset lat lon latitude longitude var variance yawspeed rollspeed pitchspeed good innov"
+    " power pwm duty load pressure temperature temperatures temp covariance quaternion quat std sd sigma var variance"
+    " error err errs yawspeed rollspeed pitchspeed"
+)
+_NO_POSITIONS = _QUANTITIES | words_in(
+    "kp ki kd mode scaling bits quality confidence orientation rotation twist index id seq sequence count status valid"
+    " latency duration header stamp nanosec layout frame done reward task episode tick time timestamp reset lat lon"
+    " latitude longitude good innov"
 )
 _FINGERS = words_in("index rotation")  # of a hand: beside words of roles, at the end, these are joints
 _ERRORS = words_in("error err errs")
@@ -218,10 +221,13 @@ def no_position(column: str) -> str | None:
 
 
 def no_position_by_place(label: str, columns: Iterable[str]) -> str | None:
-    """What the columns of a file or topic are by its name, if they have no words of their own and are no positions."""
+    """What the columns of a file or topic are by its name, if they have no words of their own and are no positions.
+
+    That is a quantity alone: runs are called after gains, tasks and robots, ``kp12``, ``delta_task2``.
+    """
     silent = all(axis_of(column, []) == "position" and not role_words(column) for column in columns)
     why = no_position(label) if silent else None
-    return None if why is None or why in _TELLING or has_word(label, _POSITIONS) else why
+    return why if why in _QUANTITIES and not has_word(label, _POSITIONS) else None
 
 
 def family(column: str, columns: Container[str]) -> tuple[str, str, str]:
