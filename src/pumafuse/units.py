@@ -60,17 +60,21 @@ AN: dict[Kind, str] = {"length": "a length", "angle": "an angle"}
 LENGTHS = ("_m", "_mm", "_um")
 ANGLES = ("_rad", "_mrad", "_deg")
 TIMES = ("_s", "_ms", "_us", "_ns")
-OF_KIND: dict[Kind, tuple[str, ...]] = {"length": LENGTHS, "angle": ANGLES}
+GUESSED: dict[Kind, tuple[str, ...]] = {"length": LENGTHS, "angle": ANGLES}  # where no name says a unit
+OF_KIND: dict[Kind, tuple[str, ...]] = {"length": (*LENGTHS, "_cm", "_inch"), "angle": ANGLES}
+POSITIONS = (*OF_KIND["length"], *ANGLES)
 SPEEDS: dict[Kind, tuple[str, ...]] = {"length": ("_m_s", "_mm_s"), "angle": ("_deg_s", "_rad_s")}  # first: on screens
-_UNNAMED = {"cm": 0.01, "inch": 0.0254}  # lengths that no name may end in, and that people write all the same
 _SAME = 1.2  # tolerance of a factor between two units
-_UNITS: dict[str, int | None] = {  # endings of names -> power of ten to SI; None: degrees
-    **dict.fromkeys(("_m", "_s", "_m_s", "_s_m", "_rad", "_rad_s", "_s_rad"), 0),
-    **dict.fromkeys(("_deg_rtHz_per_deg_s", "_deg_rts_per_deg_s"), 0),
-    **dict.fromkeys(("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mrad"), -3),
-    **dict.fromkeys(("_mm_rtHz_per_m_s", "_mm_rts_per_m_s"), -3),
-    **dict.fromkeys(("_um", "_us"), -6),
-    "_ns": -9,
+_ONE, _THOUSANDTH, _MILLIONTH = (Decimal(10) ** -power for power in (0, 3, 6))
+_UNITS: dict[str, Decimal | None] = {  # endings of names -> their size in SI; None: degrees
+    **dict.fromkeys(("_m", "_s", "_m_s", "_s_m", "_rad", "_rad_s", "_s_rad"), _ONE),
+    **dict.fromkeys(("_deg_rtHz_per_deg_s", "_deg_rts_per_deg_s"), _ONE),
+    **dict.fromkeys(("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mrad"), _THOUSANDTH),
+    **dict.fromkeys(("_mm_rtHz_per_m_s", "_mm_rts_per_m_s"), _THOUSANDTH),
+    **dict.fromkeys(("_um", "_us"), _MILLIONTH),
+    "_ns": Decimal("1e-9"),
+    "_cm": Decimal("0.01"),
+    "_inch": Decimal("0.0254"),
     **dict.fromkeys(("_deg", "_deg_s", "_deg_rtHz", "_deg_rts"), None),
 }
 _AS_ANGLE = {  # endings that carry the kind of an axis
@@ -119,9 +123,9 @@ def as_length(name: str) -> str:
 
 
 def divisor(unit: str) -> float:
-    """What a number in the unit of an ending is divided by to be in SI; the quotient is rounded once."""
-    exponent = _UNITS[unit]
-    return DEG if exponent is None else 10.0**-exponent
+    """What a number in the unit of an ending is divided by to be in SI; that rounds once, of inches twice."""
+    size = _UNITS[unit]
+    return DEG if size is None else float(1 / size)
 
 
 def si_of(values: FloatArray, unit: str) -> FloatArray:
@@ -148,15 +152,14 @@ def mistaken(factor: float, endings: Iterable[str]) -> list[tuple[str, str]]:
 
     Args:
         factor: How many times too large they come out, within a fifth.
-        endings: The units that a name can have, ``LENGTHS``, ``ANGLES`` or ``TIMES``.
+        endings: The units that a name can have, ``TIMES`` or those of a kind; what is cm or inch is called so.
     """
-    named = {unit[1:]: si(1.0, unit) for unit in endings}
-    every = named | _UNNAMED if "mm" in named else named
+    sizes = {unit[1:]: si(1.0, unit) for unit in endings}
     return [
         (true, called)
-        for true, size in every.items()
-        for called, taken in named.items()
-        if true != called and abs(math.log(factor * size / taken)) < math.log(_SAME)
+        for true, size in sizes.items()
+        for called, taken in sizes.items()
+        if called not in ("cm", "inch", true) and abs(math.log(factor * size / taken)) < math.log(_SAME)
     ]
 
 
@@ -174,15 +177,15 @@ def refuse_name(kind: str, name: str) -> None:
 
 def si(value: float | Decimal, unit: str) -> float:
     """A number in the unit of an ending in SI, from its shortest decimal form (no binary rounding in between)."""
-    decimal, exponent = value if isinstance(value, Decimal) else Decimal(repr(value)), _UNITS[unit]
-    return float(_PRECISE.multiply(decimal, _RADIANS) if exponent is None else decimal.scaleb(exponent))
+    decimal, size = value if isinstance(value, Decimal) else Decimal(repr(value)), _UNITS[unit]
+    return float(_PRECISE.multiply(decimal, _RADIANS if size is None else size))
 
 
 def in_unit(value: float, unit: str) -> float | Decimal:
     """The inverse of :func:`si`: the shortest decimal that is read as ``value`` again, a float if it is one's."""
-    exponent = _UNITS[unit]
-    if exponent is not None:
-        decimal = Decimal(repr(float(value))).scaleb(-exponent)
+    size = _UNITS[unit]
+    if size is not None:
+        decimal = _PRECISE.divide(Decimal(repr(float(value))), size)
     elif not math.isfinite(value):
         return value
     else:
@@ -254,7 +257,7 @@ def _converted(value: Any, unit: str | None, path: str, convert: Callable[[Any, 
         return converted
     if isinstance(value, list | tuple):
         return [_converted(item, unit, path, convert) for item in cast(list[Any], value)]
-    if isinstance(value, float | Decimal) or (type(value) is int and unit and _UNITS[unit] != 0):
+    if isinstance(value, float | Decimal) or (type(value) is int and unit and _UNITS[unit] != _ONE):
         return float(value) if unit is None else convert(value, unit, path)
     return value
 

@@ -973,6 +973,11 @@ def test_roles_of_columns_by_name(column: str, role: str | None) -> None:
         ("A1_Soll [°]", "a1", "deg"),
         ("m3", "m3", ""),
         ("range_mm", "position", "mm"),
+        ("tcp_y_cm", "y", "cm"),
+        ("ziel_x [cm]", "ziel_x", "cm"),
+        ("x(in)", "x", "inch"),
+        ("carriage_inches", "carriage", "inch"),
+        ("lift_in", "lift_in", ""),
         ("command.arm_deg", "arm", "deg"),
         ("robot.position_mm", "position", "mm"),
         ("position[肩]", "position", ""),
@@ -2009,6 +2014,19 @@ def test_columns_without_words_are_what_their_file_is_called(log: Path) -> None:
         (log / f"{name}.csv").unlink()
     said = one_line(RunError, lambda: survey(log))
     assert "measures where they lead: value (load, as measured_load.csv is called); value (torque, as torque" in said
+
+
+def test_commands_in_inches_and_a_sensor_in_centimetres_are_fused_in_metres(log: Path) -> None:
+    """Their names say it; no name says it of another sensor, whose unit is none that is guessed: it is asked."""
+    t, u, s, z = recorded()
+    write(log / "command.csv", {"t_s": t, "x(in)": u[:, 0] / 0.0254})
+    for name, column, size in (("camera", "x [cm]", 0.01), ("gauge", "x", 0.0254)):
+        write(log / f"{name}.csv", {"t_s": s, column: z[:, 0] / size})
+    found = survey(log)
+    run, _ = written(found, log.parent / "described")
+    np.testing.assert_allclose(run.command.values["x"], u[:, 0], atol=1e-9)
+    np.testing.assert_allclose(run.sensors["camera"].values["x"], z[:, 0], atol=1e-9)
+    assert any("gauge moves 0.039" in question for question in asked(found))
 
 
 @pytest.mark.parametrize("name", ["ki07.txt", "delta_task2.csv", "good_mode_b.log"])

@@ -451,7 +451,7 @@ def timed(time: str) -> str:
 
 RECORDED = '[sensors.s]\nfile = "a.mcap"\ntime = "log_time"\nx = "x_m"'
 REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "unit of time for an axis": (axis("x_m").replace('"m"', '"s"'), ("command.x", "'s'", "m, mm, um, rad")),
+    "unit of time for an axis": (axis("x_m").replace('"m"', '"s"'), ("command.x", "'s'", "m, mm, um, cm, inch, rad")),
     "no unit": ('time = "t_ns"\nx = "plain"', ("'plain'", "_mm", "unit = 'mm'")),
     "time without unit": (timed('"plain"'), ("'plain'", "_ms", "unit = 's'")),
     "unknown key of a column": (axis("x_m").replace("unit", "scale"), ("'command.x.scale'", "column, unit")),

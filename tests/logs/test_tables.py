@@ -24,7 +24,7 @@ from pumafuse.logs import tables
 from pumafuse.logs.tables import Table
 from refusals import one_line
 
-LENGTHS = {"_m": 0, "_mm": 3, "_um": 6}
+LENGTHS = {"_m": 0, "_cm": 2, "_mm": 3, "_um": 6}
 TIMES = {"_s": 9, "_ms": 6, "_us": 3, "_ns": 0}
 EPOCH_NS = 1_700_000_000_123_456_789  # int64 ns of today: float64 there has a grid of 256 ns
 LAST_S = 4_599_999_999  # the last whole second within reach

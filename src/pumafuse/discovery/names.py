@@ -93,14 +93,16 @@ _TELLING = _TIMES | COUNTERS | WHOSE | VALID | words_in("episode run trial")
 _DIGITS = "0123456789"
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
-_PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
-_BRACKETED = re.compile(rf"[\[(] *(mm|m|um|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
+_PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|cm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
+_BRACKETED = re.compile(rf"[\[(] *(mm|cm|m|um|in|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 # Joints in metres, where others turn.
 SLIDING = words_in("slide slider prismatic linear rail gantry insertion telescope telescopic elevator")
 JOINTS = words_in("joint joints jnt dof")
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
+    **dict.fromkeys(words_in("cm centimeter centimeters centimetre centimetres"), "cm"),
+    **dict.fromkeys(words_in("in inch inches"), "inch"),
     **dict.fromkeys(words_in("m meter meters metre metres"), "m"),
     **dict.fromkeys(words_in("um micrometer micrometers micrometre micrometres"), "um"),
     **dict.fromkeys(words_in("deg degs degree degrees"), "deg"),
@@ -258,7 +260,7 @@ def unit_of(column: str) -> str:
     if _DEGREES.search(column):
         return "deg"
     *before, last = words(column) or [""]  # also that of `x [mm]`
-    return _UNITS.get(last, "") if before else ""
+    return _UNITS.get(last, "") if before and (last != "in" or _BRACKETED.search(column)) else ""
 
 
 def is_turning(axis: str) -> bool:

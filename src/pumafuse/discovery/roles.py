@@ -20,7 +20,7 @@ from ..logs.columns import leaf
 from ..logs.frames import CARTESIAN
 from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
-from ..units import AN, DEG, KINDS, OF_KIND, TURN, Kind, kind_of
+from ..units import AN, DEG, GUESSED, KINDS, TURN, Kind, kind_of
 from . import names
 from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, period_of, unused, usual_size
 from .following import LATEST, Following, following
@@ -799,7 +799,7 @@ def _fitted(stream: Stream, anchor: Stream) -> Stream:
             ratios = [max(moved.travel(axis), 1e-12) / max(anchored.travel(axis), 1e-12) for axis in of_kind]
             return abs(float(np.median(np.log(ratios))))
 
-        unit = min(OF_KIND[kind], key=misfit)
+        unit = min(GUESSED[kind], key=misfit)
         made |= {axis: _in(made[axis], unit) for axis in axes}
     return replace(stream, axes=made)
 

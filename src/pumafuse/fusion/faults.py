@@ -22,7 +22,7 @@ from ..filter.response import response
 from ..logs.frames import CARTESIAN
 from ..model.arm import CANONICAL_AXES
 from ..space.rotations import nearest
-from ..units import DEG, MM, OF_KIND, Kind, mistaken, wraps
+from ..units import DEG, GUESSED, MM, OF_KIND, Kind, mistaken, wraps
 from .causes import Cause
 from .clock_steps import ClockStep, clock_steps
 from .config import FusionConfig
@@ -483,9 +483,8 @@ def _unit(kind: Kind, factor: float) -> tuple[bool, str]:
     if not pairs:
         return False, "is its scale in fusion.toml right, or a unit?"
     taken = " or ".join(f"{true} called {called}" for true, called in pairs)
-    if any(f"_{true}" in OF_KIND[kind] for true, _ in pairs):
-        return True, f"are its values {taken}, or the commands the reverse? Correct the unit in run.toml, or the scale"
-    return False, f"are its values {taken}, or is its scale in fusion.toml another one?"
+    is_likely = any(f"_{true}" in GUESSED[kind] for true, _ in pairs)
+    return is_likely, f"are its values {taken}, or the commands the reverse? Correct the unit in run.toml, or the scale"
 
 
 def _digits(number: float, count: int) -> str:

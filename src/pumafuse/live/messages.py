@@ -21,7 +21,7 @@ from ..logs.columns import LOG_TIME, NAMES, SPLIT_STAMPS, holders, leaf
 from ..logs.manifest import Column, CommandEntry, Manifest, Orientation, SourceEntry, Time
 from ..logs.recordings import PATH, TRANSFORMS, CommandedPath, begin_of, trajectory_in
 from ..logs.run import PAUSE, Source
-from ..units import ANGLES, LENGTHS, TIMES, divisor, ending
+from ..units import POSITIONS, TIMES, divisor, ending
 from .tool import NOISE, ORIENTATION
 from .wire import Event
 
@@ -58,7 +58,7 @@ class _Number:
 
     def __init__(self, column: Column, where: str) -> None:
         unit = column.ending or ending(leaf(column.column))
-        if unit not in (*LENGTHS, *ANGLES):
+        if unit not in POSITIONS:
             raise ConfigError(f"{where}: column '{column.column}' has no unit; give unit = 'm' or 'rad' beside it")
         self._get, self._divisor, self._met = getter(column.column), divisor(unit), _condition(column.where)
         self._turn, self._before, self._turns = column.turn, math.nan, 0.0

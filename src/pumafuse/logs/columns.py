@@ -70,7 +70,7 @@ class Table:
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
         """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels."""
         numbers, note = self.plain(name)
-        unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
+        unit = unit or self._ending(name, units.POSITIONS, "mm")
         size = sentinel(numbers) if self.sentinel_of is None else self.sentinel_of(name)
         values = numbers if size is None else without(numbers, size)
         if (gone := np.isnan(values) & ~np.isnan(numbers)).any():

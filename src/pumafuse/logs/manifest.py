@@ -20,7 +20,7 @@ from ..space import rotations
 from ..space.kinematics import Chain
 from ..space.rotations import CONVENTIONS, TURNING
 from ..toml import NotNegative, Positive
-from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
+from ..units import ANGLES, POSITIONS, TIMES, Kind, ending, from_si, kind_of, refuse_name
 from .columns import DAYS, Table, leaf
 from .frames import CARTESIAN, Frame
 from .stamps import going_on, spread
@@ -439,7 +439,7 @@ def _columns(table: Any, where: str, path: str) -> list[Any]:
         if "where" in column:
             column["where"] = _where(column["where"], where, f"{path}.where")
         toml.check(column, Column, where, path)
-        _check_unit(column, (*LENGTHS, *ANGLES), where, path)
+        _check_unit(column, POSITIONS, where, path)
         if column.get("turn_deg") and msgspec.convert(column, Column).kind != "angle":
             raise ConfigError(f"{where}: {path}.turn_deg: the column is no angle")
     return columns

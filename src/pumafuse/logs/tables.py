@@ -56,7 +56,7 @@ _COMMENT = re.compile(r"\s*(#|%|//)\s*")
 _NUMBER = re.compile(
     r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf|\d{4}-\d\d-\d\d|\d\d:\d\d:\d\d([.,]\d+)?", re.IGNORECASE
 )
-_UNITS = r"[µunm]?s|[µum]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(?:mm|m|deg|rad|°)/s²?"
+_UNITS = r"[µunm]?s|[µumc]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(?:mm|m|deg|rad|°)/s²?"
 _UNIT = re.compile(rf"[\[(]?(|-|{_UNITS})[\])]?")
 # What programs print: `Target X: 70.0 mm | q[0]=1.5 | mode: auto`. A label has up to four words, as in longer ones a
 # search would begin anew at each word of a line of prose.
