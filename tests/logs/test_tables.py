@@ -242,6 +242,13 @@ def test_values_behind_labels_are_columns_of_these_names(tmp_path: Path, line: s
     assert "lines of labels and values" in note and "2 lines without these left out" in note
 
 
+@pytest.mark.parametrize("cells", ["array([{n}.5, 2.0], dtype=float64)", '7,"{{a: {n}, b: 2}}"'])
+def test_labels_within_cells_are_no_columns(tmp_path: Path, cells: str) -> None:
+    rows = "".join(f"0.{n};{cells.format(n=n)}\n" for n in range(1, 9))
+    table = csv(tmp_path, "t_s;state\n" + rows if "array" in cells else "t_s,x_mm,more\n" + rows.replace(";", ","))
+    assert "t_s" in table.columns and table.rows == 8 and not table.notes
+
+
 def test_a_list_behind_a_label_is_a_column_of_lists(tmp_path: Path) -> None:
     table = csv(tmp_path, "".join(f"t: 0.{n} target: [{n}.5, -2] pose: ({n}, 1e-3)\n" for n in range(1, 9)))
     assert table.plain("target[0]")[0].tolist() == [n + 0.5 for n in range(1, 9)]

@@ -454,18 +454,24 @@ def _unlabelled(path: Path, text: bytes) -> tuple[bytes, list[str]]:
 
 
 def _labels(head: str) -> tuple[str, ...]:
-    """The labels that most lines of a text have, a number in front of them being without one; none of any other."""
+    """The labels that most lines of a text have, two at least, a number in front being without; none of any other."""
     rows = _labelled(head)
     names, count = Counter(names for names, _ in rows).most_common(1)[0] if rows else ((), 0)
-    return names if 2 * count > len(rows) and len(names) > 1 else ()
+    return names if 2 * count > len(rows) and len(list(filter(None, names))) > 1 else ()
 
 
 def _labelled(text: str) -> list[tuple[tuple[str, ...], list[str]]]:
-    """Of each full line of a text labels and values; a label has the unit that follows its value."""
+    """Of each full line of a text labels and values, none behind several cells without labels.
+
+    A label has the unit that follows its value.
+    """
     rows = list[tuple[tuple[str, ...], list[str]]]()
     for line in filter(str.strip, text.splitlines()):
         pairs = list(_LABELLED.finditer(line))
-        stamp = _DATED.search(line, 0, pairs[0].start() if pairs else 0)
+        front = line[: pairs[0].start()] if pairs else ""
+        if len(re.findall("[,;\t]", front)) > 1:
+            front, pairs = "", []
+        stamp = _DATED.search(front)
         names = [f"{pair[1]} [{pair[3]}]" if pair[3] else pair[1] for pair in pairs]
         cells = [pair[2] or f'"{pair[4]}"' for pair in pairs]
         rows.append((("", *names), [stamp[0], *cells]) if stamp else (tuple(names), cells))
