@@ -2016,6 +2016,28 @@ def test_columns_without_words_are_what_their_file_is_called(log: Path) -> None:
     assert "measures where they lead: value (load, as measured_load.csv is called); value (torque, as torque" in said
 
 
+def test_inputs_that_nothing_follows_are_no_commands_where_a_plan_is_followed(log: Path) -> None:
+    """A controller's inputs to rotors stand beside the plan; alone they would be the commands."""
+    t, u, s, z = recorded()
+    drawn = np.random.default_rng(8).normal(size=(len(t), 2))
+    write(log / "plan.csv", {"t_s": t, "x_m": u[:, 0], "y_m": u[:, 1], "input 1": drawn[:, 0], "input 2": drawn[:, 1]})
+    write(log / "state.csv", {"t_s": s, "x_m": z[:, 0], "y_m": z[:, 1]})
+    found = survey(log)
+    assert set(found.run.axes) == {"x", "y"}
+    assert [one.lag for one in found.relations.values()] == pytest.approx([LAG] * 2, abs=0.005)
+    assert any("other commands than" in question for question in asked(found))
+    write(log / "plan.csv", {"t_s": t, "input x": u[:, 0], "input y": u[:, 1]})
+    assert set(survey(log).run.axes) == {"x", "y"}
+
+
+def test_a_clock_of_zeros_at_first_does_not_begin_anew(tmp_path: Path) -> None:
+    """Rows that were made before the first message came are left out of what the refusal says."""
+    t, _, s, z = recorded()
+    rows = np.column_stack([s, z, np.random.default_rng(4).normal(size=len(s))])
+    np.savetxt(tmp_path / "log.txt", np.vstack([np.zeros((3, 5)), rows + np.array([300.0, 0, 0, 0, 0])]))
+    assert "begins anew" not in one_line(RunError, lambda: survey(tmp_path / "log.txt"))
+
+
 def test_commands_in_inches_and_a_sensor_in_centimetres_are_fused_in_metres(log: Path) -> None:
     """Their names say it; no name says it of another sensor, whose unit is none that is guessed: it is asked."""
     t, u, s, z = recorded()

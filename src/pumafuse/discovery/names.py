@@ -37,6 +37,7 @@ _ROLES: dict[Role, frozenset[str]] = {
 _OF_COLUMNS = words_in("set sp pv process fb current cur curr present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
+_DRIVES = words_in("control ctrl input inputs")  # commands, or what a controller puts into motors or rotors
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
 _OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in a column's
 FILTERED = words_in(
@@ -154,6 +155,12 @@ def may_be_seen(name: str) -> bool:
     """Whether a name calls its numbers commands by nothing but a word for what a camera looks at, too."""
     stems = {word.rstrip(_DIGITS) for word in words(name)} & _ROLES["command"]
     return bool(stems) and stems <= _SEEN
+
+
+def may_drive(columns: Iterable[str]) -> bool:
+    """Whether columns are called commands by nothing but a word for what drives a plant, too."""
+    stems = {word.rstrip(_DIGITS) for column in columns for word in words(leaf(column))} & _ROLES["command"]
+    return bool(stems) and stems <= _DRIVES
 
 
 def role_words(column: str) -> list[str]:

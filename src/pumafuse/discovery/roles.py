@@ -555,9 +555,13 @@ def _free(name: str, taken: Set[str]) -> str:
 
 
 def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
-    """The commands, and how they are known: by name, and of several by what follows them; without names by that."""
+    """The commands, and how they are known: by name, and of several by what follows them; without names by that.
+
+    Inputs that nothing follows drive a plant, where others lead without a name.
+    """
     called = [stream for stream in streams if stream.role == "command"]
-    if len(called) == 1:
+    driving = [stream for stream in called if names.may_drive(some[0].name for some in stream.axes.values())]
+    if len(called) == 1 and not driving:
         return called[0], called[0].why
     # A reference that runs ahead, or that stands beside one other alone, is a set point, as control engineers call it.
     beside = [stream for stream in streams if stream.role != "reference"]
@@ -569,6 +573,8 @@ def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
     best = max(candidates, key=lambda candidate: followers[candidate.name], default=None)
     if best is None or (not called and not followers[best.name][0]):
         return None
+    if called and len(driving) == len(called) and not followers[best.name][0]:
+        return _command([stream for stream in streams if stream.role != "command"]) or (best, best.why)
     return best, best.why or "others follow it"
 
 
