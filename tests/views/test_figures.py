@@ -119,6 +119,14 @@ def test_the_fused_figure_shows_command_estimate_measurements_and_reference() ->
             assert line(axes, label)[1] == pytest.approx(seen.values[name][~good] * 1e3)
 
 
+def test_a_measurement_after_the_last_estimate_has_no_difference_from_it() -> None:
+    """The estimate is not held on: the arm moves, and that would look like an error."""
+    est, _ = case(axes=1)
+    time, left = line(fused_figure(est).axes[2], "camera")
+    np.testing.assert_array_equal(np.isnan(left), time > est.time[-1])
+    assert np.isnan(left).any()
+
+
 def test_the_validation_figure_draws_what_it_judges() -> None:
     """Each row: the fused components' ν/√S, their autocorrelation as bars, and the verdict above."""
     est, run = case(axes=2, outlier=True)

@@ -345,7 +345,8 @@ def _residuals(axes: Axes, est: Estimates, name: str) -> None:
         left = measured.value.copy()
         for number in np.unique(measured.segment).tolist():
             rows, here = measured.segment == number, est.segment == number
-            left[rows] -= np.interp(measured.time[rows], est.time[here], est[name].position[here])
+            estimates = est.time[here], est[name].position[here]
+            left[rows] -= np.interp(measured.time[rows], *estimates, left=np.nan, right=np.nan)
         _dots(axes, est, sensor, replace(measured, value=left), scale, colour)
         shown.append(left[measured.outcome != Outcome.REJECTED])
         if sensor in est.config.sensors and (sd := est.config.sensors[sensor].sd_of(name)) is not None:
