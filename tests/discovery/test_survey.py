@@ -617,6 +617,20 @@ def test_joints_have_the_names_that_are_beside_them(log: Path, tmp_path: Path) -
     assert {one.unit for part in found.parts for one in part.signals} == {"rad"}
 
 
+@pytest.mark.parametrize("commanded", ["joints", "tool"])
+def test_joints_and_the_tool_in_space_need_the_robot(commanded: str, log: Path) -> None:
+    """Of commands in one and measurements in the other it is said what makes both poses."""
+    t, u, s, z = recorded()
+    joints, tool = ("pan_rad", "lift_rad", "wrist_rad"), ("x_m", "y_m", "z_m")
+    told, other = (joints, tool) if commanded == "joints" else (tool, joints)
+    write(log / "commands.csv", {"t_s": t, **dict(zip(told, u.T, strict=True))})
+    write(log / "encoders.csv", {"t_s": s, **dict(zip(told, z.T, strict=True))})
+    write(log / "seen.csv", {"t_s": s, **dict(zip(other, np.sin(9.0 * z.T), strict=True))})
+    roles = survey(log).roles
+    assert roles is not None
+    assert ["[robot] in run.toml" in why for stream, why in roles.left_out if stream.name == "seen"] == [True]
+
+
 @pytest.mark.parametrize(("yes", "no", "key"), [(1, 0, "1"), (True, False, "true")])
 def test_rows_that_a_sensor_calls_invalid_are_left_out(yes: Any, no: Any, key: str, tmp_path: Path) -> None:
     """Where it was lost it writes 0, which is a position; ``where`` chooses the others, and that is said."""

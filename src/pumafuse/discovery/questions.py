@@ -44,6 +44,8 @@ def decisions(survey: Survey) -> Iterator[tuple[str, str, str]]:
         who = ", ".join(f"{sensor.name} is a sensor" for sensor in roles.sensors)
         moved = [stream.name for stream in streams if "follow" in stream.why]
         yield "who is who", f"{roles.command.part.label} is commanded, {who}", _sure(moved, "by how they move")
+    for name, own_frame in survey.own_frames.items():
+        yield name, own_frame.words, "a guess, which registering it tries"
     for name in survey.run.sensors:
         by_axis = survey.of_source(name)
         if by_axis:
@@ -65,8 +67,6 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
         stream.part.clock.doubt for stream in streams if stream.part.clock and stream.part.clock.doubt
     )
     yield from dict.fromkeys(stream.attitude.doubt for stream in streams if stream.attitude and stream.attitude.doubt)
-    for name, own_frame in survey.own_frames.items():
-        yield f"{name} {own_frame.words}: `pumafuse register` finds where it stands, and what it sees of the tool"
     if survey.interpolation:
         yield (
             "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"

@@ -45,6 +45,7 @@ _MOST_APART = 40  # axes of a table that is taken apart by their names
 _MOST_LISTED, _LONGEST = 8, 200  # columns in an error, letters of all of them
 _NUMBERED = re.compile(r"joint\d+|position")
 _OF_POSE = {*CARTESIAN, "roll", "pitch", "yaw"}  # axes whose names say so much that only the same motion says more
+_POSES_OF_JOINTS = "; of joints, [robot] in run.toml makes poses by a URDF"
 _AXIS_WORD = re.compile(r"[xyz]|\d+|")
 _Group: TypeAlias = tuple[str, str, str, bool]  # words of roles, list, copy, whether they are desired values
 
@@ -694,14 +695,17 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
         if pairs[name, axis] >= least[name] and axis not in fits and name in others:
             fits[axis] = stream.axes[name]
             others.remove(name)
+    in_space = [{*CARTESIAN} <= sides.axes.keys() for sides in (command, stream)]
+    few_joints = min(len(command.axes), len(stream.axes)) < len(CARTESIAN)
+    poses = "" if in_space[0] == in_space[1] or few_joints else _POSES_OF_JOINTS
     if fits or not pairs:
         kinds = sorted({AN[stream.kind(axis)] for axis in stream.axes})
-        none = f"none of the commands that were taken is {' or '.join(kinds)}, as {', '.join(stream.axes)} are"
+        none = f"none of the commands that were taken is {' or '.join(kinds)}, as {', '.join(stream.axes)} are{poses}"
         many = f"no axis is called as one of the commands', and {len(others)} are too many to compare how they move"
         return fits, none if few else many
     most = max(pairs, key=pairs.__getitem__)
     alike = f"at most {pairs[most]:.2f}, {most[1]}"
-    return fits, f"its axes are called otherwise than the commands', and follow none ({alike})"
+    return fits, f"its axes are called otherwise than the commands', and follow none ({alike}){poses}"
 
 
 def _turned_point(
