@@ -500,7 +500,8 @@ def test_init_registers_sensors_in_frames_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_fuse_of_such_a_log_is_of_the_tool(tmp_path: Path) -> None:
     """The one command registers, tunes and fuses: the tool is known to half a millimetre about a constant."""
-    pumafuse("fuse", log(tmp_path / "log", "commands", "tracker"), "-o", tmp_path / "fused")
+    done = pumafuse("fuse", log(tmp_path / "log", "commands", "tracker"), "-o", tmp_path / "fused")
+    assert done.stdout.count("the latency of tracker is taken to be 0 ms") == 1
     assert turned_by(tmp_path / "fused" / "fusion.toml")["tracker"] < 0.5
     est = pf.fuse(pf.Run.read(tmp_path / "fused"), pf.FusionConfig.load(tmp_path / "fused" / "fusion.toml"))
     true = pf.Run.read(RUNS / "inspect1").reference

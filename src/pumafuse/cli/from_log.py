@@ -73,8 +73,8 @@ def run(
     while True:
         texts, here = drafts(surveyed, arm, begins, output), Path()
         recorded = described(drafts(surveyed, arm, begins, here)["run.toml"], here).between(*part)
-        begun = init.registered(surveyed, recorded) if surveyed.own_frames else None
-        begun = begun or FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
+        registered = init.registered(surveyed, recorded) if surveyed.own_frames else None
+        begun = registered or FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
         begun.sensor_names(sensors)  # before anything is fitted
         try:
             with fitting() as progress:
@@ -97,8 +97,9 @@ def run(
     slow = otherwise_than_at_first(surveyed, fitted.details.lags, fitted.config.arm)
     for line in [*strays, *slow, *_told_by_one(summary)]:
         say(line)
-    for name in (name for name, sensor in fitted.config.sensors.items() if sensor.latency == 0.0):
-        say(taken(name, 0.0))
+    if registered is None:  # which says it beside what it found
+        for name in (name for name, sensor in fitted.config.sensors.items() if sensor.latency == 0.0):
+            say(taken(name, 0.0))
     folder = shlex.quote(str(output))
     another = "pumafuse fuse ANOTHER_LOG"
     if surveyed.roles is not None:  # it is read by what `init` finds in it, as this one was

@@ -55,7 +55,7 @@ def run(
             folder = shlex.quote(str(output))
             first = any(_MENDED.intersection(sensor.findings) for sensor in registration.details.sensors.values())
             after = "mend run.toml as said above, and register anew" if first else None
-            say(f"written to {output}\nnext: {after or f'pumafuse fuse RUN -c {folder}/fusion.toml -o DIR'}")
+            say(f"written to {output}\nnext: {after or f'pumafuse tune RUN -c {folder}/fusion.toml -o DIR'}")
     if any(sensor.frame is None for sensor in registration.details.sensors.values()):
         raise typer.Exit(_NOT_ALL)
 
