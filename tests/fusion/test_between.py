@@ -10,11 +10,10 @@ import pytest
 import pumafuse as pf
 from fusion.test_oracle import GRID, MODES, MS, NOISE, PANEL, TRACKER, UNDER, VISION, Case, one, replace_, warned
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
-from pumafuse.fusion.estimates import Estimates
 from pumafuse.logs.run import Source
 from pumafuse.tuning.likelihood import Likelihood
 from refusals import one_line
-from tuning_runs import outage, scenario
+from tuning_runs import outage
 
 quiet = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 PARTS = {
@@ -58,27 +57,6 @@ def test_a_part_is_the_conditional_gaussian_given_its_measurements(case: Case, h
     assert 0 < len(oracle.measurements) < sum(len(source.stamp) for source in run.sensors.values())
     check_innovations(est.measurements, oracle)
     check_estimates(est["radial"], getattr(oracle, how)(times))
-
-
-@quiet
-def test_an_arm_in_motion_is_in_motion_where_a_part_begins() -> None:
-    """Within 4 sd throughout; a file that is cut there is off by speed times lag, twenty times as much."""
-    found, since = scenario("panel-tracker-outage", 0.1, 0.02), 0.9
-    sim = pf.simulate(replace_(found, start=replace_(found.start, offset_sd=1e-4)), 1)
-    part, file = pf.fuse(sim.run.between(since), sim.config), pf.fuse(cut(sim.run, since), sim.config)
-    begin = int(np.searchsorted(sim.run.command.stamp, sim.run.command.stamp[0] + since * 1e9))
-    assert part.time[0] == (sim.run.command.stamp[begin] - sim.run.command.stamp[0]) / 1e9
-    assert part.origin + round(part.time[0] * 1e9) == file.origin
-    error, off = (est["tangential"].position - true(sim.run, est) for est in (part, file))
-    assert (np.abs(error) < 4.0 * part["tangential"].position_sd).all()
-    lag = sim.config.arm.lag_of("tangential", 0.06)
-    assert abs(off[0]) == pytest.approx(0.06 * lag, rel=0.2)
-    assert abs(off[0]) > 20.0 * abs(error[0])
-
-
-def true(run: pf.Run, est: Estimates) -> np.ndarray:
-    reference = run.reference
-    return np.interp(est.time, (reference.stamp - est.origin) / 1e9, reference.values["tangential"])
 
 
 @quiet

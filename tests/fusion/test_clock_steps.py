@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from pumafuse.fusion.placing import in_base
 from pumafuse.fusion.segments import build
 from pumafuse.logs.run import Source
 from pumafuse.tuning.parameters import changed
-from tuning_runs import SCENARIOS
+from tuning_runs import SCENARIOS, later
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 SCAN = Path(__file__).parents[2] / "src" / "pumafuse" / "data" / "scan"
@@ -96,15 +97,8 @@ def logged(name: str) -> tuple[pf.Run, pf.FusionConfig]:
     return found.run, found.config
 
 
-RUNS = ("scan", "panel-tracker-outage", "panel-vision", "mismatched-arm", "saturating-servo", "smooth-disturbance")
-
-
-@pytest.mark.parametrize("name", ["scan", "panel-tracker-outage"])
-def test_outages_are_no_clock(name: str) -> None:
-    """Stamps leap by as much, and what is measured goes on as it was."""
-    run, config = logged(name)
-    for seed in range(1, 6):
-        assert named(with_outages(run, seed), config) == []
+RUNS = ["scan", "panel-tracker-outage", "panel-vision", "mismatched-arm", "saturating-servo", "smooth-disturbance"]
+RUNS += ["wrong-latency", "tool-with-play", "sagging-lever"]
 
 
 def test_leaps_are_as_long_as_time_went_by_without_rows() -> None:
@@ -120,10 +114,11 @@ def test_leaps_are_as_long_as_time_went_by_without_rows() -> None:
     assert leaps(stamp[:: len(stamp)]) == []
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("seed", range(7))
-@pytest.mark.parametrize("name", [*RUNS, "wrong-latency", "tool-with-play", "sagging-lever"])
-def test_no_outage_of_many_is_a_clock(name: str, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "seed"), [("scan", 1), ("panel-tracker-outage", 1), *(later(*case) for case in product(RUNS, range(2, 9)))]
+)
+def test_outages_are_no_clock(name: str, seed: int) -> None:
+    """Stamps leap by as much, and what is measured goes on as it was, also of an arm with a wrong delay."""
     run, config = logged(name)
     for more in (0.0, 0.1):
         assert named(with_outages(run, 100 + seed), delayed(config, more)) == []

@@ -136,21 +136,6 @@ def moving() -> pf.Run:
     return recorded(axes="abcdef", seconds=18.0, told=swing)
 
 
-@pytest.mark.parametrize(
-    ("latency", "verdict"),
-    [
-        (-0.010, r": the lag is (29|30)[.\d]* ms too small \(latency_ms, delay_ms or plant\)$"),
-        (0.025, r"the lag is [3-7][.\d]* ms too large \(latency_ms, "),
-        (0.050, r"the lag is (29|30|31)[.\d]* ms too large \(latency_ms, "),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:.*latency_ms is -10:pumafuse.PumafuseWarning")
-def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, latency: float, verdict: str) -> None:
-    """A latency that is 5 and 30 ms too small and too large: on every axis."""
-    for axis, found in judged(moving, config(moving, latency=latency)).items():
-        assert re.search(verdict, sentence(found)), (axis, sentence(found))
-
-
 @pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 def test_a_verdict_on_what_a_gate_has_left_says_so(moving: pf.Run) -> None:
     """With a third of the noise and a gate of 2 the rest fits by selection: the verdict is how many were rejected."""

@@ -16,39 +16,6 @@ def config(**sensor):
     return pf.FusionConfig(arm=ARM, sensors={"camera": pf.Sensor(sd=1e-3, **sensor)})
 
 
-def arc(frame=None, **spoil):
-    """0.2 rad at 0.5 m; spoil: values of row 50 of the camera."""
-    time, angle = 10 + 0.028 * np.arange(60), np.linspace(0, 0.2, 60)
-    seen = 10 + 0.01 * np.arange(1, 150)
-    camera = {"x": 0.5 * np.cos(np.interp(seen, time, angle)), "y": 0.5 * np.sin(np.interp(seen, time, angle))}
-    for axis, value in spoil.items():
-        camera[axis][50] = value
-    return pf.Run.from_arrays(
-        time,
-        {"x": 0.5 * np.cos(angle), "y": 0.5 * np.sin(angle)},
-        {"camera": (seen, camera)},
-        frame=frame or Cylindrical(),
-    )
-
-
-@pytest.mark.parametrize("axis", ["x", "y"])
-def test_infinite_x_or_y_is_invalid(axis):
-    est = pf.fuse(arc(**{axis: np.inf}), config(gate=0.0))
-    assert est.measurements.of("camera", "tangential").outcome[50] == pf.Outcome.INVALID
-
-
-@pytest.mark.parametrize("sensor", [{"gate": 0.0}, {"gate_rows": False}])
-def test_a_measurement_on_the_base_axis_does_not_poison_the_filter(sensor):
-    est = pf.fuse(arc(x=0.0, y=0.0), config(**sensor))
-    assert np.isfinite(est["tangential"].position).all()
-
-
-def test_an_infinite_command_is_no_radius():
-    run = arc()
-    run.command.values["x"][20] = np.inf
-    assert pf.fuse(run, config()).radius == pytest.approx(0.5)
-
-
 def test_a_sensor_in_x_y_without_a_frame_is_refused():
     """Its axes are none of the arm's."""
     run = pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]}, {"camera": ([0.01], {"x": [0.5], "y": [0.0]})})

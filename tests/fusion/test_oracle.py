@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm, solve_discrete_are
 
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
@@ -216,8 +215,10 @@ CASES = {
     "a gap in the measurements": Case(
         one(UNDER), seen={"tracker": replace(LATE, valid=np.r_[every(90, 15), LATE.valid])}
     ),
-    "a latency that wanders": Case(
+    "a latency that wanders, by the speed of plant and disturbance": Case(
+        one(UNDER),
         delay=0.02,
+        process=replace_(NOISE, disturbance_sd=2e-3, disturbance_time=0.05),
         seen={"wandering": Seen(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), GRID), "vision": VISION},
     ),
     "a panel before the tracker": Case(one(UNDER), seen={"panel": PANEL, "tracker": LATE}, rate=60.0),
@@ -288,21 +289,6 @@ def test_error_bars_count_how_well_the_arm_is_known(case: Case) -> None:
             doubted, certain = (fuse(run, one, **how) for one in (config, known))
         assert np.array_equal(doubted["radial"].position, certain["radial"].position)
         assert np.array_equal(doubted.measurements.innovation_sd, certain.measurements.innovation_sd)
-
-
-DISTURBED = replace_(NOISE, disturbance_sd=2e-3, disturbance_time=0.05)
-
-
-@pytest.mark.parametrize(
-    ("case", "engine"), [(Case(one(UNDER)), "filterpy"), (Case(process=DISTURBED), "compiled")], ids=["plant", "both"]
-)
-def test_wandering_latency_counts_with_speed(case: Case, engine: str) -> None:
-    """A measurement's variance grows by (scale · predicted speed · latency_sd)²; a command acts before it.
-
-    The speed is that of the plant and of a smooth disturbance.
-    """
-    wanders = Seen(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), np.union1d(case.times, every(70, 28)))
-    check(replace(case, seen={"wandering": wanders, "vision": VISION}), engine=engine)
 
 
 def plants() -> st.SearchStrategy[Plant]:
@@ -401,39 +387,6 @@ def core_of(case: Case) -> tuple[Filter, Model, Events]:
     segment = build(run, config)
     model = model_of(segment, config)
     return Filter(model, segment.origin), model, segment.events(config)[0]
-
-
-def companion(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    if isinstance(plant, FirstOrder):
-        return np.array([[-1.0 / plant.time_constant]]), np.array([1.0 / plant.time_constant]), np.array([1.0])
-    w, zeta = plant.natural_frequency, plant.damping
-    return np.array([[0.0, 1.0], [-w * w, -2.0 * zeta * w]]), np.array([0.0, w * w]), np.array([1.0, 0.0])
-
-
-@pytest.mark.parametrize("plant", [LAG, UNDER])
-def test_the_covariance_settles_where_riccatis_equation_says(plant: Plant) -> None:
-    """One measurement each period, forever: P after a measurement, from the discrete algebraic Riccati equation."""
-    process = Process(input_noise=0.3e-3, drift=0.8e-3)
-    read = Seen(sensor(0.1e-3), np.arange(400) * T + 5 * MS)
-    case = Case(one(plant), times=np.arange(400) * T, delay=0.0, process=process, seen={"tracker": read})
-    core, _, events = core_of(case)
-    results = Results.room(len(events.time), 1)
-    variance = core.run(events, results, events.time[-1:])[1::2, 0, 0] ** 2
-    A, B, C = companion(plant)
-    n = len(A)
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    F, Q, H = np.eye(n + 1), np.zeros((n + 1, n + 1)), np.append(C, 1.0)[None]
-    F[:n, :n], Q[n, n] = expm(A * 0.028), process.drift**2 * 0.028
-    for node, weight in zip(nodes, weights, strict=True):
-        kick = expm(A * 0.014 * (1.0 + node)) @ B
-        Q[:n, :n] += 0.014 * weight * process.input_noise**2 * np.outer(kick, kick)
-    P = solve_discrete_are(F.T, H.T, Q, [[0.1e-3**2]])
-    S = (H @ P @ H.T).item() + 0.1e-3**2
-    P -= P @ H.T @ H @ P / S
-    ahead = H @ (F - np.eye(n + 1))
-    velocity = (ahead @ P @ ahead.T + H @ Q @ H.T).item() / 0.028**2
-    np.testing.assert_allclose(variance[:3], [(H @ P @ H.T).item(), velocity, P[n, n]], rtol=1e-8)
-    assert results.innovation_sd[-1, 0] ** 2 == pytest.approx(S, rel=1e-8)
 
 
 def test_a_million_steps_leave_the_covariance_as_it_was() -> None:

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from executable import FUSION, SCAN
-from fusion.test_oracle import MODES, MS, UNDER, Case, Seen, T, cases, every, one, sensor, tame
+from fusion.test_oracle import MODES, MS, UNDER, Case, cases, one, tame
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.outcome import Outcome
-from pumafuse.fusion.config import FusionConfig, Sensor
+from pumafuse.fusion.config import FusionConfig
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.logs.run import Run, Source
@@ -44,22 +44,6 @@ def test_smoothing_does_not_reach_across_a_clock_that_was_set_back() -> None:
 # ---- gates ----------------------------------------------------------------------------------------------------------
 
 
-def bumped() -> tuple[Run, FusionConfig]:
-    """An arm that somebody pushes aside by 20 mm at 0.6 s and back at 1.4 s; the camera looks away meanwhile."""
-    rng = np.random.default_rng(3)
-    seen = {
-        "vision": Seen(sensor(0.4e-3), every(12, 7)),
-        "tracker": Seen(Sensor(sd=0.2e-3, latency=0.008, scale=-1.5, gate=5.0), every(25, 56)),
-    }
-    run, config = Case(one(UNDER), times=np.arange(85) * T, seen=seen).made()
-    oracle = AxisOracle(run, config, "radial")
-    for name, each in seen.items():
-        pushed = np.where((each.valid > 600 * MS) & (each.valid < 1400 * MS), 0.02, 0.0)
-        truth = oracle.undisturbed(each.valid)[0] + pushed
-        run.sensors[name].values["radial"][:] = each.sensor.scale * truth + rng.normal(0.0, 0.1e-3, len(each.valid))
-    return run, config
-
-
 def check_gated(run: Run, config: FusionConfig, estimates: Estimates, mode: str) -> dict[Outcome, set[tuple[str, int]]]:
     """Estimates are those of the Gaussian without what was rejected; what re-acquired adds (ν/scale)² to the offset's.
 
@@ -75,20 +59,6 @@ def check_gated(run: Run, config: FusionConfig, estimates: Estimates, mode: str)
     check_innovations(found.where(np.isin(found.outcome, [Outcome.FUSED, Outcome.REACQUIRED])), oracle)
     check_estimates(estimates["radial"], getattr(oracle, mode)(nanoseconds(estimates)))
     return by
-
-
-@pytest.mark.parametrize("mode", ["filtered", "smoothed"])
-def test_a_reacquired_gate_is_a_jump_of_the_offset(mode: str) -> None:
-    """Smoothed estimates know of it before.
-
-    The camera saw the arm at 0.5 s and stands against the tracker until 1.0 s. The second time nobody does.
-    """
-    run, config = bumped()
-    with pytest.warns(PumafuseWarning):
-        estimates = fuse(run, config, rate=30.0, **MODES[mode])
-    rows = check_gated(run, config, estimates, mode)
-    assert rows[Outcome.REJECTED] == {("tracker", row) for row in (*range(16, 26), 35)}
-    assert rows[Outcome.REACQUIRED] == {("tracker", 26), ("tracker", 36)}
 
 
 @settings(max_examples=30)

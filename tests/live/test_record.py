@@ -7,19 +7,18 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.live import record
 from pumafuse.live.record import Recorder
 from pumafuse.live.stream import Stream
-from streams import FIELDS, TRACKED, Event, T, any_stream, delayed, events_of, record_is_as_live
+from streams import FIELDS, TRACKED, Event, T, any_stream, delayed, events_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 
@@ -103,34 +102,13 @@ def record_says_what_live_said(
             assert np.array_equal(said, getattr(track, field), equal_nan=True), (axis, field)
 
 
-@pytest.mark.parametrize(
-    ("late", "rate", "seconds"),
-    [
-        ("tracker", 100.0, 8.0),  # its last row is valid before the last tick, and stamped behind it
-        ("all", None, 10.0),
-    ],
-)
-def test_a_record_of_late_rows_is_as_live(tmp_path: Path, late: str, rate: float | None, seconds: float) -> None:
-    """A camera or a tracker is 50 ms late, commands are by 0 to 20 ms, all by 0 to 0.9 s; each command, and a grid."""
-    source = files("pumafuse") / "data" / "scan"
-    run, config = pf.Run.read(str(source)), pf.FusionConfig.load(str(source / "fusion.toml"))
-    first, rng = int(run.command.stamp[0]), np.random.default_rng(1)
-    events = [event for event in events_of(replace(run, reference=None)) if event.stamp <= first + seconds * 1e9]
+@settings(max_examples=20)
+@given(drawn=any_stream(), rate=st.sampled_from([None, 100.0]))
+def test_a_record_of_any_late_rows_is_as_live(tmp_path_factory, drawn, rate) -> None:
+    """Any axes, gaps and gates, sensors late by up to 0.9 s; commands too, and twice, if they are a period apart.
 
-    def arrival(event: Event) -> float:
-        if late == "all":
-            return event.stamp + (rng.uniform(0.0, 0.9e9) if event.stamp > first else 0.0)
-        if late == "commands":
-            return event.stamp + (rng.uniform(0.0, 20e6) if not event.sensor and event.stamp > first else 0.0)
-        return event.stamp + 50e6 * (event.sensor == late)
-
-    record_says_what_live_said(tmp_path / "record", config, dict(run.start), sorted(events, key=arrival), rate)
-
-
-@settings(max_examples=15)
-@given(drawn=any_stream())
-def test_a_record_of_any_late_rows_is_as_live(tmp_path_factory, drawn) -> None:
-    """Any axes, gaps and gates, sensors late by up to 0.9 s; commands too, and twice, if they are a period apart."""
+    Each command, and a grid.
+    """
     config, run, seed = drawn
     assume((np.diff(run.command.stamp) > 0).all())  # of one stamp the last command counts
     start, rng, events = dict.fromkeys(run.axes, 0.5), np.random.default_rng(seed), events_of(run)
@@ -140,7 +118,7 @@ def test_a_record_of_any_late_rows_is_as_live(tmp_path_factory, drawn) -> None:
     arrivals = [events[place] for place in np.argsort(late, kind="stable")]
     if apart:
         arrivals = [first, *(event for event in delayed(arrivals, 0.9, seed, twice=0.1) if event.stamp != first.stamp)]
-    record_says_what_live_said(tmp_path_factory.mktemp("live") / "record", config, start, arrivals)
+    record_says_what_live_said(tmp_path_factory.mktemp("live") / "record", config, start, arrivals, rate)
 
 
 def test_a_record_without_arrivals_is_read_as_before(tmp_path: Path) -> None:
@@ -155,16 +133,6 @@ def test_a_record_without_arrivals_is_read_as_before(tmp_path: Path) -> None:
     assert len(run.command.arrival) == 0
     for field in FIELDS:
         assert getattr(now["radial"], field).tolist() == getattr(before["radial"], field).tolist()
-
-
-def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
-    """Twenty seconds of the shipped run as lines."""
-    data = files("pumafuse") / "data"
-    run, config = pf.Run.read(str(data / "scan1")), pf.FusionConfig.load(str(data / "fusion.toml"))
-    until = run.command.stamp[0] + 20 * 10**9
-    sensors = {name: one.rows(one.stamp <= until) for name, one in run.sensors.items()}
-    command = run.command.rows(run.command.stamp <= until)
-    record_is_as_live(tmp_path / "record", replace(run, command=command, sensors=sensors), config)
 
 
 def test_it_can_be_read_while_it_grows(recorded: Recorded) -> None:

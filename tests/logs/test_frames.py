@@ -170,13 +170,13 @@ def test_what_a_frame_cannot_place_is_refused(
 
 
 def test_tangential_and_radial_need_both_x_and_y_vertical_needs_neither() -> None:
-    """NaN where one is missing, and on the base's axis, where there is no angle: not used, and no turn is lost."""
-    x, y = [0.5, np.nan, 0.0, -0.1, 0.0, np.nan], [0.0, 0.1, np.nan, 0.5, 0.0, np.nan]
-    z = [0.0, 0.0, 0.0, np.nan, 0.0, 0.0]
-    run = pf.Run.from_arrays(stamps(6), {"x": x, "y": y, "z": z}, frame=Cylindrical())
+    """NaN where one is missing or infinite, and on the base's axis, where there is no angle; no turn is lost."""
+    x, y = [0.5, np.nan, 0.0, -0.1, 0.0, np.inf, 0.1], [0.0, 0.1, np.nan, 0.5, 0.0, 0.1, -np.inf]
+    z = [0.0, 0.0, 0.0, np.nan, 0.0, 0.0, 0.0]
+    run = pf.Run.from_arrays(stamps(7), {"x": x, "y": y, "z": z}, frame=Cylindrical())
     found = in_axes(run, None)[0].command.values
-    assert np.flatnonzero(np.isnan(found["tangential"])).tolist() == [1, 2, 4, 5]
-    assert np.flatnonzero(np.isnan(found["radial"])).tolist() == [1, 2, 4, 5]
+    assert np.flatnonzero(np.isnan(found["tangential"])).tolist() == [1, 2, 4, 5, 6]
+    assert np.flatnonzero(np.isnan(found["radial"])).tolist() == [1, 2, 4, 5, 6]
     assert np.flatnonzero(np.isnan(found["vertical"])).tolist() == [3]
     assert found["tangential"][3] == pytest.approx(0.5 * math.atan2(0.5, -0.1))
 

@@ -461,16 +461,6 @@ def test_decimal_commas_may_come_late(tmp_path: Path, rest: str) -> None:
     assert tables.read(path).numbers("x_mm")[0].tolist() == [5e-4] * 3000 + [2.5e-4]
 
 
-@pytest.mark.parametrize("text", ["t_s;x_mm;y_mm\n0.5;1.25;\n1;2;3\n", "t_s;x_mm;y_mm\n0,5;1,25;\n1;2;3\n"])
-@pytest.mark.parametrize("separator", [";", "\t"])
-def test_cells_may_be_separated_otherwise(tmp_path: Path, text: str, separator: str) -> None:
-    """Spreadsheets of many countries write semicolons, and commas for the points of decimals."""
-    table = csv(tmp_path, text.replace(";", separator))
-    assert table.stamps("t_s")[0].tolist() == [500_000_000, 1_000_000_000]
-    assert table.numbers("x_mm")[0].tolist() == [1.25e-3, 2e-3]
-    assert np.isnan(table.numbers("y_mm")[0][0])
-
-
 def test_a_text_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small file of gzip may hold any amount, and a device file has no end."""
     monkeypatch.setattr(tables, "_MOST_TEXT", 32 << 20)
