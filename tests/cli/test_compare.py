@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ import pytest
 import pumafuse as pf
 from executable import pumafuse
 from pumafuse.cli import compare
+from tuning_runs import quietly
 
 ARM = {"name": "arm", "update_period_ms": 20, "delay_ms": 30, "axes": {"x": {"plant": "first-order"}}}
 ARM["axes"]["x"]["time_constant_ms"] = 40  # pyright: ignore
@@ -38,9 +38,8 @@ def recorded(seed: int = 1) -> pf.Run:
 def saved(folder: Path, run: pf.Run, camera: float = 1.0, gate: float = 50.0, **how: Any) -> Path:
     """A result with a believed noise of the camera [mm], and its gate."""
     sensors = {"camera": {"sd_mm": camera, "gate": gate}, "tracker": {"sd_mm": 0.1}}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        pf.fuse(run, pf.FusionConfig.parse({"arm": ARM, "sensors": sensors}), **how).save(folder)
+    config = pf.FusionConfig.parse({"arm": ARM, "sensors": sensors})
+    quietly(lambda: pf.fuse(run, config, **how)).save(folder)
     return folder
 
 

@@ -53,6 +53,17 @@ def write(file: Path, columns: dict[str, Any]) -> None:
         writer.writerows(zip(*columns.values(), strict=True))
 
 
+def surveyed(folder: Path, columns: dict[str, Any]) -> Survey:
+    """What is found in a table of these columns."""
+    write(folder / "log.csv", columns)
+    return survey(folder / "log.csv")
+
+
+def refusal(folder: Path, columns: dict[str, Any]) -> str:
+    """The line that refuses a table of these columns."""
+    return one_line(RunError, lambda: surveyed(folder, columns))
+
+
 def xyz(values: FloatArray, name: str = "{}_m") -> dict[str, Any]:
     return {name.format(axis): values[:, place] for place, axis in enumerate("xyz")}
 
@@ -428,8 +439,7 @@ def test_a_sensor_that_says_again_what_another_says_is_no_second_one(tmp_path: P
     """As the log of a policy has the encoders twice, as what it observes and as what is measured."""
     t, u, z = recorded_at_once()
     columns = {**xyz(u, "goal_{}_m"), **xyz(z, "encoder_{}_m"), **xyz(z, "observed_{}_m")}
-    write(tmp_path / "log.csv", {"t_s": t, **columns})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, {"t_s": t, **columns})
     assert found.roles is not None and list(found.run.sensors) == ["encoder"]
     assert [why for _, why in found.roles.left_out] == ["the same numbers as encoder, at the same time"]
 
@@ -468,8 +478,7 @@ def test_set_points_are_what_is_followed_as_far_not_what_they_are_scaled_from(tm
 def test_a_command_that_leaps_away_decides_no_unit(tmp_path: Path) -> None:
     t, u, z = recorded_at_once()
     u[500, 1] *= 1000.0
-    write(tmp_path / "log.csv", {"t_s": t, **xyz(u, "sp_{}"), **xyz(z, "pv_{}")})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, {"t_s": t, **xyz(u, "sp_{}"), **xyz(z, "pv_{}")})
     assert "are the numbers of log.csv in m? No name says it (run.toml)" in asked(found)
 
 
@@ -507,8 +516,7 @@ def test_signals_that_nothing_tells_apart_are_described_and_no_column_is_both(tm
     """The refusal says what the table looks like; what it says to add makes it a log; a column measures not itself."""
     t, u, z = recorded_at_once()
     stacked = {"stamp_ms": np.tile(1e3 * t, 2), "reading_mm": 1e3 * np.concatenate([u[:, 0], z[:, 0]])}
-    write(tmp_path / "log.csv", stacked)
-    said = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    said = refusal(tmp_path, stacked)
     assert "the clock of log.csv begins anew in row 1001: if its rows are signals one below another, add" in said
     for name, (first, second) in {"log": ("command_x", "measured_x"), "other": ("soll_x", "ist_x")}.items():
         write(tmp_path / f"{name}_2.csv", {**stacked, "signal": np.repeat([first, second], len(t))})
@@ -522,8 +530,8 @@ def test_signals_that_nothing_tells_apart_are_described_and_no_column_is_both(tm
         (tmp_path / "run.toml").write_text(f"[command]\n{table}{told}\n[sensors.arm]\n{table}{measured}\n")
         assert ", and so is command.x: give each" in one_line(ConfigError, lambda: survey(tmp_path))
     (tmp_path / "run.toml").write_text(f'[command]\n{table}"reading_mm"\n[sensors.arm]\n{table}"reading_mm"\n')
-    refusal = one_line(ConfigError, lambda: survey(tmp_path))
-    assert "sensors.arm.x is the column 'reading_mm' of log.csv, and so is command.x" in refusal
+    said = one_line(ConfigError, lambda: survey(tmp_path))
+    assert "sensors.arm.x is the column 'reading_mm' of log.csv, and so is command.x" in said
     (tmp_path / "run.toml").write_text("[command\n")
     assert "run.toml" in one_line(ConfigError, lambda: survey(tmp_path))
 
@@ -543,8 +551,7 @@ def test_set_points_are_what_is_measured_and_the_error_of_a_controller(tmp_path:
 def test_the_error_of_a_controller_alone_is_no_command(error: str, tmp_path: Path) -> None:
     """It is said what it is, and that the set points are its sum with what is measured."""
     t, u, z = recorded_at_once()
-    write(tmp_path / "log.csv", {"t_s": t, "level_mm": 1e3 * z[:, 0], error: 1e3 * (u - z)[:, 0]})
-    text = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    text = refusal(tmp_path, {"t_s": t, "level_mm": 1e3 * z[:, 0], error: 1e3 * (u - z)[:, 0]})
     assert f"{error} of log.csv is an error: if it is the set point less what is measured" in text
     columns = 'file = "log.csv"\ntime = "t_s"\nboom = '
     told = f'[command]\n{columns}{{ column = "{error}", unit = "mm" }}\n'
@@ -750,8 +757,7 @@ def test_a_lag_that_may_be_a_period_longer_is_asked(late: float, tmp_path: Path)
     def at(t: FloatArray) -> FloatArray:
         return 0.02 * np.interp(t, 4.0 * np.arange(30), height) * np.cos(0.25 * np.pi * np.maximum(t, 0.0)) ** 4
 
-    write(tmp_path / "log.csv", {"t_s": t, "chest_goal_m": at(t), "chest_state_m": at(t - late)})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, {"t_s": t, "chest_goal_m": at(t), "chest_state_m": at(t - late)})
     assert found.relations["state", "chest"].lag == pytest.approx(0.9, abs=0.05)
     asked = [one for one in questions(found, {}) if " s late? " in one]
     assert [one[:20] for one in asked] == (["is state 4.9 s late?"] if late > 4.0 else [])
@@ -774,8 +780,7 @@ def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:
     t, u, _, _ = recorded()
     z = path(t - LAG) + np.random.default_rng(4).normal(0.0, 1e-4, (2, *u.shape))
     columns = {f"camera{n}_{axis}_m": z[n - 1, :, place] for n in (1, 2) for place, axis in enumerate("xy")}
-    write(tmp_path / "log.csv", {"time_s": t, **columns, "goal_x_m": u[:, 0], "goal_y_m": u[:, 1]})
-    found = survey(tmp_path / "log.csv").roles
+    found = surveyed(tmp_path, {"time_s": t, **columns, "goal_x_m": u[:, 0], "goal_y_m": u[:, 1]}).roles
     assert {one.name: [*one.axes] for one in found.sensors} == {"camera1": ["x", "y"], "camera2": ["x", "y"]}
 
 
@@ -1057,8 +1062,7 @@ def test_desired_values_are_the_commands_of_those_beside_them(desired: str, meas
     z = path(t - LAG) + np.random.default_rng(2).normal(0.0, 1e-4, u.shape)
     columns = {"t_s": t, "success_rate": np.ones(len(t)), **{f"w_{n}": np.gradient(z[:, n], t) for n in range(3)}}
     columns |= {measured.format(n): z[:, n] for n in range(3)} | {f"dq[{n}]": np.gradient(u[:, n], t) for n in range(3)}
-    write(tmp_path / "log.csv", columns | {desired.format(n): u[:, n] for n in range(3)})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, columns | {desired.format(n): u[:, n] for n in range(3)})
     assert of_roles(found) == [[name.format(n) for n in range(3)] for name in (desired, measured)]
     assert [one.correlation > 0.99 for one in found.relations.values()] == [True] * 3
     assert set(found.run.kinds.values()) == {"angle"}
@@ -1131,8 +1135,7 @@ def test_what_adds_up_to_a_position_is_its_velocity_by_whatever_name(tmp_path: P
         columns[f"{who} ram L"] = ram + np.random.default_rng(4).normal(scale=1e-5, size=len(t))
         columns[f"{who} ram W"] = np.gradient(ram, t)
         columns[f"{who} ram B"] = np.gradient(columns[f"{who} ram W"], t)
-    write(tmp_path / "log.csv", columns)
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, columns)
     assert of_roles(found) == [["K2S ram L"], ["S2K ram L"]]
     assert set(found.parts[0].left_out.values()) == {
         f"velocity: it adds up to {who} ram {what} by the clock" for who in ("K2S", "S2K") for what in "LW"
@@ -1357,8 +1360,7 @@ def test_a_log_without_commands_says_how_they_are_known(tmp_path: Path) -> None:
 
 def test_commands_that_never_move_are_named(tmp_path: Path) -> None:
     t, _, z = recorded_at_once()
-    write(tmp_path / "log.csv", {"t_s": t, "arm": z[:, 0], "GoalTicks": np.full(len(t), 42)})
-    text = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    text = refusal(tmp_path, {"t_s": t, "arm": z[:, 0], "GoalTicks": np.full(len(t), 42)})
     assert "What is called so never moves: GoalTicks, always 42, and none runs ahead" in text
     assert "None is called" not in text
     write(tmp_path / "log.csv", {"t_s": t, "swing": z[:, 0]})
@@ -1401,8 +1403,7 @@ def test_velocities_are_to_be_integrated_only_where_no_positions_are_commanded(
 ) -> None:
     _, u, z = recorded_at_once()
     columns = {"lathe_vel_demand": np.gradient(u[:, 0]), "lathe_pos_encoder": z[:, 0]}
-    write(tmp_path / "log.csv", columns | ({"lathe_pos_demand": u[:, 0]} if has_positions else {}))
-    text = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    text = refusal(tmp_path, columns | ({"lathe_pos_demand": u[:, 0]} if has_positions else {}))
     assert ("integrate them" in text) is not has_positions
     assert "give it to init as --rate HZ" in text
 
@@ -1517,8 +1518,7 @@ def test_a_clock_that_counts_its_rows_tells_no_unit(every: int, tmp_path: Path) 
     """It is asked what it is; rows at a rate that is given are so far apart. One that leaves numbers out is a clock."""
     n = np.arange(2500)
     told = np.sin(n / 90.0) + 0.4 * np.sin(n / 37.0)
-    write(tmp_path / "log.csv", {"stamp": 310 + every * n, "goal_x_m": told, "actual_x_m": np.roll(told, 4)})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, {"stamp": 310 + every * n, "goal_x_m": told, "actual_x_m": np.roll(told, 4)})
     assert any("a count of rows?" in one and "--rate HZ" in one for one in asked(found)) is (every == 1)
     assert next(decisions(found)) == ("clock", "stamp: ms by motion", "a guess: stamp")
     (part,) = parts_of(tmp_path / "log.csv", rate=40.0)
@@ -1566,8 +1566,7 @@ def test_a_clock_that_was_counted_gives_way_to_one_that_was_measured(tmp_path: P
     seen = np.sin(2.0 * seen) + 0.3 * np.sin(7.1 * seen) + rng.normal(0.0, 1e-3, len(real))
     nominal = 0.8 + 0.002 * np.arange(4000)
     columns = {"timestamp": nominal, "real_time": real, "x_target_m": told, "x_actual_m": seen}
-    write(tmp_path / "log.csv", columns)
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, columns)
     assert found.relations["actual", "x"].lag == pytest.approx(0.08, abs=3e-3)
     assert any(
         "which is the clock of log.csv? By timestamp it lasts 7.998 s, by real_time 16" in one for one in asked(found)
@@ -1581,8 +1580,7 @@ def test_an_angle_by_the_name_of_what_measures_it_is_one(told: str, measured: st
     """``reference`` beside ``theta``, without a unit: both in rad, not in m."""
     t = np.arange(0.0, 30.0, 0.02)
     columns = {"time_s": t, told: np.sin(t) + 0.3 * np.sin(3.3 * t)}
-    write(tmp_path / "log.csv", columns | {measured: np.interp(t - 0.1, t, columns[told])})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, columns | {measured: np.interp(t - 0.1, t, columns[told])})
     assert set(found.run.kinds.values()) == {"angle"}
     (value,) = found.run.command.values.values()
     assert value.max() == pytest.approx(columns[told].max())
@@ -1627,12 +1625,10 @@ def test_thrust_says_nothing_about_the_unit_of_positions(tmp_path: Path) -> None
     """Columns that follow nothing, however large, leave the unit alone, and axes of one source share it."""
     t, u, z = recorded_at_once()
     columns = {**xyz(30.0 * u, "goal_{}"), **xyz(30.0 * z, "actual_{}")}  # up to 18 and only 6
-    write(tmp_path / "log.csv", {"time": t, **columns, "propeller": 4e4 + 1e3 * np.sin(t)})
-    roles = survey(tmp_path / "log.csv").roles
+    roles = surveyed(tmp_path, {"time": t, **columns, "propeller": 4e4 + 1e3 * np.sin(t)}).roles
     assert {one.unit for some in roles.command.axes.values() for one in some} == {"mm"}
     small = {name: 0.2 * value for name, value in columns.items()}
-    write(tmp_path / "log.csv", {"time": t, **small, "propeller": 4e4 + 1e3 * np.sin(t)})
-    roles = survey(tmp_path / "log.csv").roles
+    roles = surveyed(tmp_path, {"time": t, **small, "propeller": 4e4 + 1e3 * np.sin(t)}).roles
     assert {one.unit for some in roles.command.axes.values() for one in some} == {"m"}
 
 
@@ -1657,8 +1653,7 @@ def test_a_reference_that_runs_ahead_of_the_commands_is_no_truth(tmp_path: Path)
     ahead = np.roll(steps, -25)
     shaped = np.convolve(np.pad(ahead, (50, 0), mode="edge"), np.full(51, 1.0 / 51.0), mode="valid")
     measured = np.interp(t - LAG, t, shaped) + np.random.default_rng(5).normal(0.0, 1e-4, len(t))
-    write(tmp_path / "log.csv", {"t_s": t, "reference_x_m": ahead, "command_x_m": shaped, "actual_x_m": measured})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, {"t_s": t, "reference_x_m": ahead, "command_x_m": shaped, "actual_x_m": measured})
     assert found.run.reference is None
     assert any(one.startswith("reference is not used on x: it does not follow the commands") for one in asked(found))
 
@@ -1667,8 +1662,7 @@ def test_of_two_clocks_that_were_counted_the_first_is_taken(tmp_path: Path) -> N
     """Cycles of 4 ms beside the time that they make: another count tells it no better."""
     t, n = 0.004 * np.arange(3000), np.arange(3000)
     columns = {"time_run": t, "time_cycle": n, "bend_target": np.sin(2.0 * t), "bend_actual": np.sin(2.0 * (t - 0.06))}
-    write(tmp_path / "log.csv", columns)
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, columns)
     assert found.relations["actual", "bend"].lag == pytest.approx(0.06, abs=3e-3)
     assert any("By time_run it lasts 12 s, by time_cycle" in one for one in asked(found))
 
@@ -1746,8 +1740,7 @@ def test_how_a_tool_leans_is_not_where_it_is(tmp_path: Path) -> None:
     told = path(t)
     lean = 0.2 * path(t - 0.2)[:, :2] + 0.014 * np.sin(3.1 * t)[:, None] + rng.normal(0.0, 1e-4, (len(t), 2))
     columns = {"t_s": t, "target_x": told[:, 0], "target_y": told[:, 1]}
-    write(tmp_path / "log.csv", columns | {"measured_roll_rad": lean[:, 1], "measured_pitch_rad": lean[:, 0]})
-    said = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    said = refusal(tmp_path, columns | {"measured_roll_rad": lean[:, 1], "measured_pitch_rad": lean[:, 0]})
     assert "commands, but nothing that measures where they lead" in said
 
 
@@ -2085,8 +2078,7 @@ def test_the_best_pairs_of_axes_come_first(tmp_path: Path) -> None:
             f"was_qd{place}": np.degrees(np.gradient(np.roll(joint, 5), t)),
         }
         columns[f"was_q{place}"] = np.interp(t - 0.05, t, joint)
-    write(tmp_path / "log.csv", columns)
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, columns)
     (sensor,) = found.roles.sensors
     assert {axis: one[0].column for axis, one in sensor.axes.items()} == {f"q{n}": f"was_q{n}" for n in range(3)}
     assert found.parts[0].left_out == {f"cmd_qd{place}": "velocity" for place in range(3)}
@@ -2104,8 +2096,7 @@ def test_many_axes_are_matched_by_what_follows_the_words_that_all_share(tmp_path
     seen = at(t - LAG) + rng.normal(scale=1e-4, size=(500, 24))
     columns = {f"wanted_rover_{joint}": values for joint, values in zip(joints, at(t).T, strict=True)}
     columns |= {f"encoder_{joint}": values for joint, values in zip(joints[::-1], seen.T[::-1], strict=True)}
-    write(tmp_path / "log.csv", {"t_s": t, **columns})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, {"t_s": t, **columns})
     assert [axis for _, axis in found.relations] == [f"rover_{joint}" for joint in joints]
     assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.005)] * 24
 
@@ -2121,8 +2112,7 @@ def test_an_axis_whose_name_ends_as_that_of_a_command_is_that(tmp_path: Path) ->
         "p_RS_R_x_m": np.roll(y, 5),
         "p_RS_R_y_m": np.roll(y, 5) + z[:, 2],
     }
-    write(tmp_path / "log.csv", {name: value[10:] for name, value in columns.items()})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, {name: value[10:] for name, value in columns.items()})
     (sensor,) = found.roles.sensors
     assert {axis: one[0].column for axis, one in sensor.axes.items()} == {"x": "p_RS_R_x_m", "y": "p_RS_R_y_m"}
 
@@ -2139,8 +2129,7 @@ def test_a_clock_of_whole_seconds_says_how_many_rows_a_second_has(form: str, tmp
     """Which is what --rate asks for."""
     _, u, z = recorded_at_once()
     time = [form.format(17, 22, 25 + n // 50) for n in range(1000)]
-    write(tmp_path / "log.csv", {"x_cmd_mm": 1e3 * u[:, 0], "x_meas_mm": 1e3 * z[:, 0], "time": time})
-    said = one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+    said = refusal(tmp_path, {"x_cmd_mm": 1e3 * u[:, 0], "x_meas_mm": 1e3 * z[:, 0], "time": time})
     assert "time is no clock: 20 distinct stamps, one every 1 s, in 1000 rows with x_" in said
     assert "stands still: 50 rows a second); if rows come at a constant rate, give it to init as --rate HZ" in said
     assert survey(tmp_path / "log.csv", rate=50.0).run.sensors
@@ -2150,8 +2139,7 @@ def test_a_clock_of_whole_seconds_says_how_many_rows_a_second_has(form: str, tmp
 def test_what_is_asked_about_a_sensor_is_not_sure(late: float, tmp_path: Path) -> None:
     """A lag that is a little less than none is asked about, and decided accordingly."""
     t, u, _ = recorded_at_once()
-    write(tmp_path / "log.csv", {"t_s": t, "target_x_mm": 1e3 * u[:, 0], "actual_x_mm": 1e3 * path(t - late)[:, 0]})
-    found = survey(tmp_path / "log.csv")
+    found = surveyed(tmp_path, {"t_s": t, "target_x_mm": 1e3 * u[:, 0], "actual_x_mm": 1e3 * path(t - late)[:, 0]})
     (sure,) = [sure for what, _, sure in decisions(found) if what == "actual follows"]
     assert sure == ("sure" if late > 0.0 else "a question")
     assert any("ahead of the commands on x" in one for one in asked(found)) is (late < 0.0)

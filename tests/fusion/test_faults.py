@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
+from changes import of_sensor
 from fusion.test_between import cut
 from pumafuse.logs.run import Source
 from pumafuse.tuning.likelihood import Likelihood
@@ -22,11 +23,6 @@ CONFIG = outage(1).config
 def notes(run: pf.Run, config: pf.FusionConfig = CONFIG) -> list[str]:
     given = [one for one in pf.fuse(run, config).notes if one.startswith(("sensor '", "sensors."))]
     return [one for one in given if "contradicts" not in one]
-
-
-def with_vision(change: Callable[[Source], Source]) -> pf.Run:
-    run = outage(1).run
-    return replace(run, sensors={**run.sensors, "vision": change(run.sensors["vision"])})
 
 
 def changed(one: Source, change: Callable[[np.ndarray], np.ndarray]) -> Source:
@@ -43,8 +39,8 @@ def elsewhere(run: pf.Run, config: pf.FusionConfig = CONFIG) -> list[str]:
 
 def test_another_zero_is_said_where_nothing_told_is_as_uncertain() -> None:
     """50 mm where noise and priors are 2 mm; not 3 mm, not with anything as uncertain as that, not in a good run."""
-    assert not notes(outage(1).run) and not notes(with_vision(lambda one: moved(0.003, one)))
-    run = with_vision(lambda one: moved(0.05, one))
+    assert not notes(outage(1).run) and not notes(of_sensor(outage(1).run, "vision", lambda one: moved(0.003, one)))
+    run = of_sensor(outage(1).run, "vision", lambda one: moved(0.05, one))
     assert len(elsewhere(run)) == 1
     for told in (
         with_sensors(CONFIG, "vision", bias_sd=0.05),
@@ -57,8 +53,11 @@ def test_another_zero_is_said_where_nothing_told_is_as_uncertain() -> None:
 def test_what_scatters_that_far_has_no_other_zero() -> None:
     """20 mm in 30 mm of scatter, of a sensor that claims 0.5 mm."""
     rng = np.random.default_rng(1)
-    run = with_vision(lambda one: changed(one, lambda value: value + rng.normal(0.02, 0.03, len(value))))
-    assert not elsewhere(run)
+
+    def scattered(one: Source) -> Source:
+        return changed(one, lambda value: value + rng.normal(0.02, 0.03, len(value)))
+
+    assert not elsewhere(of_sensor(outage(1).run, "vision", scattered))
 
 
 def test_a_negative_latency_is_questioned() -> None:

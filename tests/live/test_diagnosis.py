@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
+from changes import Change, delayed, exchanged, of_sensor, scaled
 from pumafuse.filter.response import response
 from pumafuse.fusion.consistency import consistency
 from pumafuse.fusion.verdicts import sentence
@@ -42,22 +43,6 @@ def tracked() -> tuple[pf.Run, pf.FusionConfig]:
     return replace(run, sensors={"tracker": run.sensors["tracker"]}), msgspec.structs.replace(config, sensors=sensors)
 
 
-def slipped(run: pf.Run, slip: Callable[[Source], Source], sensor: str = "tracker") -> pf.Run:
-    return replace(run, sensors={**run.sensors, sensor: slip(run.sensors[sensor])})
-
-
-def later(seconds: float) -> Callable[[Source], Source]:
-    return lambda one: replace(one, stamp=one.stamp + round(seconds * 1e9))
-
-
-def larger(factor: float) -> Callable[[Source], Source]:
-    return lambda one: replace(one, values={axis: factor * value for axis, value in one.values.items()})
-
-
-def exchanged(one: Source) -> Source:
-    return replace(one, values={**one.values, "x": one.values["y"], "y": one.values["x"]})
-
-
 def turned(one: Source) -> Source:
     x, y = one.values["x"], one.values["y"]
     seen = {"x": np.cos(TURN) * x - np.sin(TURN) * y, "y": np.sin(TURN) * x + np.cos(TURN) * y}
@@ -76,10 +61,10 @@ def zero_while_lost(one: Source) -> Source:
     return replace(one, values={axis: np.where(is_lost, noise, value) for axis, value in one.values.items()})
 
 
-SLIPS: dict[str, tuple[Callable[[Source], Source], str]] = {
-    "early": (later(-1.5), "s early: it follows the commands of"),
-    "exchanged": (exchanged, "follows on x the commands of y"),
-    "inches": (larger(1.0 / 25.4), "are its values inch called mm"),
+SLIPS: dict[str, tuple[Change, str]] = {
+    "early": (delayed(-1.5), "s early: it follows the commands of"),
+    "exchanged": (exchanged("x", "y"), "follows on x the commands of y"),
+    "inches": (scaled(1.0 / 25.4), "are its values inch called mm"),
     "turned": (turned, "looks turned by"),
 }
 
@@ -97,7 +82,7 @@ def said(run: pf.Run, config: pf.FusionConfig) -> tuple[list[str], pf.LiveEstima
 def test_a_sensor_that_tells_nonsense_is_named_once(slip: str) -> None:
     """With the words of `fuse`; estimates say on which axes they are not to be believed."""
     (run, config), (change, words) = tracked(), SLIPS[slip]
-    run = slipped(run, change)
+    run = of_sensor(run, "tracker", change)
     notices, live = said(run, config)
     assert len([one for one in notices if words in one]) == 1
     assert len([one for one in live.health().faults if words in one]) == 1
@@ -116,20 +101,20 @@ def longer_delay(config: pf.FusionConfig) -> pf.FusionConfig:
 @pytest.mark.parametrize(
     ("slip", "configured", "words", "size"),
     [
-        (later(0.0), longer_delay, "ms too large (latency_ms, delay_ms or plant)", 70.0),
+        (delayed(0.0), longer_delay, "ms too large (latency_ms, delay_ms or plant)", 70.0),
         (noisy, lambda config: config, "sd_mm is too small", None),
     ],
     ids=["a delay of the arm", "noise"],
 )
 def test_innovations_that_are_too_large_are_explained_as_fuse_explains_them(
-    slip: Callable[[Source], Source],
+    slip: Change,
     configured: Callable[[pf.FusionConfig], pf.FusionConfig],
     words: str,
     size: float | None,
 ) -> None:
     """Where no fault shows: once, with the verdict that `fuse` has of the whole, on the axis where it is worst."""
     run, config = tracked()
-    run, config = slipped(run, slip), configured(config)
+    run, config = of_sensor(run, "tracker", slip), configured(config)
     notices, live = said(run, config)
     explained = [one for one in notices if words in one]
     assert len(explained) == 1 and explained[0].startswith("sensor 'tracker' on ")
@@ -162,20 +147,20 @@ def of_tracker(**keys: float) -> Callable[[pf.FusionConfig], pf.FusionConfig]:
     ("slip", "configured", "words", "spoils"),
     [
         (mixed, of_tracker(), "the error turns with the direction", True),
-        (later(0.0), of_tracker(gate=0.8), "were rejected: sd_mm", True),
-        (later(0.0), of_tracker(sd=1e-4), "sd_mm is too large by a factor of", False),
+        (delayed(0.0), of_tracker(gate=0.8), "were rejected: sd_mm", True),
+        (delayed(0.0), of_tracker(sd=1e-4), "sd_mm is too large by a factor of", False),
     ],
     ids=["an echo", "a narrow gate", "noise that is too large"],
 )
 def test_what_is_wrong_by_little_is_named_as_fuse_names_it(
-    slip: Callable[[Source], Source],
+    slip: Change,
     configured: Callable[[pf.FusionConfig], pf.FusionConfig],
     words: str,
     spoils: bool,
 ) -> None:
     """Where innovations are not far larger than expected: once; error bars that are too wide make nothing doubtful."""
     run, config = tracked()
-    run, config = slipped(run, slip), configured(config)
+    run, config = of_sensor(run, "tracker", slip), configured(config)
     notices, live = said(run, config)
     (named,) = [one for one in notices if " NIS " in one and "(by " in one]
     axis = named.removeprefix("sensor 'tracker' on ").partition(":")[0]
@@ -188,7 +173,7 @@ def test_what_is_wrong_by_little_is_named_as_fuse_names_it(
 def test_what_the_gate_keeps_out_makes_no_estimate_doubtful() -> None:
     """Two other sensors contradict it: it is named, and harms nothing."""
     run, config = scan()
-    notices, live = said(slipped(run, exchanged), config)
+    notices, live = said(of_sensor(run, "tracker", exchanged("x", "y")), config)
     assert len([one for one in notices if SLIPS["exchanged"][1] in one]) == 1
     assert live.estimate().doubtful == ()
 
@@ -200,12 +185,12 @@ def test_it_says_when_a_fault_is_over() -> None:
     begin = run.command.stamp[0]
 
     def at_first(one: Source) -> Source:
-        early, wrong = one.stamp < begin + round(15e9), exchanged(one)
+        early, wrong = one.stamp < begin + round(15e9), exchanged("x", "y")(one)
         return replace(
             one, values={axis: np.where(early, wrong.values[axis], value) for axis, value in one.values.items()}
         )
 
-    notices, live = said(slipped(run, at_first), config)
+    notices, live = said(of_sensor(run, "tracker", at_first), config)
     assert len([one for one in notices if SLIPS["exchanged"][1] in one]) == 1
     assert len([one for one in notices if "exchanged columns shows no more" in one]) == 1
     assert live.health().faults == () and live.estimate().doubtful == ()
@@ -247,7 +232,7 @@ def test_a_sensor_that_is_taken_again_is_said_and_doubted_at_once() -> None:
     notices = list[str]()
     live = pf.LiveEstimator(config, on_notice=notices.append)
     far, doubted = list[bool](), list[bool]()
-    for event in events_of(slipped(run, zero_while_lost)):
+    for event in events_of(of_sensor(run, "tracker", zero_while_lost)):
         result = feed(live, event)
         if pf.Outcome.REACQUIRED in result.axes.values():
             assert {axis for axis, one in result.axes.items() if one is pf.Outcome.REACQUIRED} <= {

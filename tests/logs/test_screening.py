@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 
 import pumafuse as pf
 from pumafuse.arrays import FloatArray
 from pumafuse.logs.screening import lost
+from tuning_runs import quietly
 
 PERIOD, LAG = 0.025, 0.075  # s
 TIME = PERIOD * np.arange(2400)
@@ -40,9 +39,7 @@ def followed(command: FloatArray, step: float = 0.0, noise: float = 1e-3) -> Flo
 
 def fused(command: FloatArray, value: FloatArray, **more: object) -> tuple[pf.Estimates, str]:
     run = pf.Run.from_arrays(TIME, {"slide": command}, {"rule": (TIME + 0.004, {"slide": value})})
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        est = pf.fuse(run, CONFIG, **more)  # type: ignore[arg-type]
+    est = quietly(lambda: pf.fuse(run, CONFIG, **more))  # type: ignore[arg-type]
     return est, " / ".join(est.notes)
 
 
@@ -68,9 +65,7 @@ def test_values_that_nobody_sent_are_not_used(name: str) -> None:
     run = pf.Run.from_arrays(
         np.delete(TIME, rows), {"slide": np.delete(PATH, rows)}, {"rule": (TIME + 0.004, {"slide": VALUE})}
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        wanted = pf.fuse(run, CONFIG, rate=50.0, mode="as-live")  # type: ignore[arg-type]
+    wanted = quietly(lambda: pf.fuse(run, CONFIG, rate=50.0, mode="as-live"))
     assert est["slide"].position.tolist() == wanted["slide"].position.tolist()
 
 

@@ -6,7 +6,6 @@ import math
 import os
 import subprocess
 import sys
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from pumafuse.tuning import latency as module
 from pumafuse.tuning.arms import Arm, NoiseModel
 from pumafuse.tuning.latency import Latency
 from pumafuse.tuning.likelihood import Likelihood
+from tuning_runs import quietly
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 Array = NDArray[np.float64]
@@ -208,10 +208,8 @@ def test_an_encoder_that_rests_most_of_the_time_is_not_taken_for_exact() -> None
     position = step * np.rint(moved(time, command, stamp) / step)
     run = pf.Run.from_arrays(time, {"x": command}, {"encoder": (stamp, {"x": position})})
     found = pf.latency(run)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)  # of an sd at its bound
-        rough = structs.replace(found.config, sensors={"encoder": pf.Sensor(sd={"x": step}, gate=0.0)})
-        tuned = pf.tune(run, rough, fit=["noise", "delay", "plant"])
+    rough = structs.replace(found.config, sensors={"encoder": pf.Sensor(sd={"x": step}, gate=0.0)})
+    tuned = quietly(lambda: pf.tune(run, rough, fit=["noise", "delay", "plant"]))  # an sd is at its bound
     for config in (found.config, tuned.config):
         assert config.arm.lag_of("x") == pytest.approx(DELAY + TAU, abs=2e-3)
         assert config.sensors["encoder"].sd_of("x") == pytest.approx(step / math.sqrt(12.0), rel=0.5)
@@ -256,9 +254,7 @@ def test_what_tells_nothing_is_refused() -> None:
 def test_no_interval_ends_at_its_estimate() -> None:
     """Half a minute of a soft arm: models that are about as likely lag by milliseconds more than the chosen one."""
     run = replace(pf.Run.read(EXAMPLES / "trunk-servo" / "0g"), until=30.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        axes = pf.latency(run).details.axes
+    axes = quietly(lambda: pf.latency(run)).details.axes
     assert len(axes) == 6
     for name, one in axes.items():
         low, high = one.lag_ci95
