@@ -177,24 +177,12 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path, content: bytes | 
     assert str(path) in refusal(lambda: FusionConfig.load(path))
 
 
-@pytest.mark.parametrize(
-    ("key", "wrong"),
-    [
-        ("disturbance_sd", np.nan),
-        ("disturbance_time", 1e-120),
-        ("disturbance_kind", "Matern"),
-    ],
-)
-def test_process_noise_made_in_python_is_checked_like_a_file(key: str, wrong: float | str) -> None:
-    """A number out of range names its key, rather than make estimates that are no numbers."""
-    arm = ArmModel.load("puma560-internal")
-    with pytest.raises(ConfigError, match=rf"process\.radial\.{key}"):
-        FusionConfig(arm=arm, process={"radial": Process(**{key: wrong})})
-
-
 def test_a_configuration_made_in_python_is_checked_like_a_file() -> None:
-    """Axes that the arm has not, a name like a unit: refused without a file too."""
+    """Axes that the arm has not, a name like a unit, a number out of range: refused without a file too."""
     arm = ArmModel.load(PRESET)
+    for key, number in {"disturbance_sd": np.nan, "disturbance_time": 1e-120, "disturbance_kind": "Matern"}.items():
+        with pytest.raises(ConfigError, match=rf"process\.radial\.{key}"):
+            FusionConfig(arm=arm, process={"radial": Process(**{key: number})})
     for wrong in ({"process": {"yaw": Process()}}, {"sensors": {"tracker": Sensor(sd={"yaw": 1e-3})}}):
         with pytest.raises(UnknownNameError):
             FusionConfig(arm=arm, **wrong)
