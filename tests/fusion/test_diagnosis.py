@@ -246,9 +246,7 @@ def test_a_zero_that_all_sensors_contradict_is_the_commands() -> None:
 
 def test_a_sensor_that_moves_while_its_commands_rest_is_told() -> None:
     """A wrong column that is constant."""
-    log = "trunk-servo"
-    run, _ = logged(log)
-    axis = run.axes[0]
+    log, axis = "trunk-servo", logged("trunk-servo")[0].axes[0]
     (note, *_) = notes(
         of_commands(log, lambda one: replace(one, values={**one.values, axis: 0.0 * one.values[axis]})), log
     )
@@ -369,14 +367,13 @@ def test_what_is_odd_but_no_mistake_gives_no_alarm(
 
 def test_commands_that_are_missing_in_motion_are_told() -> None:
     """With their number, to a few that an end of a motion hides; those that change nothing may be left out."""
-    share = 0.05
     run, config = logged("scan1")
     stamps, drawn = run.command.stamp, np.random.default_rng(3).random(len(run.command.stamp))
     steps = np.any([np.diff(value, append=value[-1]) != 0.0 for value in run.command.values.values()], axis=0)
-    kept = run.command.rows(np.flatnonzero(drawn > share))
+    kept = run.command.rows(np.flatnonzero(drawn > 0.05))
     (note,) = clock_faults(replace(run, command=kept), config.arm.update_period, [])
-    told, moving = int(number_before(" of ", note)), int(np.count_nonzero(steps & (drawn <= share)))
-    assert 0.9 * moving < told <= np.count_nonzero(drawn <= share)
+    told, moving = int(number_before(" of ", note)), int(np.count_nonzero(steps & (drawn <= 0.05)))
+    assert 0.9 * moving < told <= np.count_nonzero(drawn <= 0.05)
     assert "are missing while the arm moves" in note
     changed = run.command.rows(np.flatnonzero(np.append(True, steps[:-1])))
     assert len(changed.stamp) < 0.99 * len(stamps)

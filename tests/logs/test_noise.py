@@ -33,24 +33,22 @@ noise = {}
 """
 
 
-def fused(measured: dict[str, tuple[np.ndarray, dict[str, np.ndarray]]], sd: dict[str, float], engine: str) -> object:
+def fused(measured: dict[str, tuple[np.ndarray, dict[str, np.ndarray]]], sd: dict[str, float]) -> object:
     """Position and its standard deviation."""
     config = pf.FusionConfig(arm=ARM, sensors={name: pf.Sensor(sd=one, gate=0.0) for name, one in sd.items()})
-    est = pf.fuse(pf.Run.from_arrays(GIVEN, COMMAND, measured), config, engine=engine)
+    est = pf.fuse(pf.Run.from_arrays(GIVEN, COMMAND, measured), config)
     return np.column_stack([est["x"].position, est["x"].position_sd])
 
 
 def test_rows_of_each_noise_are_a_sensor_of_their_own() -> None:
     """One sensor whose rows have three noises is three sensors of one noise each."""
-    engine = "compiled"
-    one = fused({"camera": (SEEN, {"x": MEASURED, "noise": FACTOR})}, {"camera": 2e-4}, engine)
+    one = fused({"camera": (SEEN, {"x": MEASURED, "noise": FACTOR})}, {"camera": 2e-4})
     parts = {f"camera{factor}": factor == FACTOR for factor in (0.5, 1.0, 3.0)}
     apart = fused(
         {name: (SEEN[rows], {"x": MEASURED[rows]}) for name, rows in parts.items()},
         {f"camera{factor}": 2e-4 * factor for factor in (0.5, 1.0, 3.0)},
-        engine,
     )
-    even = fused({"camera": (SEEN, {"x": MEASURED})}, {"camera": 2e-4}, engine)
+    even = fused({"camera": (SEEN, {"x": MEASURED})}, {"camera": 2e-4})
     assert one == pytest.approx(apart, rel=1e-9)
     assert even != pytest.approx(apart, rel=1e-2)
 

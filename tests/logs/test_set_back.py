@@ -105,11 +105,10 @@ def test_a_reference_may_have_a_clock_that_goes_on(rate: float, back: float, is_
 
 
 def test_one_sensor_alone_is_named_and_left() -> None:
-    back = 0.06
-    run = logged({8.0: back}, only="tracker")
+    run = logged({8.0: 0.06}, only="tracker")
     found, (note,) = going_on(run)
     assert found is run
-    assert note.startswith(f"tracker: its clock is set back by {back:.3f} s in row 796, and others are not")
+    assert note.startswith("tracker: its clock is set back by 0.060 s in row 796, and others are not")
 
 
 def test_commands_alone_are_not_all() -> None:

@@ -54,21 +54,19 @@ def test_too_few_measurements() -> None:
 
 def test_a_few_measurements_tell_the_lag_and_little_else() -> None:
     """A slow camera of a wide motion: fewer numbers are fitted, and it is said; the lag is right to 15 ms."""
-    count = 14
-    time = 0.02 * np.arange(20 * count)
-    stamp = 0.4 * np.arange(count) + 0.115
-    seen = 0.3 * np.sin(np.maximum(stamp - 0.11, 0.0)) + np.random.default_rng(count).normal(0.0, 1e-3, count)
+    time = 0.02 * np.arange(280)
+    stamp = 0.4 * np.arange(14) + 0.115
+    seen = 0.3 * np.sin(np.maximum(stamp - 0.11, 0.0)) + np.random.default_rng(14).normal(0.0, 1e-3, 14)
     run = pf.Run.from_arrays(time, {"x": 0.3 * np.sin(time)}, {"camera": (stamp, {"x": seen})})
     arm = pf.ArmModel(
         name="a", update_period=0.02, delay=0.03, axes={"x": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.03))}
     )
     config = pf.FusionConfig(arm=arm, sensors={"camera": pf.Sensor(sd=1e-3)})
     found = quietly(lambda: pf.tune(run, config, fit=["noise", "delay", "plant", "gain"]))
-    assert any(note.startswith(f"x: only {count} measurements: gain, disturbance") for note in found.details.notes)
+    assert any(note.startswith("x: only 14 measurements: gain, disturbance") for note in found.details.notes)
     assert found.config.arm.lag_of("x") == pytest.approx(0.1, abs=0.015)
     assert not any("gain" in key or "disturbance" in key for key in found.params)
-    if count * 2 < 3 * 12:
-        assert found.details.validation is None
+    assert found.details.validation is None
 
 
 @pytest.mark.long
