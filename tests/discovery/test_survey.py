@@ -2039,7 +2039,7 @@ def test_inputs_that_nothing_follows_are_no_commands_where_a_plan_is_followed(lo
 
 def test_a_clock_of_zeros_at_first_does_not_begin_anew(tmp_path: Path) -> None:
     """Rows that were made before the first message came are left out of what the refusal says."""
-    t, _, s, z = recorded()
+    _, _, s, z = recorded()
     rows = np.column_stack([s, z, np.random.default_rng(4).normal(size=len(s))])
     np.savetxt(tmp_path / "log.txt", np.vstack([np.zeros((3, 5)), rows + np.array([300.0, 0, 0, 0, 0])]))
     assert "begins anew" not in one_line(RunError, lambda: survey(tmp_path / "log.txt"))

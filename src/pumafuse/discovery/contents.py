@@ -995,11 +995,13 @@ def no_commands(parts: Iterable[Part]) -> str:
             of_axis = f'AXIS = ["MEASURED", "{error}"]'
             advice.append(f"{error} of {part.label} is an error: {ERROR}: {of_axis} under [command] in run.toml")
         advice += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]
-        stamped = np.flatnonzero(part.clock.stamp != NO_STAMP) if part.clock else np.empty(0, dtype=np.int64)
-        if part.clock and len(rows := falls_back(part.clock.stamp[stamped])):
+        stamp = part.clock.stamp if part.clock else np.empty(0, dtype=np.int64)
+        stamped = np.flatnonzero(stamp != NO_STAMP)
+        if len(rows := falls_back(stamp[stamped])):
             advice.append(
-                f"the clock of {part.label} begins anew in row {stamped[rows[0]] + 1}: if its rows are signals one below"
-                " another, add a column of words that say which signal a row is of, such as command_x and measured_x"
+                f"the clock of {part.label} begins anew in row {stamped[rows[0]] + 1}: if its rows are signals one"
+                " below another, add a column of words that say which signal a row is of, such as command_x and"
+                " measured_x"
             )
     return "".join(f"{printable(sentence, 300)}; " for sentence in advice) + ("or " if advice else "")
 
