@@ -9,6 +9,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -245,9 +246,15 @@ def test_score_and_information_are_those_of_generalised_least_squares() -> None:
     assert weight.score == pytest.approx(x @ np.linalg.solve(covariance, measured.value - led), rel=1e-5)
 
 
-def test_another_noise_gains_what_the_likelihood_says() -> None:
-    """Twice the sd, four times the process noise: the difference of the log-likelihoods of two fusions."""
+@pytest.mark.parametrize("rows", [[], [1.0, 3.0]])
+def test_another_noise_gains_what_the_likelihood_says(rows: list[float]) -> None:
+    """Twice the sd, four times the process noise: the difference of the log-likelihoods of two fusions.
+
+    Also where rows tell a noise of their own.
+    """
     run, known = recorded(), config(sd=0.5 * SD)
+    camera = run.sensors["camera"]
+    run = replace(run, sensors={"camera": replace(camera, noise=np.resize(rows, len(camera.stamp) * bool(rows)))})
     doubled = with_sensors(known, sd=SD)
     each = {axis: pf.Process(input_noise=0.2e-3, drift=1.2e-3) for axis in AXES}
     est = [pf.fuse(run, one) for one in (known, doubled, changed(known, process=each))]

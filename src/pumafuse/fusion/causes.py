@@ -142,8 +142,8 @@ Evidence: TypeAlias = Mapping[Tried, Weight]
 
 def evidence_of(est: Estimates, axis: str) -> Evidence:
     """What every alternative would gain on one axis."""
-    measured, number = est.measurements, est.measurements.axes.index(axis)
-    decided = (measured.axis == number) & (measured.outcome <= Outcome.REACQUIRED)
+    measured = est.measurements
+    decided = (measured.axis == measured.axes.index(axis)) & (measured.outcome <= Outcome.REACQUIRED)
     return together(
         _of_part(_part(est, segment, axis, measured.where(chosen)))
         for number, segment in enumerate(est.segments)
@@ -332,8 +332,8 @@ def _of_part(part: _Part) -> Evidence:
     moved = np.zeros((len(part.time), 1 + len(other) + len(shapes)))
     for column, (tried, x) in enumerate(shapes.items(), 1 + len(other)):
         moved[:, column] = moves[tried] * x
-    spread = np.ones_like(moved)
-    spread[:, 1 + len(other) - len(jitters) : 1 + len(other)] = np.column_stack(list(jitters.values()))
+    spread = np.repeat(part.measured.spread[:, None], moved.shape[1], axis=1)
+    spread[:, 1 + len(other) - len(jitters) : 1 + len(other)] *= np.column_stack(list(jitters.values()))
     models = [base, *(model for _, model in other), *(base for _ in shapes)]
     nu, sd, sensor = _filtered(part, models, moved, spread)
     normalised = nu / sd
@@ -444,7 +444,7 @@ def _jitters(part: _Part, base: Model) -> Iterator[tuple[Tried, FloatArray]]:
     """By what the noise of each component is scaled if the latency of a sensor scatters, (m,)."""
     moved = np.abs(part.scale * part.speed)
     for number in part.sensors:
-        noise = moved * (part.measured.sensor == number) / base.view["sd"][number, 0]
+        noise = moved * (part.measured.sensor == number) / (part.measured.spread * base.view["sd"][number, 0])
         for latency_sd in _JITTERS:
             yield Tried(Cause.JITTER, part.measured.sensors[number], latency_sd), np.hypot(1.0, latency_sd * noise)
 

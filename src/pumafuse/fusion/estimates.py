@@ -79,6 +79,7 @@ class Measurements:
         axis: Index into ``axes``.
         segment: As in :class:`Estimates`.
         value: As logged [m].
+        spread: By what its noise is scaled: as its row tells it, and by the lever of a marker or a frame.
         innovation: One step ahead [m], NaN where the filter did not use the component.
         innovation_sd: Predicted standard deviation of the innovation, √S [m].
         noise_scale: How many times as large as configured the arm's variances were (``adaptation``).
@@ -93,6 +94,7 @@ class Measurements:
     axis: IndexArray
     segment: IndexArray
     value: FloatArray
+    spread: FloatArray
     innovation: FloatArray
     innovation_sd: FloatArray
     noise_scale: FloatArray
@@ -102,7 +104,7 @@ class Measurements:
 
     ARRAYS = (
         *("time", "stamp", "sensor", "axis", "segment"),
-        *("value", "innovation", "innovation_sd", "noise_scale", "outcome"),
+        *("value", "spread", "innovation", "innovation_sd", "noise_scale", "outcome"),
     )
 
     def __repr__(self) -> str:

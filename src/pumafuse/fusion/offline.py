@@ -281,6 +281,7 @@ def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measu
         sensor, axis = events.source.take(row), (rows - row * len(first.axes)).astype(np.int16)
         del row, measured  # of a long run each array counts
         segment = np.full(len(rows), number, dtype=np.int16)
-        numbers = events.value, results.innovation, results.innovation_sd, results.noise_scale, results.outcome
+        spread = events.spread if len(events.spread) else np.ones_like(events.value)
+        numbers = events.value, spread, results.innovation, results.innovation_sd, results.noise_scale, results.outcome
         columns.append((time, stamp, sensor, axis, segment, *(part.take(rows) for part in numbers)))
     return Measurements(*map(_joined, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)
