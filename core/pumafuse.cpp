@@ -60,10 +60,10 @@ void pf_transition(const pf_axis* axis, double dt, double step[17]) {
 
 void pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int64_t* given, const double* command,
                  int64_t n, const int64_t* time, double* position) {
-    for (const auto& one : lifted<Axis, double>(axis, count, {})) {
-        respond(Arm<double>(one), one.start, std::llround(one.delay * 1e9), commands, given, command, n, time, position);
-        position += n;
-    }
+    by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
+        const Arm<double> arm(lifted<Axis, double>(axis + i, 1, {})[0]);
+        respond(arm, axis[i].start, delays, commands, given, command, n, time, position + i * n);
+    });
 }
 
 void pf_follow(const pf_axis* axis, pf_motion* motion, int64_t commands, const int64_t* given, const double* command,
@@ -87,8 +87,9 @@ void pf_weigh(const pf_noise* noise, int64_t n, const int64_t* time, const doubl
               const double* whitened, int64_t commands, const int64_t* given, const double* command, int64_t count,
               const pf_axis* axis, double* products) {
     const Whitening whitening(*noise, n, time, variance);
-    for (int64_t i = 0; i < count; ++i)
-        weigh(axis[i], whitening, commands, given, command, n, time, c, whitened, products + i * 2 * (2 + c));
+    by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
+        weigh(axis[i], delays, whitening, commands, given, command, n, time, c, whitened, products + i * 2 * (2 + c));
+    });
 }
 
 void pf_classify(const pf_model* model, const pf_events* events, int64_t origin, const uint8_t* too_late,

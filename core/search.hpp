@@ -1,7 +1,9 @@
 // The search for an arm: responses of many arms against what was measured, under the noise that the best of them leaves.
 #pragma once
+#include <cstring>
+
+#include "interface.hpp"
 #include "residual.hpp"
-#include "response.hpp"
 
 namespace pumafuse {
 
@@ -74,56 +76,76 @@ class Whitening {
     std::vector<Step> steps;
 };
 
-// Where an axis goes without noise, relative to its start level, at n instants; commands act `delay` ns after `given`.
-inline void respond(const Arm<double>& arm, double start, Time delay, Time commands, const Time* given,
-                    const double* command, Time n, const Time* time, double* position) {
+// Where an axis goes without noise, relative to its start level, at n instants, with each of some dead times [ns]: those
+// of one arm have its way through the commands in common. Each position follows from the last command. (delays, n).
+inline void respond(const Arm<double>& arm, double start, const std::vector<Time>& delays, Time commands,
+                    const Time* given, const double* command, Time n, const Time* time, double* position) {
     Response<double> response;
     response.start = start;
-    if (commands > 0 && n > 0) response.time.ns = std::min(given[0] + delay, time[0]);
-    for (Time k = 0, c = 0; k < n; ++k) {
-        for (; c < commands && given[c] + delay <= time[k]; ++c) {
-            response.predict(arm, {given[c] + delay, 0.0});
-            response.command(arm, command[c]);
+    if (commands > 0) response.time.ns = given[0];
+    std::vector<Time> next(delays.size(), 0);
+    for (Time c = 0; c <= commands; ++c) {
+        for (std::size_t j = 0; j < delays.size(); ++j)
+            for (Time& k = next[j]; k < n && (c == commands || time[k] - delays[j] < given[c]); ++k) {
+                Response<double> then = response;
+                if (c > 0) then.predict(arm, {time[k] - delays[j], 0.0});
+                position[j * n + k] = then.position(arm);
+            }
+        if (c == commands) break;
+        response.predict(arm, {given[c], 0.0});
+        response.command(arm, command[c]);
+    }
+}
+
+// Calls `work` with the first of each arms in a row that differ in their dead times alone, and with these [ns].
+inline void by_delays(Time count, const pf_axis* axis, auto work) {
+    const auto undelayed = [](pf_axis one) { return one.delay = 0.0, one; };
+    for (Time i = 0, end = 0; i < count; i = end) {
+        const pf_axis shape = undelayed(axis[i]);
+        std::vector<Time> delays;
+        for (; end < count; ++end) {
+            const pf_axis other = undelayed(axis[end]);
+            if (std::memcmp(&shape, &other, sizeof(shape)) != 0) break;
+            delays.push_back(std::llround(axis[end].delay * 1e9));
         }
-        response.predict(arm, {time[k], 0.0});
-        position[k] = response.position(arm);
+        work(i, delays);
     }
 }
 
 // The response at a gain of 1 and what each 1 of gain adds to it, whitened, times one another and times c columns that
-// are: products (2, 2 + c).
-inline void weigh(const pf_axis& axis, const Whitening& whitening, Time commands, const Time* given,
-                  const double* command, Time n, const Time* time, Time c, const double* whitened, double* products) {
-    thread_local std::vector<double> raw, plain, more;
-    raw.resize(n), plain.resize(n), more.resize(n);
-    const Time delay = std::llround(axis.delay * 1e9);
-    const auto of = [&](double intercept, std::vector<double>& found) {
-        Axis<double> one{};
-        std::copy_n(reinterpret_cast<const double*>(&axis), sizeof(axis) / sizeof(double),
-                    reinterpret_cast<double*>(&one));
-        one.intercept = intercept;
-        respond(Arm<double>(one), axis.start, delay, commands, given, command, n, time, raw.data());
-        whitening(raw.data(), found.data());
-    };
-    of(1.0, plain);
+// are, with each of some dead times: products (delays, 2, 2 + c).
+inline void weigh(const pf_axis& axis, const std::vector<Time>& delays, const Whitening& whitening, Time commands,
+                  const Time* given, const double* command, Time n, const Time* time, Time c, const double* whitened,
+                  double* products) {
     const bool straight = axis.max_speed == 0.0 && axis.play == 0.0 && axis.sag_offset == 0.0 &&
-                          axis.sag_slope == 0.0 && axis.sag_slope_beyond == 0.0 && axis.sag_slope_below == 0.0;
-    if (straight && axis.slope == 0.0 && axis.recovery == 0.0) more = plain;
-    else {
-        of(2.0, more);
-        for (Time k = 0; k < n; ++k) more[k] -= plain[k];
+                          axis.sag_slope == 0.0 && axis.sag_slope_beyond == 0.0 && axis.sag_slope_below == 0.0 &&
+                          axis.slope == 0.0 && axis.recovery == 0.0;
+    std::vector<double> raw[2], plain(n), more(n);
+    for (int i = 0; i < (straight ? 1 : 2); ++i) {
+        Axis<double> one = lifted<Axis, double>(&axis, 1, {})[0];
+        one.intercept = 1.0 + i;
+        raw[i].resize(delays.size() * n);
+        respond(Arm<double>(one), axis.start, delays, commands, given, command, n, time, raw[i].data());
     }
-    const double* columns[2] = {plain.data(), more.data()};
-    for (int i = 0; i < 2; ++i)
-        for (Time j = 0; j < 2 + c; ++j) {
-            const double* other = j < 2 ? columns[j] : whitened + (j - 2) * n;
-            double sum[4] = {};
-            Time k = 0;
-            for (; k + 4 <= n; k += 4)
-                for (int lane = 0; lane < 4; ++lane) sum[lane] += columns[i][k + lane] * other[k + lane];
-            for (; k < n; ++k) sum[0] += columns[i][k] * other[k];
-            products[i * (2 + c) + j] = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    for (std::size_t d = 0; d < delays.size(); ++d, products += 2 * (2 + c)) {
+        whitening(raw[0].data() + d * n, plain.data());
+        if (straight) more = plain;
+        else {
+            whitening(raw[1].data() + d * n, more.data());
+            for (Time k = 0; k < n; ++k) more[k] -= plain[k];
         }
+        const double* columns[2] = {plain.data(), more.data()};
+        for (int i = 0; i < 2; ++i)
+            for (Time j = 0; j < 2 + c; ++j) {
+                const double* other = j < 2 ? columns[j] : whitened + (j - 2) * n;
+                double sum[4] = {};
+                Time k = 0;
+                for (; k + 4 <= n; k += 4)
+                    for (int lane = 0; lane < 4; ++lane) sum[lane] += columns[i][k + lane] * other[k + lane];
+                for (; k < n; ++k) sum[0] += columns[i][k] * other[k];
+                products[i * (2 + c) + j] = (sum[0] + sum[1]) + (sum[2] + sum[3]);
+            }
+    }
 }
 
 }  // namespace pumafuse

@@ -225,12 +225,12 @@ class ArmSearch:
         late = delays(self._measured) if "delay" in free.free else np.array([start.delay])
         lags = LAGS if "lag" in free.free else np.array([start.lag])
         damping = 0.0 if 1 in free.orders else start.damping
-        arms = [start._replace(delay=d, lag=lag, damping=damping) for d, lag in product(late.tolist(), lags.tolist())]
+        arms = [start._replace(delay=d, lag=lag, damping=damping) for lag, d in product(lags.tolist(), late.tolist())]
         varied = "gain" in free.free
         if varied:
             arms = [free.shaped(arm, "static") for arm in arms]
         log, gain = self._measured.weighed(arms, self.noise, self.limits if varied else None)
-        table = log.reshape(len(late), len(lags))
+        table = log.reshape(len(lags), len(late))
         around = np.pad(table, 1, constant_values=-np.inf)
         highest = np.max([np.roll(around, shift, (0, 1)) for shift in product((-1, 0, 1), repeat=2)], axis=0)[
             1:-1, 1:-1

@@ -340,6 +340,8 @@ class Measured:
     ) -> tuple[FloatArray, FloatArray]:
         """The log-likelihood of each arm with its best gain, and that gain; for ``limits`` of None the gain is given.
 
+        Arms in a row that differ in their dead times alone take little longer than one of them.
+
         Returns:
             Both, (n,).
         """

@@ -139,8 +139,8 @@ class _Search:
         sizes = [sd * width for width in _WIDTHS] if kind == "play" else [fastest * share for share in _SPEEDS]
         if min(sizes) <= BENDS[kind][0]:
             return {}
-        shares = product((arm.delay * _SOONER).tolist(), (arm.lag * _SOONER[1:]).tolist(), sizes)
-        arms = [arm._replace(delay=delay, lag=lag, **{kind: size}) for delay, lag, size in shares]
+        shares = product((arm.lag * _SOONER[1:]).tolist(), sizes, (arm.delay * _SOONER).tolist())
+        arms = [arm._replace(delay=delay, lag=lag, **{kind: size}) for lag, size, delay in shares]
         log, _ = self.measured.weighed(arms, self._noise, self._limits)
         return {kind: getattr(arms[int(np.argmax(log))], kind)}
 

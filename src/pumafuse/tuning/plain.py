@@ -97,7 +97,7 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     if measured.count < 2 * _FEWEST or not any(np.ptp(recording.command) > 0.0 for recording in measured.recordings):
         return None
     late, noise = delays(measured).tolist(), measured.white(Arm(0.0, float(LAGS[0])))
-    arms = [Arm(delay, lag) for delay in late for lag in LAGS.tolist()]
+    arms = [Arm(delay, lag) for lag in LAGS.tolist() for delay in late]
     measured = measured.without_far_from(_fitted(measured, arms, noise, 1)[0], _OUTLIER)
     starts = _fitted(measured, arms, noise, _STARTS)
     noise = measured.white(starts[0])
