@@ -246,7 +246,7 @@ def test_derivatives_are_those_of_the_innovations(plant: PLANTS) -> None:
     for key in ("slope", "knee", "slope_beyond", "knee_below", "slope_below"):
         sags = (changed(LOWER, **{key: getattr(LOWER, key) + sign * 1e-6}) for sign in (-1, 1))
         beside.append((*(with_axis(sag=one) for one in sags), 2e-6))
-    _, d_nu, _ = linearised(segment, config, outcome, beside)
+    _, d_nu, _ = linearised(segment, config, outcome, [(high, 0.5 * width) for _, high, width in beside])
     fused = segment.measurement_rows.codes[:, 0] == pf.Outcome.FUSED
     for found, (low, high, width) in zip(d_nu[:, fused, 0], beside, strict=True):
         down, up = (innovations(segment, one, outcome).innovation[fused, 0] for one in (low, high))

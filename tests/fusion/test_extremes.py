@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from fusion.test_innovations import beside, numbers
+from fusion.test_innovations import near, numbers
 from fusion.test_oracle import MODES, MS, PAPER, Case, Seen, T, one, replace_, sensor
 from pumafuse.filter.core import FINEST
 from pumafuse.filter.outcome import Outcome
@@ -90,7 +90,7 @@ def check(run: Run, config: pf.FusionConfig, rate: float | None = None) -> dict[
         for name, value in known.items():
             assert value.tobytes() == again[name].tobytes(), (mode, name)
     segment = build(run, config)
-    outcome, each = innovations(segment, config).outcome, [beside(config, path) for path in numbers(config, "radial")]
+    outcome, each = innovations(segment, config).outcome, [near(config, path) for path in numbers(config, "radial")]
     assert all(np.isfinite(derivatives).all() for derivatives in linearised(segment, config, outcome, each)[1:])
     return found
 

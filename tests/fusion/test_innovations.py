@@ -143,6 +143,12 @@ def beside(config: FusionConfig, path: tuple[str, ...]) -> tuple[FusionConfig, F
     return with_number(config, path, at - step), with_number(config, path, at + step), 2.0 * step
 
 
+def near(config: FusionConfig, path: tuple[str, ...]) -> tuple[FusionConfig, float]:
+    """The configuration a little above a number, and by how much."""
+    _, high, width = beside(config, path)
+    return high, 0.5 * width
+
+
 def alike(found: FloatArray, wanted: FloatArray, path: tuple[str, ...]) -> None:
     """To a millionth of the largest."""
     assert np.abs(wanted).max() > 0.0, path
@@ -160,7 +166,7 @@ def test_derivatives_are_those_of_the_joint_gaussian(
     segment, paths = build(run, config), numbers(config, "radial")
     order = np.argsort(segment.events(config)[1])
     outcome = np.zeros_like(segment.measurement_rows.codes)
-    _, d_nu, d_s = linearised(segment, config, outcome, [beside(config, path) for path in paths])
+    _, d_nu, d_s = linearised(segment, config, outcome, [near(config, path) for path in paths])
     assert len(paths) > 20
     for path, by_nu, by_s in zip(paths, d_nu[:, order, 0], d_s[:, order, 0], strict=True):
         low, high, width = beside(config, path)
@@ -185,17 +191,17 @@ def test_derivatives_are_those_of_innovations_whose_outcomes_stay() -> None:
     }
     config = changed(config, arm=changed(config.arm, axes=axes), process=dict.fromkeys(axes, noise), sensors=sensors)
     paths = list(dict.fromkeys(path for axis in axes for path in numbers(config, axis)))
-    found, d_nu, d_s = linearised(segment, config, outcome, [beside(config, path) for path in paths])
+    found, d_nu, d_s = linearised(segment, config, outcome, [near(config, path) for path in paths])
     for path, by_nu, by_s in zip(paths, d_nu, d_s, strict=True):
         low, high, width = beside(config, path)
         down, up = (innovations(segment, one, outcome) for one in (low, high))
         alike(by_nu, (up.innovation - down.innovation) / width, path)
         alike(by_s, (up.innovation_sd**2 - down.innovation_sd**2) / width, path)
-        _, alone_nu, alone_s = linearised(segment, config, outcome, [beside(config, path)])
+        _, alone_nu, alone_s = linearised(segment, config, outcome, [near(config, path)])
         np.testing.assert_array_equal(alone_nu[0], by_nu)
         np.testing.assert_array_equal(alone_s[0], by_s)
     for count in (6, 7, 10, 11):
-        _, some_nu, some_s = linearised(segment, config, outcome, [beside(config, path) for path in paths[:count]])
+        _, some_nu, some_s = linearised(segment, config, outcome, [near(config, path) for path in paths[:count]])
         np.testing.assert_array_equal(some_nu, d_nu[:count])
         np.testing.assert_array_equal(some_s, d_s[:count])
     plain, *none = linearised(segment, config, outcome, [])

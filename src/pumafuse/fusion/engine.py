@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import NO_STAMP, CodeArray, FloatArray, TimeArray
-from ..filter.core import Filter, Model, linearise
+from ..filter.core import Filter, Model, Record, linearise
 from ..filter.events import Events, Results
 from ..filter.outcome import Outcome
 from .config import FusionConfig
@@ -90,30 +90,28 @@ def linearised(
     segment: Segment,
     config: FusionConfig,
     outcome: CodeArray,
-    beside: Sequence[tuple[FusionConfig, FusionConfig, float]],
+    beside: Sequence[tuple[FusionConfig, float]],
 ) -> tuple[Results, FloatArray, FloatArray]:
     """The same, with derivatives of ν and of S by k parameters, (k, m, A) each.
 
-    ``beside`` has, for each, the configuration a little below and above, and how far these are apart.
+    ``beside`` has, for each, a configuration with another value of it, and by how much that is more: the numbers of a
+    model are linear in it.
     """
     events, index = segment.events(config)
     results = _undecided(events)
     results.outcome[index] = outcome
-    model = _certain(model_of(segment, config))
-    tangents = [_slope(segment, *each) for each in beside]
+    model, *others = (_certain(model_of(segment, each)) for each in (config, *(other for other, _ in beside)))
+    slopes = [_slopes(*parts, widths=[width for _, width in beside]) for parts in zip(model, *others, strict=True)]
+    tangents = [Model(*parts) for parts in zip(*slopes, strict=True)]
     d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
     return results.rows(index), d_nu[:, index], d_s[:, index]
 
 
-def _slope(segment: Segment, low: FusionConfig, high: FusionConfig, width: float) -> Model:
-    """How every number of a model changes from one configuration to another, ``width`` of a parameter apart."""
-
-    def of(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        change = (b.view(np.float64) - a.view(np.float64)) / width
-        return np.nan_to_num(change).view(a.dtype)  # NaN where there is none: no level, no sd
-
-    ends = [_certain(model_of(segment, end)) for end in (low, high)]
-    return Model(*(of(a, b) for a, b in zip(*ends, strict=True)))
+def _slopes(records: Record, *others: Record, widths: Sequence[float]) -> Record:
+    """How every number of some records changes to each of ``others``, ``widths`` of a parameter apart, (k, …)."""
+    numbers = np.stack([records, *others]).view(np.float64)
+    change = (numbers[1:] - numbers[0]) / np.reshape(widths, (-1, *[1] * records.ndim))
+    return np.nan_to_num(change).view(records.dtype)  # NaN where there is none: no level, no sd
 
 
 def model_of(segment: Segment, config: FusionConfig) -> Model:

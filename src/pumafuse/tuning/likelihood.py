@@ -39,8 +39,7 @@ from ..model.arm import ArmModel
 from .arms import Measured, Recording
 from .parameters import Parameter
 
-_LOG_STEP = 1e-4  # of a logarithm: the truncation error is a sixth of its square, the rounding error 1e-11
-_STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
+_STEP = 1e-4  # of a coordinate
 _PIECES = 20  # of a run, that a model which is right has independent scores in
 _COUNTED = 0.98  # of the innovations
 _MOST, _STRETCHES = 80_000, 8  # components of all axes that are enough for a fit; of longer runs, in so many stretches
@@ -315,10 +314,10 @@ class Likelihood:
             numbers = [
                 number for number, parameter in enumerate(parameters) if parameter.axis in (None, self.axes[part.axis])
             ]
-            beside = list[tuple[FusionConfig, FusionConfig, float]]()
+            beside = list[tuple[FusionConfig, float]]()
             for parameter in (parameters[number] for number in numbers):
-                at, step = parameter.at(config), _LOG_STEP if parameter.log else _STEP
-                beside.append((parameter.move(config, at - step), parameter.move(config, at + step), 2.0 * step))
+                other = parameter.move(config, parameter.at(config) + _STEP)
+                beside.append((other, math.expm1(_STEP) if parameter.log else _STEP))
             filtered, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
             fused, sd = outcome != int(Outcome.REJECTED), filtered.innovation_sd[:, 0]
             r, d_nu, d_s = filtered.innovation[:, 0] / sd, d_nu[:, :, 0] * (fused / sd), d_s[:, :, 0] / sd**2
