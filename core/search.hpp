@@ -83,18 +83,27 @@ inline void respond(const Arm<double>& arm, double start, const std::vector<Time
     Response<double> response;
     response.start = start;
     if (commands > 0) response.time.ns = given[0];
+    constexpr Time NEVER = std::numeric_limits<Time>::max();
     std::vector<Time> next(delays.size(), 0);
-    for (Time c = 0; c <= commands; ++c) {
-        for (std::size_t j = 0; j < delays.size(); ++j)
-            for (Time& k = next[j]; k < n && (c == commands || time[k] - delays[j] < given[c]); ++k) {
+    Time due = -NEVER;  // the first instant of a position that is still asked for
+    const auto ask = [&](Time until, bool commanded) {
+        due = NEVER;
+        for (std::size_t j = 0; j < delays.size(); ++j) {
+            Time& k = next[j];
+            for (; k < n && time[k] - delays[j] < until; ++k) {
                 Response<double> then = response;
-                if (c > 0) then.predict(arm, {time[k] - delays[j], 0.0});
+                if (commanded) then.predict(arm, {time[k] - delays[j], 0.0});
                 position[j * n + k] = then.position(arm);
             }
-        if (c == commands) break;
+            if (k < n) due = std::min(due, time[k] - delays[j]);
+        }
+    };
+    for (Time c = 0; c < commands; ++c) {
+        if (due < given[c]) ask(given[c], c > 0);
         response.predict(arm, {given[c], 0.0});
         response.command(arm, command[c]);
     }
+    ask(NEVER, commands > 0);
 }
 
 // Calls `work` with the first of each arms in a row that differ in their dead times alone, and with these [ns].
