@@ -109,7 +109,7 @@ def linearised(
 
 def _slopes(records: Record, *others: Record, widths: Sequence[float]) -> Record:
     """How every number of some records changes to each of ``others``, ``widths`` of a parameter apart, (k, …)."""
-    numbers = np.stack([records, *others]).view(np.float64)
+    numbers = np.stack([each.view(np.float64) for each in (records, *others)])
     change = (numbers[1:] - numbers[0]) / np.reshape(widths, (-1, *[1] * records.ndim))
     return np.nan_to_num(change).view(records.dtype)  # NaN where there is none: no level, no sd
 
