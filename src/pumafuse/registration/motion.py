@@ -106,14 +106,15 @@ class Answer:
         where = self._through(self._position, position)
         if not self.turns:
             return Poses(where, np.broadcast_to(np.eye(3), (len(where), 3, 3)))
-        return Poses(where, self._turned(rotation).as_matrix())
+        return Poses(where, self._turned(rotation).as_matrix() @ self._reference.as_matrix())
 
     def quaternions(self, rotation: Plant) -> FloatArray:
         """The orientations under a plant, as x, y, z, w, (n, 4); only where they are commanded."""
-        return self._turned(rotation).as_quat()
+        return (self._turned(rotation) * self._reference).as_quat()
 
     def _turned(self, rotation: Plant) -> Rotation:
-        return Rotation.from_rotvec(self._through(self._angle, rotation)) * self._reference
+        """From the mean of the orientations."""
+        return Rotation.from_rotvec(self._through(self._angle, rotation))
 
     def slopes(self, position: Plant, rotation: Plant, here: Poses) -> tuple[list[FloatArray], list[FloatArray]]:
         """How position and orientation [rad along the base's axes] change with dead time [s] and log τ, (n, 3) each."""
