@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -80,8 +81,8 @@ class SensorGuess:
     pair: Pair | None
 
 
-def guess(survey: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
-    """The arm, and each sensor."""
+def guess(survey: Survey, known: Mapping[str, float] = MappingProxyType({})) -> tuple[ArmGuess, dict[str, SensorGuess]]:
+    """The arm, and each sensor; latencies [s] that are ``known`` are not looked for."""
     run = survey.run
     period = period_of(run.command)
     if math.isnan(period):
@@ -91,7 +92,7 @@ def guess(survey: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
         for (name, axis), relation in survey.relations.items()
         if abs(relation.correlation) >= FOLLOWS and name not in survey.own_frames
     }
-    first, latencies, pairs = _against_each_other(survey.run, relations)
+    first, latencies, pairs = _against_each_other(survey.run, relations, known)
     leads: dict[str, dict[str, Following]] = {axis: {} for axis in run.axes}
     late: dict[str, list[float]] = {}
     for (name, axis), relation in relations.items():
@@ -110,7 +111,7 @@ def guess(survey: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
 
 
 def _against_each_other(
-    run: Run, relations: Mapping[tuple[str, str], Following]
+    run: Run, relations: Mapping[tuple[str, str], Following], known: Mapping[str, float]
 ) -> tuple[str, dict[str, float], dict[str, Pair]]:
     """The earliest source, or the reference; how much later each is [s]; each beside the densest."""
     lags: dict[str, list[float]] = {}
@@ -120,8 +121,9 @@ def _against_each_other(
         return "", {}, {}
     base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
     others = [name for name in lags if name != base]
-    pairs = {name: Pair(base, alignment) for name in others if (alignment := aligned([run], base, name)) is not None}
-    later = {base: 0.0}
+    later = {name: known[name] - known.get(base, 0.0) for name in others if name in known} | {base: 0.0}
+    unknown = [name for name in others if name not in later]
+    pairs = {name: Pair(base, alignment) for name in unknown if (alignment := aligned([run], base, name)) is not None}
     for name, (_, alignment) in pairs.items():
         # One that seems earlier than the densest one, but not surely, would make the time of all wrong by that.
         if not -_SURELY * alignment.half < alignment.latency < 0.0:
@@ -129,7 +131,7 @@ def _against_each_other(
     first = base if base == REFERENCE else min(later, key=later.__getitem__)
     ahead = float(np.median(lags[first]))
     ahead = ahead if ahead < -AHEAD else 0.0
-    latencies = {name: ahead + max(later.get(name, 0.0) - later[first], 0.0) for name in (base, *pairs)}
+    latencies = {name: ahead + max(later.get(name, 0.0) - later[first], 0.0) for name in later | pairs}
     return first, latencies, pairs
 
 
