@@ -132,6 +132,11 @@ struct Arm {
         if (linear) d = free(d, plant.over(dt), dt);
         else in_pieces(d, slack, dt);
     }
+    // Over a dt that will not come again, as that of a measurement: to remember it takes longer than to compute it.
+    void move_once(Drive<Real>& d, Real& slack, const Real& dt) const {
+        if (linear) d = free(d, plant.computed(dt), dt);
+        else in_pieces(d, slack, dt);
+    }
 
   private:
     static constexpr double STILL = 1e-12;      // m; what moves by less is at rest: a thousandth of PF_FINEST

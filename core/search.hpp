@@ -92,7 +92,8 @@ inline void respond(const Arm<double>& arm, double start, const std::vector<Time
             Time& k = next[j];
             for (; k < n && time[k] - delays[j] < until; ++k) {
                 Response<double> then = response;
-                if (commanded) then.predict(arm, {time[k] - delays[j], 0.0});
+                const Instant<double> at{time[k] - delays[j], 0.0};
+                if (commanded) arm.move_once(then.drive, then.slack, seconds(then.time, at));
                 position[j * n + k] = then.position(arm);
             }
             if (k < n) due = std::min(due, time[k] - delays[j]);
