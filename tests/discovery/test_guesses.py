@@ -142,6 +142,15 @@ def test_a_camera_whose_latency_steps_tells_nothing_of_the_arms_lag(tmp_path: Pa
         assert sensors["camera"].latency == pytest.approx(latency, abs=2e-3)
 
 
+def test_latencies_that_are_known_are_not_looked_for(tmp_path: Path) -> None:
+    """That of a camera beside an encoder, which is otherwise compared with it."""
+    t, u, z = swings(1800)
+    found = survey(mount(tmp_path / "mount", t, command=(u, 1), encoder=(z, 1), camera=(z, 3)))
+    camera = guess(found, {"encoder": 0.002, "camera": 0.05})[1]["camera"]
+    assert camera.latency == pytest.approx(0.048, abs=1e-12)
+    assert camera.pair is None
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_chance_makes_no_sensor_the_earliest(seed: int, tmp_path: Path) -> None:
     """A camera of a sixth of the rows and ten times the noise: the time of all is the encoder's, not the camera's."""

@@ -68,6 +68,17 @@ def test_what_bends_an_axis_is_part_of_its_response(arm: Arm) -> None:
     assert np.abs(measured.residuals(bent)[0]).max() < 1e-12
 
 
+@pytest.mark.parametrize("arm", [*ARMS, ARMS[1]._replace(max_speed=0.4, play=0.01)])
+def test_arms_weigh_as_much_among_others_as_alone(arm: Arm) -> None:
+    """Whether those before and after differ in their dead times alone, or in more."""
+    others = [arm._replace(delay=delay) for delay in (0.3, 0.0, 0.01234, 0.3)] + [arm._replace(lag=0.07), arm]
+    measured = Measured([recording(3), recording(4, 0), recording(5, 40)], T, ["a"])
+    log, gain = measured.weighed(others, RESTS[3], FREE)
+    alone = [measured.weighed([one], RESTS[3], FREE) for one in others]
+    np.testing.assert_array_equal(log, np.concatenate([one for one, _ in alone]))
+    np.testing.assert_array_equal(gain, np.concatenate([one for _, one in alone]))
+
+
 @pytest.mark.parametrize(("arm", "rest"), list(zip(ARMS, RESTS, strict=True)))
 def test_the_likelihood_of_an_arm_is_the_joint_gaussians(arm: Arm, rest: NoiseModel) -> None:
     """Of what the arm leaves, in two recordings that rest at two levels before their first command."""
