@@ -58,11 +58,13 @@ void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     std::copy_n(found, 17, step);
 }
 
-void pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int64_t* given, const double* command,
-                 int64_t n, const int64_t* time, double* position) {
-    by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
-        const Arm<double> arm(lifted<Axis, double>(axis + i, 1, {})[0]);
-        respond(arm, axis[i].start, delays, commands, given, command, n, time, position + i * n);
+int pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int64_t* given, const double* command,
+                int64_t n, const int64_t* time, double* position) {
+    return attempt([&] {
+        by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
+            const Arm<double> arm(lifted<Axis, double>(axis + i, 1, {})[0]);
+            respond(arm, axis[i].start, delays, commands, given, command, n, time, position + i * n);
+        });
     });
 }
 
@@ -76,33 +78,40 @@ void pf_follow(const pf_axis* axis, pf_motion* motion, int64_t commands, const i
     *motion = {response.time.ns, u, response.step, e, x, rate, response.slack};
 }
 
-void pf_whiten(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,
-               const double* columns, double* whitened, double* log_determinant) {
-    const Whitening whitening(*noise, n, time, variance);
-    for (int64_t j = 0; j < c; ++j) whitening(columns + j * n, whitened + j * n);
-    *log_determinant = whitening.log_determinant;
-}
-
-void pf_weigh(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,
-              const double* whitened, int64_t commands, const int64_t* given, const double* command, int64_t count,
-              const pf_axis* axis, double* products) {
-    const Whitening whitening(*noise, n, time, variance);
-    by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
-        weigh(axis[i], delays, whitening, commands, given, command, n, time, c, whitened, products + i * 2 * (2 + c));
+int pf_whiten(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,
+              const double* columns, double* whitened, double* log_determinant) {
+    return attempt([&] {
+        const Whitening whitening(*noise, n, time, variance);
+        for (int64_t j = 0; j < c; ++j) whitening(columns + j * n, whitened + j * n);
+        *log_determinant = whitening.log_determinant;
     });
 }
 
-void pf_classify(const pf_model* model, const pf_events* events, int64_t origin, const uint8_t* too_late,
-                 uint8_t* known) {
-    const Table rows{*events, nullptr, model->axes};
-    const Policy policy{model_of<double>(*model), origin};
-    for (Time row = 0; row < events->count; ++row) {
-        const bool again = events->source[row] != PF_COMMAND && repeats_earlier(rows, row, 0, int(model->axes));
-        const Code whole = again ? PF_DUPLICATE : too_late[row] ? PF_TOO_LATE : PF_FUSED;
-        for (int a = 0; a < model->axes; ++a)
-            known[row * model->axes + a] =
-                policy.classify(rows, row, a, 0, events->count, whole, model->axis[a].start);
-    }
+int pf_weigh(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,
+             const double* whitened, int64_t commands, const int64_t* given, const double* command, int64_t count,
+             const pf_axis* axis, double* products) {
+    return attempt([&] {
+        const Whitening whitening(*noise, n, time, variance);
+        by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
+            weigh(axis[i], delays, whitening, commands, given, command, n, time, c, whitened,
+                  products + i * 2 * (2 + c));
+        });
+    });
+}
+
+int pf_classify(const pf_model* model, const pf_events* events, int64_t origin, const uint8_t* too_late,
+                uint8_t* known) {
+    return attempt([&] {
+        const Table rows{*events, nullptr, model->axes};
+        const Policy policy{model_of<double>(*model), origin};
+        for (Time row = 0; row < events->count; ++row) {
+            const bool again = events->source[row] != PF_COMMAND && repeats_earlier(rows, row, 0, int(model->axes));
+            const Code whole = again ? PF_DUPLICATE : too_late[row] ? PF_TOO_LATE : PF_FUSED;
+            for (int a = 0; a < model->axes; ++a)
+                known[row * model->axes + a] =
+                    policy.classify(rows, row, a, 0, events->count, whole, model->axis[a].start);
+        }
+    });
 }
 
 pf_filter* pf_filter_new(const pf_model* model, int64_t origin) {

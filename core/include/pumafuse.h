@@ -118,9 +118,9 @@ PF_API const char *pf_error(void); /* of the last call of this thread that faile
  * Q of a smooth disturbance of variance 1. */
 PF_API void pf_transition(const pf_axis *axis, double dt, double step[17]);
 /* Where each of `count` arms goes without noise, relative to its start level [m], at n instants, ascending; commands [m]
- * are given at their instants, ascending. position (count, n). */
-PF_API void pf_response(int64_t count, const pf_axis *axis, int64_t commands, const int64_t *given,
-                        const double *command, int64_t n, const int64_t *time, double *position);
+ * are given at their instants, ascending. position (count, n). Returns 0; -1 without memory, as the next ones do. */
+PF_API int pf_response(int64_t count, const pf_axis *axis, int64_t commands, const int64_t *given,
+                       const double *command, int64_t n, const int64_t *time, double *position);
 
 /* What an axis without noise does just after a command, relative to its start level: when it acts [ns], the command in
  * force and the step that it was [m], the gain error [m], position [m] and rate [m/s] of the drive, and what the tool is
@@ -144,16 +144,16 @@ typedef struct {
 
 /* c columns (c, n) of what was measured at n instants, ascending, with white noise of `variance` (n,) [m^2], infinite
  * where none was: their innovations over standard deviations, and the sum of log S. */
-PF_API void pf_whiten(const pf_noise *noise, int64_t n, const int64_t *time, const double *variance, int64_t c,
-                      const double *columns, double *whitened, double *log_determinant);
-/* How `count` arms fit c columns that are whitened: the response to a gain of 1 and what 1 of gain adds to it, both
- * whitened, times these two and times the columns. products (count, 2, 2 + c). */
-PF_API void pf_weigh(const pf_noise *noise, int64_t n, const int64_t *time, const double *variance, int64_t c,
-                     const double *whitened, int64_t commands, const int64_t *given, const double *command,
-                     int64_t count, const pf_axis *axis, double *products);
+PF_API int pf_whiten(const pf_noise *noise, int64_t n, const int64_t *time, const double *variance, int64_t c,
+                     const double *columns, double *whitened, double *log_determinant);
+/* How `count` arms fit c columns that are whitened: the scalar products of two whitened responses, that to a gain of 1
+ * and what 1 of gain adds to it, with each other and with the columns. products (count, 2, 2 + c). */
+PF_API int pf_weigh(const pf_noise *noise, int64_t n, const int64_t *time, const double *variance, int64_t c,
+                    const double *whitened, int64_t commands, const int64_t *given, const double *command,
+                    int64_t count, const pf_axis *axis, double *products);
 /* What each value is before the filter sees it, into known (n, A); too_late (n,): rows far behind earlier ones. */
-PF_API void pf_classify(const pf_model *model, const pf_events *events, int64_t origin, const uint8_t *too_late,
-                        uint8_t *known);
+PF_API int pf_classify(const pf_model *model, const pf_events *events, int64_t origin, const uint8_t *too_late,
+                       uint8_t *known);
 
 /* A filter over recorded events; its state goes on from call to call. It begins at rest at the instant `origin`. */
 typedef struct pf_filter pf_filter;

@@ -1,8 +1,8 @@
 """Conversion of units: names carry the unit, Python carries SI.
 
-Every number in a file, a column or on a screen has its unit as the ending of its name (``latency_ms``, ``x_mm``). All
-units but degrees are powers of ten of an SI unit, so conversion moves the decimal point of the shortest decimal form of
-the number: 60.45 ms is exactly the float 0.06045 s, and comes back as 60.45. So does an angle given in degrees.
+Every number in a file, a column or on a screen has its unit as the ending of its name (``latency_ms``, ``x_mm``). A
+number is converted in its shortest decimal form: 60.45 ms is exactly the float 0.06045 s, and comes back as 60.45. So
+does an angle given in degrees.
 
 An axis is a length (m inside) or an angle (rad inside). Names in the code are those of lengths (``sd_mm``); files and
 screens have those of the axis's kind (``sd_deg``): :func:`of_kind`.

@@ -77,7 +77,7 @@ def run(
     if listen and not set(LISTENERS) & set(kinds):
         raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {addresses[0]}")
     if len(sources) > 1 and (lonely := {"stdin", "replay"} & set(kinds)):
-        raise ConfigError(f"{lonely.pop()}: is a source alone; several may be of the network")
+        raise ConfigError(f"{lonely.pop()}: cannot go with other sources; only those of the network can")
     if kinds.count("ros2") > 1:
         raise ConfigError("ros2: one node is enough; one run.toml may name all topics")
     recorded = without_strays(Run.read(alone.path)) if alone.kind == "replay" else None
@@ -136,7 +136,7 @@ def run(
         feeder = _Feeder(stream, summaries, speed, recorder, views, screen)
         if remote is not None:
             if left := _listen(remote, feeder, signals):
-                notify(f"{left} lines had come and were not taken in any more: the end was asked for")
+                notify(f"{left} events had come and are left out: the end was asked for")
         else:
             for items in standard_input() if recorded is None else replayed(recorded, configured, alone.speed):
                 feeder.take(items)

@@ -42,7 +42,7 @@ def progress_bar(what: str, total: float = 1.0) -> Generator[Callable[[float], N
 def _not_told_of_ctrl_c() -> Generator[None]:
     """Processes that are started here block Ctrl-C, which would end them with a traceback each.
 
-    They end with this one, which takes notice afterwards of what came meanwhile.
+    They end with this process, which handles afterwards any Ctrl-C that came meanwhile.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
@@ -98,7 +98,7 @@ def run_jobs(
 
 
 def _unsaid(_: threading.ExceptHookArgs) -> None:
-    """Of a thread of joblib's that is ended as it starts."""
+    """Print nothing of a thread of joblib that ends while it starts."""
 
 
 def report_failures(failed: Mapping[str, str], count: int, where: Path) -> None:

@@ -81,8 +81,10 @@ class SensorGuess:
     pair: Pair | None
 
 
-def guess(survey: Survey, known: Mapping[str, float] = MappingProxyType({})) -> tuple[ArmGuess, dict[str, SensorGuess]]:
-    """The arm, and each sensor; latencies [s] that are ``known`` are not looked for."""
+def guess(
+    survey: Survey, registered: Mapping[str, float] = MappingProxyType({})
+) -> tuple[ArmGuess, dict[str, SensorGuess]]:
+    """The arm, and each sensor; latencies [s] that a registration found are not looked for."""
     run = survey.run
     period = period_of(run.command)
     if math.isnan(period):
@@ -92,7 +94,7 @@ def guess(survey: Survey, known: Mapping[str, float] = MappingProxyType({})) -> 
         for (name, axis), relation in survey.relations.items()
         if abs(relation.correlation) >= FOLLOWS and name not in survey.own_frames
     }
-    first, latencies, pairs = _against_each_other(survey.run, relations, known)
+    first, latencies, pairs = _against_each_other(survey.run, relations, registered)
     leads: dict[str, dict[str, Following]] = {axis: {} for axis in run.axes}
     late: dict[str, list[float]] = {}
     for (name, axis), relation in relations.items():
@@ -111,7 +113,7 @@ def guess(survey: Survey, known: Mapping[str, float] = MappingProxyType({})) -> 
 
 
 def _against_each_other(
-    run: Run, relations: Mapping[tuple[str, str], Following], known: Mapping[str, float]
+    run: Run, relations: Mapping[tuple[str, str], Following], registered: Mapping[str, float]
 ) -> tuple[str, dict[str, float], dict[str, Pair]]:
     """The earliest source, or the reference; how much later each is [s]; each beside the densest."""
     lags: dict[str, list[float]] = {}
@@ -121,9 +123,9 @@ def _against_each_other(
         return "", {}, {}
     base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
     others = [name for name in lags if name != base]
-    later = {name: known[name] - known.get(base, 0.0) for name in others if name in known} | {base: 0.0}
-    unknown = [name for name in others if name not in later]
-    pairs = {name: Pair(base, alignment) for name in unknown if (alignment := aligned([run], base, name)) is not None}
+    later = {name: registered[name] - registered.get(base, 0.0) for name in others if name in registered} | {base: 0.0}
+    unaligned = [name for name in others if name not in later]
+    pairs = {name: Pair(base, alignment) for name in unaligned if (alignment := aligned([run], base, name)) is not None}
     for name, (_, alignment) in pairs.items():
         # One that seems earlier than the densest one, but not surely, would make the time of all wrong by that.
         if not -_SURELY * alignment.half < alignment.latency < 0.0:

@@ -96,7 +96,7 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
             elif relation.lag > MOST_LAG:
                 most = " or more" if relation.lag >= LATEST else ""
                 late = f"{relation.lag * MS:.0f} ms{most} late"
-                yield f"{name} is {late} on {axis}, as hardly an arm is: is its clock another one?"
+                yield f"{name} is {late} on {axis}; arms are rarely that late: is its clock another one?"
             if not _moves_as_far(run, name, axis, relation):
                 unit = (
                     "is its unit right" if not 1.0 / _OTHER_UNIT < size < _OTHER_UNIT else "is that its gear, or a unit"

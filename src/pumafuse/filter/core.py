@@ -78,11 +78,11 @@ _MODES = "filtered", "repeated", "as-live", "smoothed"
 _KINDS = {"p": _POINTER, "n": _INT64, "d": ctypes.c_double, "i": ctypes.c_int, "u": ctypes.c_uint64}
 _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double, int, uint64; v: nothing
     "transition": "vpdp",
-    "response": "vnpnppnpp",
+    "response": "inpnppnpp",
     "follow": "vppnppnpp",
-    "whiten": "vpnppnppp",
-    "weigh": "vpnppnpnppnpp",
-    "classify": "vppnpp",
+    "whiten": "ipnppnppp",
+    "weigh": "ipnppnpnppnpp",
+    "classify": "ippnpp",
     "constant_velocity": "vnppnppp",
     "filter_new": "ppn",
     "filter_free": "vp",
@@ -233,7 +233,7 @@ def classify(model: Model, events: Events, origin: int, too_late: BoolArray) -> 
     """
     codes = np.empty_like(events.codes)
     structs = ctypes.byref(struct_of(model)), ctypes.byref(_events_of(events))
-    library.pf_classify(*structs, origin, at(too_late), at(codes))
+    checked(library.pf_classify(*structs, origin, at(too_late), at(codes)))
     return codes
 
 

@@ -28,7 +28,7 @@ class Events(NamedTuple):
         stamp: As logged, int64 ns, (n,).
         value: [m] as logged, (n, A).
         spread: By what the noise of a value is scaled, (n, A); (0, A) where by nothing.
-        known: What each value is before the filter sees it: ``FUSED`` where the filter decides, ``ABSENT`` where the
+        codes: What each value is before the filter sees it: ``FUSED`` where the filter decides, ``ABSENT`` where the
             row gives none, else why it is not used, (n, A).
         arrival: When it came, int64 ns, (n,); (0,) where at its stamp.
     """

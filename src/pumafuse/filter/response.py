@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import ALWAYS, FloatArray, TimeArray
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
-from .core import AXIS, MOTION, Record, at, library
+from .core import AXIS, MOTION, Record, at, checked, library
 
 
 def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Record:
@@ -39,7 +39,8 @@ def response(
     position = np.empty(len(time))
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
     record = record_of(axis, period, delay, start)
-    library.pf_response(1, at(record), len(told_at), at(told_at), at(command), len(time), at(time), at(position))
+    commands, asked = (len(told_at), at(told_at), at(command)), (len(time), at(time), at(position))
+    checked(library.pf_response(1, at(record), *commands, *asked))
     return position
 
 

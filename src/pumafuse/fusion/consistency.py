@@ -27,7 +27,9 @@ LAGS = 20
 _FEW = 30  # fewer components get no verdict
 _COLOURED = 0.01  # p-value below which innovations are not white
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
-_STRAYS = 1.5  # times its sd, by which an estimate is away from the response: if that is the sensor, 81 % are in 95
+# How far an estimate is from the response, in its sds, from which it strays: where that distance is noise of the sensor
+# alone, 95 % error bars hold 81 % of the errors.
+_STRAYS = 1.5
 MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
 
 

@@ -181,8 +181,8 @@ class Segment:
     def end(self, config: FusionConfig, as_live: bool) -> int:
         """Where an even grid of estimates ends, int ns: with the last command or measurement.
 
-        That is when it is valid, and for a stream, which knows no more of now, how it is stamped. Measurements an hour
-        after the last command are on another clock.
+        A measurement counts by when it is valid; as live by its stamp, since a stream knows the time by stamps alone.
+        Measurements an hour after the last command are on another clock.
         """
         rows = self.measurement_rows
         time = rows.stamp if as_live else _valid(rows.stamp, self._latency(config)[rows.source])
@@ -426,7 +426,7 @@ def _measurement_rows(
     span: tuple[int, int],
     notes: list[str],
 ) -> tuple[Events, dict[str, int]]:
-    """The rows of one of the sensors ``names`` by stamp, each value classified, and how many of its own are what."""
+    """The rows of one of the sensors ``names`` by stamp, each value classified; how many rows have which outcome."""
     name = names[number]
     source, sensor = run.sensors[name], config.sensors.get(name)
     label, used = source.label_for(name), run.within(source.stamp, origin)

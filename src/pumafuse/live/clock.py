@@ -24,8 +24,9 @@ Time: TypeAlias = float | int  # float seconds, or int nanoseconds
 LEAST_NS = 1_000_000_000  # a window is no shorter: the stamps of several senders differ, and commands may pause
 RESET_AFTER = 3  # commands in a row that have another time: the clock was reset
 
-_COMMANDS = 3  # in a row that are set back, with a sensor that is, too, until all clocks are …
-_ALONE = 8  # … and where no sensor measures
+# So many commands in a row behind the newest show that all clocks were set back: where a sensor steps back, too, and
+# where no sensor measures.
+_COMMANDS, _ALONE = 3, 8
 _ROWS = 5  # of a sensor in a row that are set back, until its clock is
 _LEAST, _MOST = 0.5, 1.5  # of the usual interval, within which a row goes on after the one before
 _FEW = 20  # intervals of which the usual one is a mean, and rows in order before those that are set back

@@ -243,8 +243,7 @@ class LiveEstimator:
     def until(self, t: Time, sensor: str | None = None) -> int | None:
         """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
 
-        To the event's own time if its stamp is plainly right, or shows that a jump ahead was; else no farther than it
-        is.
+        That is the event's stamp, if it is plausible or confirms a jump ahead; else the newest stamp that is confirmed.
         """
         try:
             stamp = nanoseconds(t)

@@ -75,7 +75,7 @@ class Health:
 
 
 def by_word(outcomes: IntArray) -> dict[str, int]:
-    """How many there are of each outcome, (8,), by its word."""
+    """How many there are of each outcome, (outcomes,), by its word."""
     return {outcome.word: count for outcome, count in zip(Outcome, outcomes.tolist(), strict=True)}
 
 
@@ -160,7 +160,7 @@ class Counts:
         self._second[self._second > after // _SECOND] = ALWAYS
 
     def health(self, sensor: int, outcomes: IntArray, newest: int | None, stale_ns: int) -> SensorHealth:
-        """The health of a sensor, by what :meth:`counted` gives and by what was refused before, (8,)."""
+        """The health of a sensor, by what :meth:`counted` gives and by what was refused before, (outcomes,)."""
         last, places = int(self._last[sensor]), slice(sensor * _SECONDS, (sensor + 1) * _SECONDS)
         silent = None if newest is None or last == ALWAYS else max((newest - last) / 1e9, 0.0)
         now, second = newest or 0, self._second[places]

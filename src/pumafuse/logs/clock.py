@@ -109,7 +109,8 @@ def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
 def without_strays(run: Run) -> Run:
     """The run without stray stamps (see :func:`stray_offsets`) and commands, and a note on each source that has any.
 
-    Clocks that were set back by up to 1 s go on before that (:func:`.set_back.going_on`).
+    Before that, stamps of clocks that were set back by up to 1 s are shifted so that they go on
+    (:func:`.set_back.going_on`).
 
     Their rows stay, without a stamp: commands are not used, measurements are invalid. Rows of sensors and of the
     reference that are far behind keep their stamps, since they disturb no other: they become too late. This is done

@@ -121,7 +121,7 @@ class Table:
         number, note = self.plain(name) if name else (np.arange(self.rows, dtype=np.float64), None)
         time = number / rate
         if (np.abs(time) >= REACH_NS / 1e9).any():
-            raise RunError(f"{self.path}: at {rate:g} Hz a row is stamped beyond the year 2110")
+            raise RunError(f"{self.path}: at {rate:g} Hz a row is stamped beyond the year 2115")
         return units.nanoseconds(time), note
 
     def is_dated(self, name: str) -> bool:
@@ -248,7 +248,7 @@ class Table:
 
     def _refuse_beyond(self, name: str, rows: BoolArray) -> None:
         if rows.any():
-            what = "a stamp beyond the year 2110; is it of the unit that its name or run.toml says?"
+            what = "a stamp outside of the years 1824 to 2115; is it of the unit that its name or run.toml says?"
             raise self._refusal(name, what, int(rows.argmax()))
 
     def _refusal(self, name: str, what: str, row: int | None = None) -> RunError:

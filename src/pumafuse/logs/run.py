@@ -217,7 +217,8 @@ class Source:
             values = {axis: np.where(number == of_axis, value, np.nan) for of_axis, axis in enumerate(self.values)}
             whole = replace(every[0], stamp=stamp, values=values)
             return whole.rows(np.argsort(stamp, kind="stable")).pivoted()
-        gap = np.diff(self.stamp.astype(np.float64))  # far and negative where a row has no stamp
+        stamped = self.stamp != NO_STAMP
+        gap = np.where(stamped[1:] & stamped[:-1], np.diff(self.stamp), -1).astype(np.float64)
         interval = float(np.median(gap[gap > 0.0])) if (gap > 0.0).any() else np.nan
         if not interval / _MOST_STEPS <= step * 1e9 <= _ABOUT * interval:
             raise RunError(
@@ -579,7 +580,7 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
         missing = np.isnat(time) if kind == "M" else time == NO_STAMP
         rough = time.astype("M8[s]").astype(np.float64) if kind == "M" else time / 1e9
     if (np.abs(rough[~missing]) >= REACH_NS / 1e9).any():
-        raise ValueError("a stamp beyond the year 2110")
+        raise ValueError("a stamp outside of the years 1824 to 2115")
     return nanoseconds(rough) if kind == "f" else time.astype("M8[ns]").astype(np.int64)
 
 

@@ -61,8 +61,8 @@ def configuration(
     """A configuration to begin with: the arm that was found, and noise as it looks along the base's axes."""
     config = as_late(placed_by(begun, registrations, latencies), registrations)
     placed = [in_base(run, config)[0] for run in runs]
-    known = {name: sensor.latency for name, sensor in config.sensors.items()}
-    guessed = first_guess([guess(Survey(Path(run.name), run, relations(run)), known) for run in placed])
+    latency = {name: sensor.latency for name, sensor in config.sensors.items()}
+    guessed = first_guess([guess(Survey(Path(run.name), run, relations(run)), latency) for run in placed])
     sensors = {
         name: msgspec.structs.replace(
             guessed.sensors[name],

@@ -2,9 +2,9 @@
 
 A row is off by e = p + R m − c − s S (z − z̄) [m] and, where the sensor tells an orientation, by the rotation that
 takes S R_sensor Qᵀ to R [rad]; p, R are the arm's response, z and R_sensor what is measured, S the frame's rotation,
-m the marker's place, Q its rotation, c where the mean z̄ of what is measured lies, s a scale. A row counts as
-Cauchy's distribution would have it, by how far it is off for the direction: an arm errs along its path more than across
-it, and what it errs little in tells the more.
+m the marker's place, Q its rotation, c where the mean z̄ of what is measured lies, s a scale. Rows
+have the weights of Cauchy's distribution. Their errors are whitened by direction, since an arm errs more along its path
+than across it.
 """
 
 from __future__ import annotations
@@ -182,7 +182,9 @@ def _of_poses(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArra
 def tell(
     slope: Sequence[FloatArray], off: Sequence[FloatArray], whitening: Sequence[FloatArray], *, expected: bool
 ) -> Blocks:
-    """What rows tell of a step that are so far off and change so with it, positions and orientations together.
+    """The information and the score of rows, by how far they are off and how that changes with a step.
+
+    Positions and orientations count together.
 
     The information is that of Cauchy's curvature where it is the ``expected`` one, of which intervals are made; else
     the larger one of Gauss and Newton, which leads down more safely.

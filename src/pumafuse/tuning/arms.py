@@ -18,7 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
-from ..filter.core import AXIS, Record, at, library
+from ..filter.core import AXIS, Record, at, checked, library
 from ..filter.response import record_of
 from ..model.arm import AxisModel, Gain, Sag
 from ..model.plants import FirstOrder, SecondOrder
@@ -354,10 +354,9 @@ class Measured:
             products_here, record = np.empty_like(products), self._noise_record(noise)
             variance = self._variance(recording, noise)
             records["start"] = recording.start
-            library.pf_weigh(
-                at(record), len(recording.time), at(recording.time), at(variance), c, at(white), len(recording.told),
-                at(recording.told), at(recording.command), len(arms), at(records), at(products_here),
-            )  # fmt: skip
+            rows = len(recording.time), at(recording.time), at(variance), c, at(white)
+            commands = len(recording.told), at(recording.told), at(recording.command)
+            checked(library.pf_weigh(at(record), *rows, *commands, len(arms), at(records), at(products_here)))
             products += products_here
         every = np.zeros((len(arms), 2 + c, 2 + c))  # products of plain response, gain, measurements and biases
         every[:, :2], every[:, :, :2], every[:, 2:, 2:] = products, products.swapaxes(1, 2), columns_alone
@@ -521,7 +520,8 @@ class Measured:
             records["start"] = recording.start
             moved = np.empty((len(arms), len(recording.time)))
             commands = len(recording.told), at(recording.told), at(recording.command)
-            library.pf_response(len(arms), at(records), *commands, len(recording.time), at(recording.time), at(moved))
+            asked = len(recording.time), at(recording.time), at(moved)
+            checked(library.pf_response(len(arms), at(records), *commands, *asked))
             responses.append(moved)
         return responses
 
@@ -554,7 +554,7 @@ class Measured:
             self._noise_record(noise), self._variance(recording, noise), np.empty_like(columns), np.empty(1)
         )  # fmt: skip
         rows = len(recording.time), at(recording.time), at(variance)
-        library.pf_whiten(at(record), *rows, len(columns), at(columns), at(white), at(log))
+        checked(library.pf_whiten(at(record), *rows, len(columns), at(columns), at(white), at(log)))
         return white, float(log[0])
 
 

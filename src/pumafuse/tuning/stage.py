@@ -38,9 +38,9 @@ from .parameters import (
 )
 from .search import FreeOf, Search, arm_searches
 
-_GATE = 5.0  # of the fit for a sensor with a narrow one:
-_NARROWEST = 3.0  # below it rejecting good measurements would pay, the more the smaller the noise
-_WIDEST = 8.0  # of the fit for a sensor with a wider one: a few outliers or jerks must not widen all error bars
+# Gates of the fit. Below the narrowest, rejecting good measurements would pay, the more the smaller the noise; beyond
+# the widest, a few outliers or jerks would widen all error bars. A sensor with a narrower one is fitted with `_GATE`.
+_GATE, _NARROWEST, _WIDEST = 5.0, 3.0, 8.0
 _MOST_FIXED = 8  # combinations of which one parameter each is fixed, at most
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis at rest still determines
 _BIAS_GAIN = 3.0  # log-likelihood that a bias must gain; the width of its prior is already paid for in it
@@ -122,8 +122,8 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
     still = [axis for axis in likelihood.sensors if axis not in excited]
     notes += [f"{axis}: does not move; only its noise at rest was fitted" for axis in still]
     notes += [
-        f"{name}: was fitted with a gate of {_GATE:g}, not of {sensor.gate:g}: outliers must not count, good"
-        " measurements must"
+        f"{name}: was fitted with a gate of {_GATE:g}, not of {sensor.gate:g}: a narrow one would"
+        " reject good measurements, too, while it is fitted"
         for name, sensor in config.sensors.items()
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
