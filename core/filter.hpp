@@ -280,19 +280,19 @@ class Filter {
     // Whether a row beyond its gate re-acquires; if not, it is remembered, and whom it contradicts noted.
     bool reacquires(State<N, Real>& state, const Event& event, Time first, Time end, const Fate& fate) const {
         const double gate = value_of(sensors[event.source].gate);
-        bool all_agree = true, again = false;
+        bool all_agree = true, too_soon = false;
         int other = NOBODY;
         for (Time a = first; a < end; ++a) {
             if (event.known[a] != PF_FUSED || !(std::fabs(fate.innovation[a]) > gate * fate.innovation_sd[a])) continue;
             const Agreement found = agreement(state, event, a, fate.innovation[a]);
-            all_agree &= found == Agreement::yes, again |= found == Agreement::too_soon;
+            all_agree &= found == Agreement::yes, too_soon |= found == Agreement::too_soon;
             other = std::max(other, state.gates[a].contradicted(event.source, event.time));
         }
         if (all_agree && other == NOBODY) return true;
         if (all_agree) *fate.contradicts = std::int16_t(other);
         for (Time a = first; a < end; ++a) {
             if (event.known[a] != PF_FUSED) continue;
-            state.gates[a].reject(event.source, fate.innovation[a], value_of(innovations[a].R), event.time, again);
+            state.gates[a].reject(event.source, fate.innovation[a], value_of(innovations[a].R), event.time, too_soon);
         }
         return false;
     }

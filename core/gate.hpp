@@ -24,8 +24,8 @@ struct Gate {
     Time rejected_at = PF_ALWAYS, fused_at = PF_ALWAYS;   // when that one, and the last that was fused, were valid
     std::int64_t in_a_row = 0, reacquired = 0;            // rejections in a row, and re-acquisitions
 
-    void reject(double innovation, double noise, Time time, bool again) {
-        if (!again || in_a_row == 0) nu = innovation, R = noise, rejected_at = time;
+    void reject(double innovation, double noise, Time time, bool too_soon) {
+        if (!too_soon || in_a_row == 0) nu = innovation, R = noise, rejected_at = time;
         ++in_a_row;
     }
 };
@@ -45,8 +45,8 @@ struct Gates {
         return NOBODY;
     }
 
-    void reject(int mine, double nu, double R, Time time, bool again) {
-        sensor[mine].reject(nu, R, time, again);
+    void reject(int mine, double nu, double R, Time time, bool too_soon) {
+        sensor[mine].reject(nu, R, time, too_soon);
         if (sensor[mine].in_a_row > 1 && unsettled > PF_ALWAYS) unsettled = time;
     }
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import pumafuse as pf
+from pumafuse.filter.response import response
 from pumafuse.tuning.identifiability import correlations, covariance, shared_times
 from pumafuse.tuning.parameters import Parameter, parameters, with_own_delays
 from tuning_runs import fit_stage, outage, quietly, replaced, scenario, with_outliers, with_sensors
@@ -103,3 +106,26 @@ def test_one_latency_is_fixed_of_each_connected_group(
     )
     named = {one.fixed.split(".")[1]: {key.split(".")[1] for key in one.members} for one in founds}
     assert named == {name: set(group.split()) for name, group in wanted.items()}
+
+
+@pytest.mark.parametrize(
+    ("lag", "after", "rate", "told"),
+    [(0.002, 0.020, 1.0, True), (0.040, 0.020, 1.0, False), (0.002, 0.020, 0.93, False), (0.002, 0.0, 1.0, False)],
+    ids=["in step", "an arm that moves on", "another rate", "at the commands"],
+)
+def test_steps_of_which_a_sensor_sees_one_instant_are_told(lag: float, after: float, rate: float, told: bool) -> None:
+    """An arm that is there 2 ms after its dead time, seen 20 ms after each command alone: half a step is unseen."""
+    T, rng = 28_000_000, np.random.default_rng(5)
+    commands = T * np.arange(700)
+    path = 0.5 + 0.1 * np.sin(commands / 1e9)
+    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=lag))
+    stamp = np.sort(T * 10 + round(after * 1e9) + np.rint(rate * T * np.arange(680)).astype(np.int64))
+    seen = 0.5 + response(axis, 0.028, 0.05, commands, path, 0.5, stamp) + 5e-5 * rng.standard_normal(680)
+    run = pf.Run.from_arrays(commands, {"x": path}, {"encoder": (stamp, {"x": seen})})
+    arm = pf.ArmModel(name="an arm", update_period=0.028, delay=0.05, axes={"x": axis})
+    config = pf.FusionConfig(arm=arm, sensors={"encoder": pf.Sensor(sd=5e-5)})
+    notes = [note for note in quietly(lambda: pf.tune([run], config)).details.notes if "one instant" in note]
+    assert bool(notes) is told
+    if told:
+        (size,) = re.findall(r"^encoder: 20 ms after each command, .* off by about ([\d.]+) mm on x", notes[0])
+        assert float(size) == pytest.approx(0.5 * 1e3 * np.sqrt(np.mean(np.diff(path) ** 2)), rel=0.15)

@@ -15,7 +15,7 @@ from ..discovery.guesses import SensorGuess, guess
 from ..discovery.questions import decisions, questions
 from ..discovery.roles import Stream, UndecidedError
 from ..discovery.survey import Survey, name_of, survey
-from ..errors import ConfigError, RunError, counted, printable
+from ..errors import ConfigError, RunError, plural, printable
 from ..folders import write_file
 from ..fusion.config import FusionConfig
 from ..logs.run import Run, described
@@ -123,7 +123,7 @@ def _described_rows(survey: Survey) -> list[list[str]]:
 def _rate(stamp: np.ndarray) -> tuple[str, str]:
     interval, gaps = rate_of(stamp)
     longest = f", longest {gaps.max():.3g} s" if len(gaps) else ""
-    return f"{1.0 / interval:.4g}", f"{counted(len(gaps), 'gap')}{longest}" if len(gaps) else ""
+    return f"{1.0 / interval:.4g}", f"{plural(len(gaps), 'gap')}{longest}" if len(gaps) else ""
 
 
 def _axis_rows(what: str, stream: Stream) -> Iterator[list[str]]:

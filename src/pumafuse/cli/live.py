@@ -73,14 +73,14 @@ def run(
 ) -> None:
     """Estimate from a stream until it ends, or a signal ends it; the arguments are the options, in s and Hz."""
     sources, configured, start = list(map(Address.parse, addresses)), FusionConfig.load(config), dict[str, float]()
-    alone, kinds = sources[0], [source.kind for source in sources]
+    first_source, kinds = sources[0], [source.kind for source in sources]
     if listen and not set(LISTENERS) & set(kinds):
         raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {addresses[0]}")
     if len(sources) > 1 and (lonely := {"stdin", "replay"} & set(kinds)):
         raise ConfigError(f"{lonely.pop()}: cannot go with other sources; only those of the network can")
     if kinds.count("ros2") > 1:
         raise ConfigError("ros2: one node is enough; one run.toml may name all topics")
-    recorded = without_strays(Run.read(alone.path)) if alone.kind == "replay" else None
+    recorded = without_strays(Run.read(first_source.path)) if first_source.kind == "replay" else None
     if recorded is not None:
         warn(f"run '{recorded.name}': {note}" for note in recorded.notes)
         start = dict(recorded.start)
@@ -132,13 +132,13 @@ def run(
         if status and errors.is_terminal:
             screen = stack.enter_context(Live(console=errors, auto_refresh=False, transient=True))
         summaries = [part.summary for part in (remote, recorder, sender) if part is not None]
-        speed = math.inf if ros is not None and ros.simulated else alone.speed  # a simulation may stand still
+        speed = math.inf if ros is not None and ros.simulated else first_source.speed  # a simulation may stand still
         feeder = _Feeder(stream, summaries, speed, recorder, views, screen)
         if remote is not None:
             if left := _listen(remote, feeder, signals):
                 notify(f"{left} events had come and are left out: the end was asked for")
         else:
-            for items in standard_input() if recorded is None else replayed(recorded, configured, alone.speed):
+            for items in standard_input() if recorded is None else replayed(recorded, configured, first_source.speed):
                 feeder.take(items)
                 if signals:
                     break

@@ -39,7 +39,7 @@ def progress_bar(what: str, total: float = 1.0) -> Generator[Callable[[float], N
 
 
 @contextmanager
-def _not_told_of_ctrl_c() -> Generator[None]:
+def _ctrl_c_blocked() -> Generator[None]:
     """Processes that are started here block Ctrl-C, which would end them with a traceback each.
 
     They end with this process, which handles afterwards any Ctrl-C that came meanwhile.
@@ -70,7 +70,7 @@ def run_jobs(
     work = (delayed(_guarded)(name, job) for name, job in jobs.items())
     outcomes: Generator[tuple[str, R | None, str | None]] | None = None
     try:
-        with _not_told_of_ctrl_c():
+        with _ctrl_c_blocked():
             outcomes = cast(Generator[tuple[str, R | None, str | None]], parallel(work))
         with progress_bar(what, len(jobs)) as move:
             for name, result, problem in outcomes:

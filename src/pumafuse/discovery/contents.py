@@ -21,7 +21,7 @@ import pyarrow.parquet as papq
 from msgspec import structs
 
 from ..arrays import NO_STAMP, FloatArray, IntArray, TimeArray, median
-from ..errors import RunError, counted, printable
+from ..errors import RunError, plural, printable
 from ..logs import formats, recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths, prefixes, sentinel, without
 from ..logs.frames import CARTESIAN
@@ -225,7 +225,7 @@ def _of_one_run(parts: Sequence[Part]) -> list[Part]:
     again = [] if first is None else [part for part in parts if is_another(part, first)]
     if first is None or not again:
         return list(parts)
-    notes = (*first.notes, f"{counted(len(again), 'other table')}, a run each, left out: {again[0].label} …")
+    notes = (*first.notes, f"{plural(len(again), 'other table')}, a run each, left out: {again[0].label} …")
     return [replace(part, notes=notes) if part is first else part for part in parts if part not in again]
 
 
@@ -882,7 +882,7 @@ def _by_frame(table: Table, source: Part) -> Iterator[tuple[Part, Table]]:
     if not chosen:
         yield replace(source, notes=(*source.notes, "no frame in it moves as seen from a base: links only turn")), table
     others = [f"{frame} → {name}" for frame, name in rows if (frame, name) not in chosen]
-    notes = [f"transforms of {counted(len(others), 'other frame')} left out: {', '.join(others[:3])}"] if others else []
+    notes = [f"transforms of {plural(len(others), 'other frame')} left out: {', '.join(others[:3])}"] if others else []
     for frame, name in chosen:
         where = {child: name, **({parent: frame} if sum(name == each for _, each in rows) > 1 else {})}
         where = where if others or len(chosen) > 1 else {}

@@ -41,7 +41,7 @@ def tail(degrees: int, x: float) -> float:
 
 
 @lru_cache(maxsize=1024)
-def quantile(degrees: int, share: float) -> float:
+def upper_quantile(degrees: int, share: float) -> float:
     """The x with P(χ² > x) = ``share``: Newton's steps for ln x, from Wilson and Hilferty's approximation."""
     a, width = 0.5 * degrees, math.sqrt(2.0 / (9.0 * degrees))
     cube = 1.0 - width**2 + width * NormalDist().inv_cdf(1.0 - share)

@@ -129,7 +129,7 @@ def log_density(innovation: FloatArray, innovation_sd: FloatArray, outcome: Code
 
 def chi_square_band(count: int) -> tuple[float, float]:
     """Where the mean of ``count`` squares of standard normal variables lies in 95 % of cases."""
-    return chi_square.quantile(count, 0.975) / count, chi_square.quantile(count, 0.025) / count
+    return chi_square.upper_quantile(count, 0.975) / count, chi_square.upper_quantile(count, 0.025) / count
 
 
 def ljung_box(values: FloatArray, lags: int = LAGS) -> tuple[FloatArray, float]:

@@ -26,7 +26,7 @@ from .faults import Fault, by_axis, latency_questions, sensor_faults, starts_in_
 from .overruns import overrun_notes, overruns
 from .placing import in_base
 from .score import late_rows, reference_track
-from .segments import NO_STAMP_WORD, Segment, added, best_of, build, counted, on_any_axis, output_times
+from .segments import NO_STAMP_WORD, Segment, added, best_of, build, nonzero, on_any_axis, output_times
 from .verdicts import sensor_problems
 
 S = TypeVar("S", bound=np.generic)
@@ -267,7 +267,7 @@ def _without_strays(parts: Sequence[Mapping[str, int]], logged: Source, mended: 
     total = added(parts)
     unstamped, word = total.get(NO_STAMP_WORD, 0), Outcome.STRAY.word
     stray = min(int(np.count_nonzero(logged.stamp != mended.stamp)), unstamped)
-    return counted(total | {NO_STAMP_WORD: unstamped - stray, word: total.get(word, 0) + stray})
+    return nonzero(total | {NO_STAMP_WORD: unstamped - stray, word: total.get(word, 0) + stray})
 
 
 def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measurements:

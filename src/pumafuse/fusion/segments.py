@@ -236,7 +236,7 @@ def build(
     ends = run.ends(origin)
     within = rows.stamp <= ends[1]
     outside = int(np.count_nonzero((used_rows & ~within)[owned(rows.stamp, span)]))
-    command_counts = counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
+    command_counts = nonzero(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
     commands, rows = rows.stamp[used_rows & within], rows.where(within)
     notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
@@ -398,7 +398,7 @@ def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return dict(sum(map(Counter[str], counts), Counter[str]()))
 
 
-def counted(counts: Mapping[str, int]) -> dict[str, int]:
+def nonzero(counts: Mapping[str, int]) -> dict[str, int]:
     """The counts that are not 0."""
     return {word: count for word, count in counts.items() if count}
 
@@ -496,7 +496,7 @@ def _measurement_counts(kept: Events, stamp: TimeArray) -> dict[str, int]:
     best = best_of(kept.codes)[kept.stamp != NO_STAMP]
     number = np.bincount(best, minlength=len(Outcome)).tolist()
     of_outcomes = {outcome.word: number[outcome] for outcome in Outcome}
-    return counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(stamp) - unstamped - len(best)})
+    return nonzero({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(stamp) - unstamped - len(best)})
 
 
 def _table(source: Source, axes: tuple[str, ...], order: IntArray | slice, number: int, latency: int = 0) -> Events:

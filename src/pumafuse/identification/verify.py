@@ -23,7 +23,7 @@ from ..fusion.overruns import overrun_notes, overruns
 from ..fusion.segments import build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
-from ..logs.run import Run
+from ..logs.run import REFERENCE, Run
 from ..model.arm import ArmModel, commanded_speed
 from ..model.plants import PLANTS
 from ..toml import Interval
@@ -32,7 +32,6 @@ from ..tuning.plain import COMMANDS, LAGS, ROWS, delays
 from ..units import Kind
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
-REFERENCE = "reference"
 _FEWEST = 20  # measurements
 _MOST_LEVELS = 8  # of a run whose start level is searched among them
 _AS_GOOD, _FAR = 1.2, 3.0  # times the error of the best in class

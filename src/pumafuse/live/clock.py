@@ -33,7 +33,7 @@ _FEW = 20  # intervals of which the usual one is a mean, and rows in order befor
 _SLOWER = 1.1  # by a longer one the usual one grows: a source that is slower now has no holes after a while
 
 
-def nanoseconds(t: Time) -> int:
+def stamp_of(t: Time) -> int:
     """Int ns of float seconds or int nanoseconds."""
     try:
         if isinstance(t, bool):

@@ -21,7 +21,7 @@ from ..filter.events import COMMAND, Results
 from ..filter.outcome import Outcome
 from ..filter.window import Window
 from ..fusion.causes import Cause, evidence_of
-from ..fusion.chi_square import quantile
+from ..fusion.chi_square import upper_quantile
 from ..fusion.config import FusionConfig, Start
 from ..fusion.consistency import Finding, consistency
 from ..fusion.estimates import Estimates
@@ -285,7 +285,7 @@ class Diagnosis:
         everywhere = ((total > _LARGE * count) | (count == 0)).all(axis=1) & (number > 0)
         large = dict[str, dict[str, float]]()
         for pair in np.flatnonzero(everywhere | (nis > _HUGE)).tolist():
-            if nis[pair] > _HUGE or nis[pair] * number[pair] > quantile(int(number[pair]), _CHANCE):
+            if nis[pair] > _HUGE or nis[pair] * number[pair] > upper_quantile(int(number[pair]), _CHANCE):
                 name, of_axis = self._names(pair)
                 large.setdefault(name, {})[of_axis] = float(nis[pair])
         self._say_large(large, now)

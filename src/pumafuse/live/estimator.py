@@ -21,7 +21,7 @@ from ..fusion.setup import live_model
 from ..logs.frames import CARTESIAN, Placed
 from ..space.rotations import TURNING
 from ..units import Kind
-from .clock import Clock, SetBack, Time, Verdict, nanoseconds
+from .clock import Clock, SetBack, Time, Verdict, stamp_of
 from .commands import Commands, CommandWatch, number
 from .diagnosis import Diagnosis
 from .frame_start import FrameStart
@@ -184,7 +184,7 @@ class LiveEstimator:
         newest = self._clock.newest
         now = 0 if newest is None else self._clock.now
         try:
-            stamp = now if at is None else nanoseconds(at)
+            stamp = now if at is None else stamp_of(at)
         except ValueError as error:
             return no_estimate(0, _INVALID, str(error))
         origin = self._window.origin
@@ -246,7 +246,7 @@ class LiveEstimator:
         That is the event's stamp, if it is plausible or confirms a jump ahead; else the newest stamp that is confirmed.
         """
         try:
-            stamp = nanoseconds(t)
+            stamp = stamp_of(t)
         except ValueError:
             return self.sure
         is_configured = sensor is None or sensor in self._sensors
@@ -266,7 +266,7 @@ class LiveEstimator:
         parsed = self._parsed(sensor or None, {name: value for name, value in values.items() if name != NOISE})
         if self._tool is None or not sensor:
             return parsed
-        return self._tool.of_tool(sensor, nanoseconds(t), parsed).values
+        return self._tool.of_tool(sensor, stamp_of(t), parsed).values
 
     def health(self, at: Time | None = None) -> Health:
         """How each sensor does, and what became of everything so far.
@@ -277,8 +277,8 @@ class LiveEstimator:
         Raises:
             ValueError: ``at`` is no time.
         """
-        newest = None if self._clock.newest is None else max(self._clock.now, nanoseconds(at or 0))
-        counts = self._counts.counted(self._window)
+        newest = None if self._clock.newest is None else max(self._clock.now, stamp_of(at or 0))
+        counts = self._counts.snapshot(self._window)
         sensors = {
             name: counts.health(sensor, self._refused[sensor], newest, self._stale_ns)
             for name, sensor in self._sensors.items()
@@ -311,7 +311,7 @@ class LiveEstimator:
     def _take(self, t: Time, sensor: str | None, values: _Values) -> UpdateResult:
         """Put an event where its stamp says, if that can be."""
         try:
-            event = _Event(nanoseconds(t), sensor, values)
+            event = _Event(stamp_of(t), sensor, values)
             parsed = self._parsed(sensor, values)
         except ValueError as error:
             return self._refuse(sensor, values, _INVALID, str(error))
@@ -427,7 +427,7 @@ class LiveEstimator:
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
                 # The commands' clock counts: what came before is of another.
-                self._begin(self._counts.counted(self._window))
+                self._begin(self._counts.snapshot(self._window))
                 if self._event_log is not None:
                     self._event_log.begin_segment()
             clock.start(stamp)
@@ -498,7 +498,7 @@ class LiveEstimator:
         self._start = {}
         if self._joints is not None:
             self._joints.restart()
-        self._begin(self._counts.counted(self._window))
+        self._begin(self._counts.snapshot(self._window))
         if self._event_log is not None:
             self._event_log.begin_segment()
         self._clock.start(next(event.stamp for event in events if event.sensor is None))

@@ -141,7 +141,7 @@ class Counts:
         if window.port.begin - self._unread >= _MOST:
             self._read(window, self._unread + _MOST)
 
-    def counted(self, window: Window) -> Counts:
+    def snapshot(self, window: Window) -> Counts:
         """What there was until now, with what is still in the window."""
         self._settle(window)
         now = copy.deepcopy(self)
@@ -160,7 +160,7 @@ class Counts:
         self._second[self._second > after // _SECOND] = ALWAYS
 
     def health(self, sensor: int, outcomes: IntArray, newest: int | None, stale_ns: int) -> SensorHealth:
-        """The health of a sensor, by what :meth:`counted` gives and by what was refused before, (outcomes,)."""
+        """The health of a sensor, by what :meth:`snapshot` gives and by what was refused before, (outcomes,)."""
         last, places = int(self._last[sensor]), slice(sensor * _SECONDS, (sensor + 1) * _SECONDS)
         silent = None if newest is None or last == ALWAYS else max((newest - last) / 1e9, 0.0)
         now, second = newest or 0, self._second[places]

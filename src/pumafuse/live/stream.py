@@ -7,7 +7,7 @@ from typing import Protocol
 
 from ..errors import ConfigError
 from ..filter.outcome import Outcome
-from .clock import nanoseconds
+from .clock import stamp_of
 from .estimator import LiveEstimator
 from .health import Health
 from .rate_limit import RateLimitedLog
@@ -97,7 +97,7 @@ class Stream:
             became = f"{result.reason} ({result.outcome.word})"
             self._log.write(f"{who} {result.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")
         if self._step is None and not sensor and (waits or result.outcome is Outcome.FUSED):
-            self._asked.append(nanoseconds(t))
+            self._asked.append(stamp_of(t))
         if self._asked and live.sure is not None:
             self._at_commands(live.sure)
 
@@ -154,6 +154,6 @@ class Stream:
 def _at(t: float | int) -> str:
     """A stamp for people; empty where it is no time."""
     try:
-        return f" at {nanoseconds(t) / 1e9:.3f} s"
+        return f" at {stamp_of(t) / 1e9:.3f} s"
     except ValueError:
         return ""

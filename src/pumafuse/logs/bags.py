@@ -25,7 +25,7 @@ from zlib import crc32
 
 import msgspec
 
-from ..errors import RunError, counted, reason
+from ..errors import RunError, plural, reason
 
 _LARGEST = 128 << 20  # bytes of a record or a chunk; recorders make chunks of about 1 MB
 _DEEPEST = 32  # types within types of a message
@@ -72,7 +72,7 @@ class Faults:
     def notes(self, name: str) -> list[str]:
         """A sentence for each fault of the recording of that name."""
         cut = [f"{name}: the recording was cut off: read as far as it goes"] if self.cut else []
-        return cut + [f"{name}: {counted(n, what)} left out: {self.first[what]}" for what, n in self.left_out.items()]
+        return cut + [f"{name}: {plural(n, what)} left out: {self.first[what]}" for what, n in self.left_out.items()]
 
 
 # A library says in its own way that bytes are not what they should be.

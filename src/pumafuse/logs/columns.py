@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 
 from .. import units
 from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
-from ..errors import RunError, UnknownNameError, counted, reason, shortened
+from ..errors import RunError, UnknownNameError, plural, reason, shortened
 from . import dates
 
 Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
@@ -302,7 +302,7 @@ class Table:
         return self._missing(name, count, f"without {what}", row, f" {column[row].as_py()[:40]!r}")
 
     def _missing(self, name: str, count: int, what: str, row: int, first: str = "") -> str:
-        cells = f"{counted(count, 'cell')} of column '{shortened(name)}' {what}"
+        cells = f"{plural(count, 'cell')} of column '{shortened(name)}' {what}"
         return f"{self.path.name}: {cells}, first{first} in row {row + 1}: taken as missing"
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from ..errors import RunError, counted, one_line, unknown_part, warn
+from ..errors import RunError, one_line, plural, unknown_part, warn
 
 Arrays: TypeAlias = dict[str, npt.NDArray[Any]]
 _Tables: TypeAlias = dict[str, pa.Table | bytes]  # by name; of a sheet its cells as CSV
@@ -49,7 +49,7 @@ def table(path: Path, name: str) -> pa.Table | bytes:
 
 def turned_note(signals: int, numbers: int) -> str:
     """What to say of a table that is read turned."""
-    return f"has {counted(signals, 'row')} of {counted(numbers, 'number')}: read turned, each row as a column"
+    return f"has {plural(signals, 'row')} of {plural(numbers, 'number')}: read turned, each row as a column"
 
 
 def _written(path: Path) -> int:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from .. import toml
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
-from ..errors import RunError, UnknownNameError, counted
+from ..errors import RunError, UnknownNameError, plural
 from ..model.arm import CANONICAL_AXES, ArmModel
 from ..space import rotations
 from ..space.kinematics import Chain, Joints
@@ -260,7 +260,7 @@ class Source:
         again = np.append(False, (np.diff(self.stamp[order]) == 0) & (np.diff(order) > 1))
         values_in_order = [value[order] for value in self.values.values()]
         other = again & np.any([value != np.roll(value, 1) for value in values_in_order], axis=0)
-        twice = f"; {counted(int(again.sum()), 'row')} of a time that was there already left out" if again.any() else ""
+        twice = f"; {plural(int(again.sum()), 'row')} of a time that was there already left out" if again.any() else ""
         twice += f", {other.sum()} of them with another value" if other.any() else ""
         return self.rows(order[~again]), f"{self.label}: rows are not in the order of time: put in order{twice}"
 
@@ -506,7 +506,7 @@ def standing_clock(source: Source) -> str:
     each = np.median(np.diff(np.flatnonzero(tick))) if ticks > 2 else np.nan
     rate = f": {each / period:.4g} rows a second" if np.isfinite(each / period) else ""
     return (
-        f"{counted(ticks, 'distinct stamp')}{every}, in {len(step) + 1} rows with {axis}, which goes on while the clock"
+        f"{plural(ticks, 'distinct stamp')}{every}, in {len(step) + 1} rows with {axis}, which goes on while the clock"
         f" stands still{rate}"
     )
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
-from ..errors import counted
+from ..errors import plural
 
 _HOUR_NS = 3_600_000_000_000
 _PERIODS = {  # ns, after which counters of 32 bits begin anew, and times of day without a date
@@ -29,7 +29,7 @@ def going_on(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
     notes, zero = list[str](), stamp == 0
     others = stamp[~zero & (stamp != NO_STAMP)]
     if zero.any() and len(others) >= _FEWEST and np.abs(others).min() >= max(_FAR_NS, float(np.ptp(others))):
-        notes.append(f"{label}: {counted(int(zero.sum()), 'stamp')} of 0, far from all others: taken as missing")
+        notes.append(f"{label}: {plural(int(zero.sum()), 'stamp')} of 0, far from all others: taken as missing")
         stamp = np.where(zero, NO_STAMP, stamp)
     rows = np.flatnonzero(stamp != NO_STAMP)
     steps = np.diff(stamp[rows])

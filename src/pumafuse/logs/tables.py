@@ -27,7 +27,7 @@ import pyarrow.json as pajson
 import pyarrow.parquet as papq
 
 from ..arrays import BoolArray, FloatArray
-from ..errors import RunError, UnknownNameError, counted, shortened
+from ..errors import RunError, UnknownNameError, plural, shortened
 from . import formats
 from .columns import BLANK, NUMBER, SENTINELS, Table, find, largest, longest, prefixes, sentinel_among
 
@@ -394,7 +394,7 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     if layout.separator == " ":
         text = re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)|(?<=[ \t])[ \t]+", b"", text)
     wrong: list[pacsv.InvalidRow] = []
-    above = [f"{path.name}: {counted(layout.above, 'line')} above the header left out"] if layout.above else []
+    above = [f"{path.name}: {plural(layout.above, 'line')} above the header left out"] if layout.above else []
     notes = [*printed, *above]
     names, used = list[str](), list[str]()
     if choice is not None and layout.names is not None and len(layout.names) > _WIDE:
@@ -434,7 +434,7 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
         layout, note = short
         return parsed(layout), (names and layout.names) or [], [note, *notes]
     note = (
-        f"{path.name}: {counted(len(wrong), 'line')} left out: {wrong[0].actual_columns} cells where the first has"
+        f"{path.name}: {plural(len(wrong), 'line')} left out: {wrong[0].actual_columns} cells where the first has"
         f" {wrong[0].expected_columns}, first in line {wrong[0].number}"
     )
     if table.num_rows == 0:  # not the kind of table that it should be
@@ -449,7 +449,7 @@ def _unlabelled(path: Path, text: bytes) -> tuple[bytes, list[str]]:
     rows = _labelled(text.decode("utf-8"))
     kept = [";".join(cells) for header, cells in rows if header == names]
     said = f"lines of labels and values, read as a table: {', '.join(filter(None, names))}"
-    left = f"; {counted(len(rows) - len(kept), 'line')} without these left out" if len(kept) < len(rows) else ""
+    left = f"; {plural(len(rows) - len(kept), 'line')} without these left out" if len(kept) < len(rows) else ""
     return "\n".join([";".join(names), *kept, ""]).encode(), [f"{path.name}: {said}{left}"]
 
 
@@ -545,7 +545,7 @@ def _short_header(
     """
     if {row.actual_columns for row in rows} != {len(names) + 1}:
         return None
-    what = f"{path.name}: the header has {counted(len(names), 'name')}, each of {len(rows)} rows {len(names) + 1} cells"
+    what = f"{path.name}: the header has {plural(len(names), 'name')}, each of {len(rows)} rows {len(names) + 1} cells"
     first = [_split(row.text, layout.separator)[0].strip() for row in rows[:_BESIDE]]
     in_front = all(label.startswith('"') for label in first)
     if not in_front and first in ([str(begin + n) for n in range(len(first))] for begin in (0, 1)):

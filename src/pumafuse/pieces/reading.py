@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from ..arrays import ALWAYS, NEVER, NO_STAMP, BoolArray, TimeArray
-from ..errors import RunError, counted
+from ..errors import RunError, plural
 from ..fusion.config import FusionConfig
 from ..logs import manifest, tables
 from ..logs.clock import stray_offsets
@@ -200,7 +200,7 @@ class _Rows:
         """The rows at hand."""
         notes = list[str]()
         if self._late:
-            rows = counted(self._late, "row")
+            rows = plural(self._late, "row")
             notes = [f"{self.path.name}: {rows} left out, stamped more than 10 s behind an earlier one"]
         return self._table(self._at_hand(), notes)
 

@@ -53,6 +53,7 @@ _REACH = {
 }  # fmt: skip
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _NUDGE = 1e-5  # of a coordinate, by which a size is varied
+_IN_STEP = 0.9  # resultant of the measurements' phases: a jitter of 7 % of an update period
 _SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
 _BLOCKS, _STUDENT = 10, 2.262157  # of the motion; the 97.5 % point of Student's t distribution of one fewer
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -222,6 +223,33 @@ class Measured:
             way = np.abs(np.gradient(value)) if len(value) > 1 else np.zeros(len(value))
             parts.append(way >= _SLOW * np.quantile(way, _FASTEST) if way.any() else way == 0.0)
         return np.concatenate(parts)
+
+    @property
+    def phase(self) -> float | None:
+        """How long after a command all measurements are valid, in update periods; None where that differs."""
+        since = [np.zeros(0)]
+        for recording in self.recordings:
+            row = np.searchsorted(recording.told, recording.time, side="right") - 1
+            since.append((recording.time - recording.told[row])[row >= 0] / (self.period * 1e9))
+        turns = np.exp(2j * np.pi * np.concatenate(since))
+        resultant = turns.mean() if len(turns) else 0.0
+        return float(np.angle(resultant) / (2.0 * np.pi) % 1.0) if abs(resultant) > _IN_STEP else None
+
+    def unseen(self, arm: Arm) -> tuple[float, float]:
+        """How far an arm is from a line between neighbouring measurements, and how far it goes from one to the next.
+
+        Root mean squares [m], where neighbours are an update period apart.
+        """
+        off, ways = [np.zeros(0)], [np.zeros(0)]
+        for recording, moved in zip(self.recordings, self.responses(arm), strict=True):
+            gap = np.diff(recording.time)
+            usual = (gap > 0) & (gap < 1.5e9 * self.period)
+            middle = recording.of(slice(1, None))._replace(time=recording.time[:-1] + gap // 2)
+            between = self.of([middle]).responses(arm)[0]
+            off.append((between - 0.5 * (moved[1:] + moved[:-1]))[usual])
+            ways.append(np.diff(moved)[usual])
+        unseen, way = (math.sqrt(np.mean(each**2)) if len(each) else 0.0 for each in map(np.concatenate, (off, ways)))
+        return unseen, way
 
     def left(self, arm: Arm) -> FloatArray:
         """What an arm leaves of the measurements that count, of each recording about its mean [m]."""

@@ -21,6 +21,7 @@ from .identifiability import (
     not_identifiable,
     not_identifiable_noise,
     shared_times,
+    unseen_steps,
 )
 from .likelihood import Likelihood, Point
 from .maximise import Notify, ignore, maximise_with_gates
@@ -128,6 +129,7 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
     notes += few_measurements(likelihood, free(best.config))
+    notes += unseen_steps(likelihood, best.config)
     return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched, search.adapts)
 
 
