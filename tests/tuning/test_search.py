@@ -44,7 +44,7 @@ def test_last_digits_do_not_choose_among_maxima() -> None:
     )
     config, encoder = pf.FusionConfig(arm=arm, sensors={"encoder": pf.Sensor(sd=1e-4)}), run.sensors["encoder"]
     totals, lags = list[float](), list[float]()
-    for seed in range(6):
+    for seed in range(12):
         digits = 1.0 + 1e-12 * np.random.default_rng(seed).standard_normal(len(encoder.stamp))
         moved_little = replace(encoder, values={"tip": encoder.values["tip"] * digits})
         best = fit_stage(

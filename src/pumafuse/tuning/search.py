@@ -26,6 +26,7 @@ from .parameters import (
     LATENCIES,
     Parameter,
     adapting,
+    changed,
     quickest,
     rings,
     with_arm,
@@ -86,7 +87,7 @@ class Search:
         for start in self._noise_models(config):
             if points:  # an arm that is likeliest under one noise is near that under another
                 start = self._with_arm_of(start, points[0].config)
-            points.append(self._maximum(start) if points else self._with_delay(self._maximum(start)))
+            points.append(self._with_delay(self._maximum(start)))
         likeliest = self._likeliest(points)
         smooth = self._smoothly_disturbed(likeliest)
         if self._likeliest([*points, *smooth]) != likeliest:
@@ -216,15 +217,22 @@ class Search:
         return point(self.likelihood, at, self._of_axes(at))
 
     def _with_delay(self, peak: Point) -> Point:
-        """The higher of a maximum without a delay and of what half of the lag as delay leads to.
+        """The higher of a maximum without a delay and of what the same lag with a third of it as delay leads to.
 
         Delay and plant are a ridge with several tops. Its end is one, and last digits decided whether a search left it.
         """
-        config = peak.config
-        for parameter in self.free(config):
+        config, free = peak.config, self.free(peak.config)
+        shaped = {parameter.axis for parameter in free if parameter.fit == "plant"}
+        for parameter in free:
             if parameter.fit == "delay" and parameter.at_bound(config) == "lower":
                 axes = self.likelihood.axes if parameter.axis is None else [parameter.axis]
-                config = parameter.put(config, 0.5 * min(config.arm.lag_of(axis) for axis in axes))
+                plants = {axis: Arm.of(config.arm.axes[axis], 0.0) for axis in axes}
+                delay = min(arm.lag for arm in plants.values()) / 3.0
+                config = parameter.put(config, delay)
+                for axis, arm in plants.items():
+                    if axis in shaped:
+                        plant = arm._replace(lag=arm.lag - delay).model.plant
+                        config = changed(config, ("arm", "axes", axis, "plant"), plant)
         if config == peak.config:
             return peak
         other = self._maximum(config)
