@@ -82,6 +82,7 @@ def test_both_engines_adapt_alike(sensor: dict[str, float]) -> None:
     core, filterpy = (pf.fuse(run, config, engine=engine) for engine in ("compiled", "filterpy"))
     np.testing.assert_allclose(core["x"].position, filterpy["x"].position, rtol=0, atol=1e-10)
     np.testing.assert_allclose(core["x"].position_sd, filterpy["x"].position_sd, rtol=1e-7)
+    np.testing.assert_allclose(core.measurements.noise_scale, filterpy.measurements.noise_scale, rtol=1e-7)
     steady = pf.fuse(run, config_of(with_(EVERYTHING, adaptation=0.0), **sensor))
     assert not np.allclose(core["x"].position_sd, steady["x"].position_sd, rtol=0.01)
 

@@ -230,7 +230,7 @@ class Measured:
         since = [np.zeros(0)]
         for recording in self.recordings:
             row = np.searchsorted(recording.told, recording.time, side="right") - 1
-            since.append((recording.time - recording.told[row])[row >= 0] / (self.period * 1e9))
+            since.append((recording.time[row >= 0] - recording.told[row[row >= 0]]) / (self.period * 1e9))
         turns = np.exp(2j * np.pi * np.concatenate(since))
         resultant = turns.mean() if len(turns) else 0.0
         return float(np.angle(resultant) / (2.0 * np.pi) % 1.0) if abs(resultant) > _IN_STEP else None
