@@ -377,6 +377,14 @@ def test_text_of_windows_is_read_and_said(tmp_path: Path, body: str) -> None:
     assert table.notes[0] == "log.csv: its text is not UTF-8: taken for Windows-1252"
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be"])
+def test_text_that_powershell_redirects_is_read(tmp_path: Path, encoding: str) -> None:
+    """It is UTF-16 behind a mark, in either order of bytes."""
+    text = "\ufeff"[encoding == "utf-16" :] + "t_s,höhe_mm\n0.5,1.25\n"
+    table = csv(tmp_path, text.encode(encoding))
+    assert table.numbers("höhe_mm")[0].tolist() == [0.00125] and not table.notes
+
+
 @pytest.mark.parametrize("name", ["log.ndjson", "log.jsonl.gz"])
 def test_lines_of_json_are_a_table_of_nested_columns(tmp_path: Path, name: str) -> None:
     """An object a row; what is not there in it is missing."""
@@ -421,7 +429,7 @@ UNREADABLE: dict[str, tuple[str, bytes | None, str]] = {
     "one endless line": ("log.csv", b"t_s,x_mm\n0," + b"1" * 3 * FIRST_BLOCK, "not a table"),
     "CSV called gzip": ("log.csv.gz", b"t_s,x_mm\n0,1\n", "cannot be read"),
     "gzip cut short": ("log.csv.gz", gzip.compress(b"t_s,x_mm\n" + b"0,1\n" * 1000)[:-20], "cannot be read"),
-    "UTF-16": ("log.csv", "t_s,x_mm\n0,1\n".encode("utf-16"), "UTF-8"),
+    "UTF-16 cut within a letter": ("log.csv", "t_s,x_mm\n0,1\n".encode("utf-16")[:-1], "save it as UTF-8"),
 }
 
 

@@ -256,7 +256,7 @@ def one_line(path: Path) -> Generator[None]:
     try:
         yield
     except UnicodeDecodeError:
-        raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
+        raise RunError(f"{path}: not a table that can be read: its text is not UTF-8; save it as UTF-8") from None
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
         reason = str(error).splitlines()[0].removeprefix("CSV parse error: ")
         reason = "a row of more than 1 MB: is a quote not closed?" if "straddling" in reason else reason
@@ -303,6 +303,8 @@ def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
         text = stream.read(_MOST_TEXT + 1)
     if not text:
         raise RunError(f"{path}: the file is empty")
+    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # what PowerShell redirects into a file
+        text = text.decode("utf-16").encode()
     if len(text) > _MOST_TEXT:
         raise RunError(f"{path}: more than {_MOST_TEXT >> 30} GB of text; as Parquet it is read some rows at a time")
     if growing and b"\n" in text and not text.endswith((b"\n", b"\r")) and path.suffix not in _COMPRESSED:
