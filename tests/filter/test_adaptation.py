@@ -11,6 +11,9 @@ from msgspec.structs import replace as with_
 
 import pumafuse as pf
 from pumafuse.arrays import FloatArray
+from pumafuse.filter.events import COMMAND
+from pumafuse.filter.window import Window
+from pumafuse.fusion.setup import filter_model
 
 # that noise is too small, that a sensor jumped: it is
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -85,6 +88,21 @@ def test_both_engines_adapt_alike(sensor: dict[str, float]) -> None:
     np.testing.assert_allclose(core.measurements.noise_scale, filterpy.measurements.noise_scale, rtol=1e-7)
     steady = pf.fuse(run, config_of(with_(EVERYTHING, adaptation=0.0), **sensor))
     assert not np.allclose(core["x"].position_sd, steady["x"].position_sd, rtol=0.01)
+
+
+def test_a_stream_tells_how_far_its_noise_has_grown() -> None:
+    """To the bit as a recording does, and what it tells of each row is that row's."""
+    run, config = run_of(livelier(8.0)), config_of(WALK)
+    window = Window(filter_model(config, ("x",), ("camera",)))
+    camera = run.sensors["camera"]
+    for stamp, command, seen in zip(camera.stamp.tolist(), run.command.values["x"], camera.values["x"], strict=True):
+        for source, value in ((COMMAND, command), (0, seen)):
+            window.value[0] = value
+            window.add(stamp, source, 1, int(camera.stamp[0]))
+    _, source, results = window.read(window.port.begin, window.port.end)
+    recorded = pf.fuse(run, config, mode="as-live").measurements
+    for told, of_recording in ((results.noise_scale, recorded.noise_scale), (results.innovation, recorded.innovation)):
+        np.testing.assert_array_equal(told[source >= 0, 0], of_recording)
 
 
 def test_bars_hold_where_the_arm_is_livelier_than_was_learnt() -> None:
