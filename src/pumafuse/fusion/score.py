@@ -243,7 +243,8 @@ def _between(time: FloatArray, at: FloatArray, value: FloatArray) -> tuple[Float
     if len(at) < 2:
         return track, np.zeros(len(time))
     gap = np.diff(at)
-    apart = np.append(True, gap > _ALIKE * np.quantile(gap, 0.75))
+    usual = np.sort(gap)[3 * len(gap) // 4]
+    apart = np.append(True, gap > _ALIKE * usual)
     bend = np.abs(np.gradient(np.gradient(value[apart], at[apart]), at[apart]))  # m/s²
     off = 0.5 * (time - at[left]) * (at[right] - time) * np.interp(time, at[apart], bend)
     return track, np.where(inside, off, 0.0)
