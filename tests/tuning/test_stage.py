@@ -11,7 +11,10 @@ import pumafuse as pf
 from pumafuse.simulation.true_sensor import Outliers, TrueSensor
 from pumafuse.tuning.arms import BELIEF
 from pumafuse.tuning.intervals import ConfidenceInterval
-from pumafuse.tuning.stage import Stage
+from pumafuse.tuning.likelihood import Likelihood
+from pumafuse.tuning.maximise import point
+from pumafuse.tuning.parameters import parameters
+from pumafuse.tuning.stage import Stage, without_unseen_noise
 from tuning_runs import (
     SCENARIOS,
     fit_stage,
@@ -32,6 +35,29 @@ AXES = ("tangential", "vertical")
 def numbers(stage: Stage) -> dict[str, float]:
     """The fitted values by key, in its unit."""
     return {one.key: one.get(stage.best.config) / one.unit for one in stage.free}
+
+
+@pytest.mark.parametrize(("seen_after", "lasts"), [(0.019, False), (0.0004, True)])
+def test_noise_that_no_measurement_sees_is_none(seen_after: float, lasts: bool) -> None:
+    """A drive of 0.5 ms is shaken at each command. 19 ms later nothing of it is left, 0.4 ms later nearly all."""
+    rng, period = np.random.default_rng(5), 0.020
+    time = np.arange(0.0, 20.0, period)
+    command = 0.2 * np.sin(1.3 * time)
+    y = command - 0.2 * 1.3 * period * np.cos(1.3 * time) * np.exp(-seen_after / 0.5e-3)
+    shaken = 1.0 if lasts else 0.0
+    step = np.abs(np.diff(command, n=2, prepend=[0.0, 0.0])) / period
+    y += rng.normal(0.0, 1e-5, len(time)) + shaken * 0.01 * step * rng.normal(0.0, 1.0, len(time))
+    run = pf.Run.from_arrays(time, {"elbow": command}, {"encoder": (time + seen_after, {"elbow": y})})
+    plant = pf.FirstOrder(time_constant=0.5e-3)
+    arm = pf.ArmModel(name="cell", update_period=period, delay=0.0, axes={"elbow": pf.AxisModel(plant=plant)})
+    process = {"elbow": pf.Process(maneuver_noise=0.5e-3, input_noise=0.0)}
+    config = pf.FusionConfig(arm=arm, process=process, sensors={"encoder": pf.Sensor(sd=1e-5)})
+    likelihood = Likelihood([run], config)
+    free = parameters(config, config, likelihood.sensors, ["noise"])
+    best = without_unseen_noise(likelihood, point(likelihood, config, free), free)
+    assert (best.config.process["elbow"].maneuver_noise > 0.0) is lasts
+    highest = pf.fuse(run, best.config)["elbow"].position_sd[200:].max()
+    assert lasts or highest < 1e-3
 
 
 # ---- latencies ------------------------------------------------------------------------------------------------------

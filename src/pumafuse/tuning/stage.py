@@ -24,7 +24,7 @@ from .identifiability import (
     unseen_steps,
 )
 from .likelihood import Likelihood, Point
-from .maximise import Notify, ignore, maximise_with_gates
+from .maximise import Notify, ignore, maximise_with_gates, point
 from .parameters import (
     LATENCIES,
     Fit,
@@ -48,6 +48,7 @@ _BIAS_GAIN = 3.0  # log-likelihood that a bias must gain; the width of its prior
 _BIAS_WIDTHS = (1e-3, 1e-2, 1e-1)  # m or rad, of the prior
 _FAR = 20.0  # times all that is uncertain, from which a gap is no noise
 _ROOM = 3.0  # width of the prior over the gap that was found
+_UNSEEN = 0.1  # log-likelihood that noise must be worth
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
         if more:
             best, notes = maximise_with_gates(likelihood, biased, free(biased), notify), [*notes, *more]
     best = _identified(likelihood, best, free, config, fixed, notify)
+    best = without_unseen_noise(likelihood, best, free(best.config))
     used = {name for names in likelihood.sensors.values() for name in names}
     still = [axis for axis in likelihood.sensors if axis not in excited]
     notes += [f"{axis}: does not move; only its noise at rest was fitted" for axis in still]
@@ -197,6 +199,26 @@ def _identified(
         if without.log_posterior > best.log_posterior - 0.5 * Z95**2:
             fixed.append(NotIdentifiable((noise.key,), noise.key))
             best = without
+    return best
+
+
+def without_unseen_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> Point:
+    """The point without the noise of plants that no measurement sees.
+
+    A quick plant has forgotten by the next measurement what shook it at a command. So any such noise is as likely, and
+    error bars in between have no bound.
+    """
+    for field in ("input_noise", "maneuver_noise"):
+        noises = [noise for noise in free if noise.path[-1] == field and noise.get(best.config) > noise.bounds[0]]
+        none = best.config
+        for noise in noises:
+            none = noise.put(none, 0.0)
+        lost = best.posteriors - point(likelihood, none, free).posteriors
+        unseen = [noise for noise in noises if lost[likelihood.axes.index(str(noise.axis))] < _UNSEEN]
+        without = best.config
+        for noise in unseen:
+            without = noise.put(without, 0.0)
+        best = point(likelihood, without, free) if unseen else best
     return best
 
 
