@@ -169,3 +169,23 @@ def test_a_coordinate_that_is_zero_is_no_lost_target() -> None:
     """Only all three are, which a sensor does not measure of what is in front of it; nor is what has no value."""
     position = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3], [0.0, -0.2, 0.3], [np.nan, 0.0, 0.0]])
     assert lost(position).tolist() == [True, False, False, False]
+
+
+def test_zeros_that_nobody_had_set_yet_are_missing() -> None:
+    """A sensor's before its first value, or those of commands: as if the rows had none, to the bit."""
+    path, early = 0.9 + PATH, np.arange(len(TIME)) < 7
+    value = followed(path)
+    for command, measured in ((path, np.where(early, 0.0, value)), (np.where(early, 0.0, path), value)):
+        est, notes = fused(command, measured)
+        missing = fused(np.where(command == 0.0, np.nan, command), np.where(measured == 0.0, np.nan, measured))[0]
+        assert "7 rows have zeros before the first value" in notes
+        assert est["slide"].position.tolist() == missing["slide"].position.tolist()
+        assert est.counts == missing.counts
+
+
+@pytest.mark.parametrize("first", [0.0, 0.9])
+def test_zeros_of_an_arm_that_is_there_count(first: float) -> None:
+    """One at rest in its middle, which begins to follow or is told at once to be elsewhere, as its sensor sees."""
+    path = np.where(TIME < 3.0, 0.0, PATH - PATH[120]) + np.where(TIME < 2.0, 0.0, first)
+    value = np.where(TIME < 2.0, 0.0, followed(path))
+    assert fused(path, value)[0].counts["rule"] == {"fused": 2400}

@@ -16,7 +16,7 @@ from ..arrays import NO_STAMP, IntArray, TimeArray, median
 from ..errors import RunError
 from ..units import TIMES, mistaken
 from .run import REFERENCE, TOLERATED_STEP_BACK_NS, Run, Source, note_rows
-from .screening import without_stray_values
+from .screening import first_zeros, without_stray_values
 from .set_back import going_on
 
 _OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
@@ -136,6 +136,17 @@ def without_strays(run: Run) -> Run:
         return replace(source, stamp=np.where(apart == 0, source.stamp, NO_STAMP))
 
     screened_run = run.each(mended)
+    commanded, measured = screened_run.command, list(screened_run.sensors.values())
+
+    def begun(label: str, source: Source) -> Source:
+        zeros = first_zeros(source, measured if source is commanded else [commanded])
+        if not zeros:
+            return source
+        unset = np.arange(len(source.stamp)) < zeros
+        note_rows(notes, label, unset, "zeros before the first value, far from it: taken as missing")
+        return replace(source, values={axis: np.where(unset, np.nan, value) for axis, value in source.values.items()})
+
+    screened_run = screened_run.each(begun)
     command = without_stray_values(screened_run.command, list(screened_run.sensors.values()), notes)
     return replace(screened_run, command=command, notes=tuple(notes), without_strays=True)
 

@@ -20,6 +20,8 @@ MOST_STRAY = 2  # values in a row; three are a motion
 FEWEST = 20  # changes, from which a usual step is known
 BRIEF = 2.5  # usual intervals between changes, up to which one value may last
 _FOLLOWED_NS, _FOLLOWED = 1_000_000_000, 3.0  # within 1 s an arm shows it: by steps so many times as large as before
+_BEGINNING = 200  # rows after zeros
+_UNLIKE = 3.0  # times as far as any step of these, from which zeros were no position
 _STEPS = 10.0  # of its resolution, and ...
 _CLEARLY = 5.0  # ... of its usual steps, that a sensor must have missed
 _FROZEN = 5  # equal values in a row, from which it is asked whether a sensor froze
@@ -35,6 +37,33 @@ def lost(position: FloatArray) -> BoolArray:
     Nothing is in the middle of a sensor.
     """
     return (position == 0.0).all(axis=1)
+
+
+def first_zeros(source: Source, others: Sequence[Source]) -> int:
+    """How many rows at the beginning of a source are zeros of variables that nobody had set yet.
+
+    Then all that it tells leaps at once, farther than by any step soon after, to where one of the ``others`` was.
+    """
+    if not source.values or not len(source.stamp) or any(value[0] != 0.0 for value in source.values.values()):
+        return 0
+    values = np.array(list(source.values.values()))
+    first = int(np.argmax((values != 0.0).any(axis=0)))
+    after = values[:, first : first + _BEGINNING]
+    if first == 0 or after.shape[1] < FEWEST:
+        return 0
+    leapt = np.abs(after[:, 0]) > _UNLIKE * np.fmax.reduce(np.abs(np.diff(after, axis=1)), axis=1)
+    if (values[:, first][~leapt] != 0.0).any():
+        return 0
+
+    def was_there(axis: str, level: float) -> bool:
+        for stamp, value in (other.series(axis) for other in others if axis in other.values):
+            before = max(int(np.searchsorted(stamp, source.stamp[first])) - 1, 0)
+            if len(stamp) and abs(float(value[before]) - level) < BACK * abs(level):
+                return True
+        return False
+
+    levels = zip(source.values, values[:, first].tolist(), leapt.tolist(), strict=True)
+    return first if all(was_there(axis, level) for axis, level, has_leapt in levels if has_leapt) else 0
 
 
 def usual_of(steps: FloatArray) -> float:
