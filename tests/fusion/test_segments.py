@@ -239,15 +239,6 @@ def test_a_command_is_an_event_for_each_distinct_delay() -> None:
     assert (events.codes == Outcome.FUSED).all()
 
 
-@pytest.mark.parametrize(("clock", "filled"), [("stamps", False), ("regular", True)])
-def test_a_column_at_the_rate_of_the_log_is_one_command_per_change(clock: Clock, filled: bool) -> None:
-    """At 1 kHz rows repeat the command in force or are empty: only those where it changes command the arm."""
-    row = np.arange(2000)
-    value = np.where(filled | (row % 28 == 0), 0.5 + np.floor(row / 28) * 1e-3, nan)
-    wanted = [(ORIGIN + tick * TICK, round(0.5 + tick * 1e-3, 12)) for tick in range(2000 // 28 + 1)]
-    assert commanded((ORIGIN + row * MS).tolist(), value.tolist(), clock) == wanted
-
-
 def commands_by_hand(rows: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
     """Row by row: the last value of each stamp, without those that repeat the one before within half a period."""
     last = {stamp: value for stamp, value in sorted(rows, key=lambda row: row[0]) if math.isfinite(value)}
