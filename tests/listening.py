@@ -1,7 +1,5 @@
 """`pumafuse live` as a process that listens, and whose estimates come to us."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import socket

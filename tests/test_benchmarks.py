@@ -1,7 +1,5 @@
 """What pumafuse is compared with: filters without commands, lags by correlation, general filters."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable
 from pathlib import Path

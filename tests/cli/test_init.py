@@ -1,7 +1,5 @@
 """`pumafuse init` by the command line, and `fuse` without a configuration."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

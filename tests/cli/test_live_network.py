@@ -1,7 +1,5 @@
 """`pumafuse live` over the network and with a record: the executable, sockets, kills."""
 
-from __future__ import annotations
-
 import json
 import math
 import random

@@ -1,7 +1,5 @@
 """`pumafuse simulate` and many runs at a time: real files, real signals."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """What is found in logs of many kinds, and that the files written load and fuse."""
 
-from __future__ import annotations
-
 import csv
 import json
 import tomllib

@@ -1,7 +1,5 @@
 """Axes with a fastest speed, play and sag: an ODE solver that knows no piece of the path, and what must always hold."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec

@@ -1,7 +1,5 @@
 """Axes that are angles: in rad and in degrees the same, mixed with lengths, within a turn, in every file."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

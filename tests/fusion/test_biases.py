@@ -1,7 +1,5 @@
 """Constant biases of sensors, and latencies that wander."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

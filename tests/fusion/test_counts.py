@@ -1,7 +1,5 @@
 """No row of a log is lost: each source's rows add up to those of its file, by what became of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

@@ -1,7 +1,5 @@
 """Logs with one mistake each: named before anything is filtered, with the number that shows it; good ones: nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

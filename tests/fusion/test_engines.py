@@ -4,8 +4,6 @@ A measurement whose innovation is within rounding of its gate may be decided eit
 near.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

@@ -3,8 +3,6 @@
 Every run goes through all three modes of the core, twice, with another run in between, and through its derivatives.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

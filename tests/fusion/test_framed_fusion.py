@@ -1,7 +1,5 @@
 """Fusion of logs in x, y, z: the shipped scan written in them, circles, and the way back to x, y, z."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

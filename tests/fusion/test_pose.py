@@ -1,7 +1,5 @@
 """The pose of a tool that turns, in every form in which it is given out, against scipy's rotations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

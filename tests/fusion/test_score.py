@@ -1,7 +1,5 @@
 """Scores of the velocity, on constructed estimates: against the reference's mean velocity over the coming period."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A run as events: their total order, what each measurement is before the filter, which rows command the arm."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The smoother against the conditional Gaussian given every measurement of the run."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

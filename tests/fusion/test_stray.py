@@ -1,7 +1,5 @@
 """A run with stray stamps is fused as if their rows were not there, to the bit; each of them is counted and noted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

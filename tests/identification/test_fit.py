@@ -1,7 +1,5 @@
 """Fits of one trial: exact without noise, never worse than a grid, intervals that hold."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sources as they are: the same log in any layout gives the same run, bit for bit, and a wrong one gives one line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from functools import partial

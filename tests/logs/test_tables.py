@@ -1,7 +1,5 @@
 """Tables: columns in SI units to the last digit, and one clear line for whatever else a file may hold."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import random

@@ -1,7 +1,5 @@
 """``register`` of recorded runs, and what is fused with what it writes."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from collections.abc import Callable

@@ -5,8 +5,6 @@ little more of their standard deviations from their mean, or where the figure it
 measurements, without model or with wrong error bars falls out of them.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

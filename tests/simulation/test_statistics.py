@@ -6,8 +6,6 @@ instants and axes the chance of a false alarm is 1 % (Bonferroni). Innovations o
 NIS summed over every fused component is chi-square too.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from pathlib import Path

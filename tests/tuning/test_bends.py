@@ -1,7 +1,5 @@
 """Play, a fastest speed and a sag are tried by themselves: they are to predict motion they were not fitted to."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

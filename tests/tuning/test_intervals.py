@@ -1,7 +1,5 @@
 """Intervals end where the likelihood has dropped by 1.92, and contain the truth as often as they should."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """How late is it? Lags, latencies, drifts and gains that were simulated are found, and what cannot be told is said."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

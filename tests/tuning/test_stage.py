@@ -1,7 +1,5 @@
 """One stage: latencies and orders are found, outliers do not count, what is not identifiable is fixed and named."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A disturbance, the kind of a gain and a scale are found where they are, and not where they are not."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
