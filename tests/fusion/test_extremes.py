@@ -130,17 +130,6 @@ def test_a_day_of_rest_forgets_the_plant_and_widens_the_offset(plant: Plant) -> 
         assert radial.position_sd[-1] ** 2 - walked == pytest.approx(0.03e-3**2 * stationary, rel=1e-3)
 
 
-def test_no_measurements_is_a_run() -> None:
-    """No sensor at all, and one with rows only before the first command."""
-    plain = check(*edge(seen={}).made())
-    early = edge(seen={"tracker": Seen(READ, 10 * MS * np.arange(10) - 2000 * MS)})
-    for mode, estimates in check(*early.made()).items():
-        assert set(estimates.measurements.outcome) == {Outcome.BEFORE_START}
-        for name, values in parts(plain[mode]).items():
-            if name.startswith("radial"):
-                np.testing.assert_array_equal(parts(estimates)[name], values)
-
-
 # ---- measurements that are no measurements ---------------------------------------------------------------------------
 
 

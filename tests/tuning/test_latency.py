@@ -172,16 +172,6 @@ def test_shifts_of_parts_are_those_of_a_dense_regression() -> None:
 
 
 @pytest.mark.long
-def test_the_held_command_is_half_a_period_late_itself() -> None:
-    """What follows the path through the commanded points 100 ms late is 100 ms less T/2 behind the held command."""
-    time, command = path("smooth")
-    stamp = np.arange(0.5, LENGTH - 0.5, 0.013)
-    value = np.interp(stamp - 0.1, time, command) + np.random.default_rng(7).normal(0.0, 1e-5, len(stamp))
-    axis = pf.latency(pf.Run.from_arrays(time, {"x": command}, {"tracker": (stamp, {"x": value})})).details.axes["x"]
-    assert axis.lag == pytest.approx(0.1 - 0.5 * PERIOD, abs=1e-3)
-
-
-@pytest.mark.long
 @pytest.mark.parametrize(("ahead", "said"), [(0.012, "12 ms ahead of the commands"), (-0.003, "interpolation_ms = 2 ")])
 def test_an_arm_that_is_sooner_than_one_can_be_is_reported(ahead: float, said: str) -> None:
     """Where it follows the path before its points are logged, or between them; no dead time is below 0 all the same."""
