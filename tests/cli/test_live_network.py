@@ -14,7 +14,7 @@ import pumafuse as pf
 from executable import EXECUTABLE, FUSION, SCAN, pumafuse
 from listening import Live, live
 from pumafuse.live.stream import Stream
-from streams import wired
+from streams import lines, wired
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 
@@ -53,6 +53,15 @@ def test_datagrams_in_and_out_and_a_record_of_them(scan: list[bytes], tmp_path: 
     pumafuse("fuse", run, "-c", FUSION, "-o", tmp_path / "out")
     recorded = pf.Run.read(run)
     assert len(recorded.command.stamp) + sum(len(one.stamp) for one in recorded.sensors.values()) == len(scan)
+
+
+def test_lines_over_tcp() -> None:
+    """A connection that gives all it can: every row is taken in, every command answered."""
+    with live("tcp-listen://127.0.0.1:0", FUSION) as process:
+        with socket.create_connection(("127.0.0.1", process.port())) as connection:
+            connection.sendall(lines(2.8))
+        process.received(100)
+        assert "200 lines, 0 of them bad; commands: 100 fused; 100 estimates" in process.end()
 
 
 def test_only_allowed_senders_are_accepted_elsewhere() -> None:
