@@ -1,7 +1,5 @@
 """One motion, written as recordings of many kinds by others' libraries, and as CSV."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

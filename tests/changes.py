@@ -1,7 +1,5 @@
 """Runs with one thing changed, as somebody may have logged them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The command line, as the tests of every command run it."""
 
-from __future__ import annotations
-
 import io
 import subprocess
 import sys

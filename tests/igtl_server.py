@@ -5,8 +5,6 @@
 POSES is a JSON list of ``[seconds, device, matrix]``; they go out one by one once somebody has connected.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

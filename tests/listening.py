@@ -1,7 +1,5 @@
 """`pumafuse live` as a process that listens, and whose estimates come to us."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import socket
@@ -54,11 +52,6 @@ class Live:
 
     def received(self, count: int) -> list[bytes]:
         return [self.estimates.recv(65536) for _ in range(count)]
-
-    def memory(self) -> int:
-        """Resident memory [kB]."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
-        return int(status.split("VmRSS:")[1].split()[0])
 
     def end(self, number: int = signal.SIGTERM) -> str:
         """Ask for an end; what was logged."""

@@ -1,7 +1,5 @@
 """What a page consists of, and whether it is whole."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 

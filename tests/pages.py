@@ -10,8 +10,6 @@ Every fenced block is either done or, after a comment ``<!-- not executed: reaso
 - ``json`` is an object a line.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Plants of both orders, from swinging to sluggish, as hypothesis draws them."""
 
-from __future__ import annotations
-
 from hypothesis import strategies as st
 
 from pumafuse import FirstOrder, SecondOrder

@@ -1,7 +1,5 @@
 """Logs of PX4 for tests."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is in a recording of Rerun."""
 
-from __future__ import annotations
-
 import contextlib
 import warnings
 from pathlib import Path

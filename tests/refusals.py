@@ -1,7 +1,5 @@
 """The message of a refusal, and a worker process that dies."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from typing import Any

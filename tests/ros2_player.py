@@ -6,8 +6,6 @@ Messages go out at the pace of their recording, once the node tells that it is t
 which has as many publishers as it is named. OUT gets a JSON object a line: of a topic its stamp [ns] and numbers.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,7 +1,5 @@
 """Recorded runs as streams of events, fed to a live estimator in any order and compared with the offline result."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable, Sequence

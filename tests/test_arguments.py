@@ -1,7 +1,5 @@
 """What Python may be given by mistake: one line that says what is wrong, as the docstrings promise."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

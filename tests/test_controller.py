@@ -1,7 +1,5 @@
 """The filter in a controller: the header of `pumafuse export`, and the loop in C to copy."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The senders to copy, as they stand: what they send is fused."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """The notebooks: they run as they stand, in an empty folder, and say what is stored in them."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 from pathlib import Path

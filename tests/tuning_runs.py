@@ -1,7 +1,5 @@
 """Shared by the tests of tuning: short simulated runs, and configurations that are wrong about them."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

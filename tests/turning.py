@@ -1,7 +1,5 @@
 """A tool that moves and turns for four seconds, seen by a camera in a corner that tells where a marker is and how."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -84,45 +84,6 @@ def test_result_tables_have_the_documented_columns(with_tracker: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_result_is_reproduced_and_scored_by_any_reference(demo: Path, tmp_path: Path) -> None:
-    """Its fusion.toml and arm.toml give it to the last bit; the run or a reference table score it as its own does."""
-    again = tmp_path / "again"
-    pumafuse("fuse", SCAN, "-c", demo / "fusion.toml", "-o", again, "--sensors", "vision", "--rate", 200)
-    assert pq.read_table(again / "estimates.parquet").equals(pq.read_table(demo / "estimates.parquet"))
-    own = scores([demo])[0]
-    for elsewhere in (SCAN, demo / "reference.parquet"):
-        for axis, score in scores([demo], "--reference", elsewhere)[0].items():
-            assert score == pytest.approx(own[axis], rel=1e-6)
-
-
-@pytest.mark.long
-def test_as_live_has_fewer_measurements(demo: Path, tmp_path: Path) -> None:
-    """Vision is 45 ms late: an estimate that waits for it beats one that cannot, and the summary says which."""
-    pumafuse(*FUSE_SCAN, "-o", tmp_path / "live", "--sensors", "vision", "--as-live")
-    live, waited = scores([tmp_path / "live", demo])
-    assert live["tangential"]["rmse_mm"] > 1.1 * waited["tangential"]["rmse_mm"]
-    assert json.loads((tmp_path / "live" / "summary.json").read_text())["mode"] == "as-live"
-
-
-@pytest.mark.long
-def test_a_part_of_a_run_is_fused_with_pictures(with_tracker: Path, tmp_path: Path) -> None:
-    """Only its estimates, measurements and reference, of several runs as well; the summary and the screen say which."""
-    out = pumafuse(*FUSE_SCAN, "-o", tmp_path / "part", "--from", 20, "--to", 21.5, "--figures", "--rrd").stdout
-    assert "1.5 s from 20 s on" in out
-    summary = json.loads((tmp_path / "part" / "summary.json").read_text())
-    assert (summary["from_s"], summary["to_s"]) == (20.0, 21.5)
-    assert {"fused.png", "error.png", "validation.png", "fused.rrd"} < names(tmp_path / "part")
-    times = {name: pq.read_table(tmp_path / "part" / f"{name}.parquet") for name in ("estimates", "reference")}
-    stamps = pq.read_table(tmp_path / "part" / "measurements.parquet")["stamp_s"].to_numpy()
-    for time in (*(table["time_s"].to_numpy() for table in times.values()), stamps):
-        assert 20.0 <= time.min() < 20.05 and 21.45 < time.max() <= 21.5
-    whole = json.loads((with_tracker / "summary.json").read_text())
-    assert (whole["from_s"], whole["to_s"]) == (None, None)
-    pumafuse("fuse", SCAN, SCAN / "run.toml", "-c", FUSION, "-o", tmp_path / "two", "--from", 59)
-    assert names(tmp_path / "two") == {"scan1", "scan1_2"}
-
-
-@pytest.mark.long
 @pytest.mark.parametrize("command", ["fuse", "tune"])
 def test_a_part_that_is_none_is_refused(command: str, tmp_path: Path) -> None:
     """An option that is no time is a wrong usage; a part without measurements is one line about the data."""

@@ -1,7 +1,5 @@
 """`pumafuse compare`: which of several results to take, with a reference and without one."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Full disks, two at once, names that no disk takes: one line, and nothing half written."""
 
-from __future__ import annotations
-
 import resource
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """`pumafuse export`: what it says and refuses; the header itself is tested in test_controller.py."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """`pumafuse identify`: the command line on a campaign of a known arm, and on campaigns that are broken."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

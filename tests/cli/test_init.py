@@ -1,7 +1,5 @@
 """`pumafuse init` by the command line, and `fuse` without a configuration."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -53,20 +51,6 @@ def test_one_command_fuses_the_shipped_scan_to_a_tenth_of_a_millimetre(tmp_path:
     summary = json.loads((tmp_path / "fused" / "summary.json").read_text())
     for axis in summary["axes"].values():
         assert axis["score"]["coverage"] > 0.9
-
-
-@pytest.mark.long
-def test_one_command_finds_play_and_says_it(tmp_path: Path) -> None:
-    """3.4 degrees within a tenth, in tables that nothing describes; what is left is consistent."""
-    made = pf.simulate(pf.Scenario.load(EXAMPLES.parent / "scenarios" / "tool-with-play.toml")).run
-    (tmp_path / "log").mkdir()
-    for name, source in (("robot", made.command), ("camera", made.sensors["camera"])):
-        columns = {"time_s": source.stamp * 1e-9, "wrist_deg": np.degrees(source.values["wrist"])}
-        pacsv.write_csv(pa.table(columns), tmp_path / "log" / f"{name}.csv")
-    out = pumafuse("fuse", tmp_path / "log", "-o", tmp_path / "fused").stdout
-    (play,) = [line.split() for line in out.splitlines() if line.split()[:1] == ["axes.wrist.play_deg"]]
-    assert float(play[2]) == pytest.approx(3.4, rel=0.1)
-    assert "consistent" in out and "turns with the direction" not in out
 
 
 def test_one_command_looks_fits_and_fuses(tmp_path: Path) -> None:

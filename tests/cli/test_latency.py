@@ -1,7 +1,5 @@
 """`pumafuse latency` and `identify RUN`: the command line on the real robot of the examples."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import re

@@ -1,7 +1,5 @@
 """`pumafuse live` as a process: lines in, lines out, signals, and the numbers of `fuse --as-live`."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

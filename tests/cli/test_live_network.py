@@ -1,7 +1,5 @@
 """`pumafuse live` over the network and with a record: the executable, sockets, kills."""
 
-from __future__ import annotations
-
 import json
 import math
 import random
@@ -57,18 +55,13 @@ def test_datagrams_in_and_out_and_a_record_of_them(scan: list[bytes], tmp_path: 
     assert len(recorded.command.stamp) + sum(len(one.stamp) for one in recorded.sensors.values()) == len(scan)
 
 
-@pytest.mark.long
-def test_twenty_thousand_rows_over_tcp() -> None:
+def test_lines_over_tcp() -> None:
     """A connection that gives all it can: every row is taken in, every command answered."""
-    sent = lines(20_000 * 0.014)
     with live("tcp-listen://127.0.0.1:0", FUSION) as process:
         with socket.create_connection(("127.0.0.1", process.port())) as connection:
-            connection.sendall(sent)
-        last = json.loads(sent.splitlines()[-2])["t"]
-        while json.loads(process.received(1)[0])["t"] < last:
-            pass
-        log = process.end()
-    assert "20000 lines, 0 of them bad; commands: 10000 fused; 10000 estimates" in log
+            connection.sendall(lines(2.8))
+        process.received(100)
+        assert "200 lines, 0 of them bad; commands: 100 fused; 100 estimates" in process.end()
 
 
 def test_only_allowed_senders_are_accepted_elsewhere() -> None:
@@ -109,60 +102,3 @@ def test_killed_at_any_moment(tmp_path: Path, seed: int) -> None:
     assert [
         at for at, stamp in sent if stamp >= found.command.stamp[0] and stamp not in there and at < killed - 1.0
     ] == []
-
-
-def broken(rng: random.Random, good: bytes, other: bytes) -> bytes:
-    """A datagram with bytes changed, cut, doubled, or spliced with another, up to four times."""
-
-    def below(count: int) -> int:
-        return int(count * rng.random())  # randrange takes three times as long
-
-    wild = (b"", b"", b"9" * 30, b"e308", b"-", b"[" * 50, b"{", b'"', b"null", b"NaN", b"\0", b"\n")
-    for _ in range(1 + below(4)):
-        begin, end = sorted((below(len(good) + 1), below(len(good) + 1)))
-        kind = below(4)
-        put = (rng.randbytes(1 + below(20)), wild[below(len(wild))], other[begin:], good[:end])[kind]
-        good = good[:begin] + put + good[min(end, begin + below(11)) :]
-    return good
-
-
-def is_json(line: bytes) -> bool:
-    """Whether the standard library reads a line as an object."""
-    try:
-        return isinstance(json.loads(line), dict)
-    except (ValueError, RecursionError):
-        return False
-
-
-@pytest.mark.long
-def test_a_million_broken_datagrams() -> None:
-    """No crash, no hang, no memory; every estimate is, to the last bit, what it would be without the garbage."""
-    count = 1_000_000
-    rng, written = random.Random(count), list[bytes]()
-    shadow = Stream(pf.LiveEstimator(pf.FusionConfig.load(FUSION)), written.extend, lambda _: None)
-    garbage, least = 0, 0
-    with live("udp://127.0.0.1:0", FUSION) as process, socket.socket(type=socket.SOCK_DGRAM) as ours:
-        place = ("127.0.0.1", process.port())
-        for piece in range(count // 100):
-            t, radial = piece * 0.028, 560.0 + rng.gauss(0.0, 0.05)
-            measurement = {"t": t, "sensor": "tracker", "radial": radial, "vertical": -90.0}
-            command = {"t": t, "command": {"radial": 560.0, "vertical": -90.0}}
-            good = [json.dumps(body).encode() for body in (measurement, command)]
-            datagrams = [broken(rng, rng.choice(good), rng.choice(good)) for _ in range(100)]
-            for datagram in datagrams:
-                ours.sendto(datagram, place)
-            for datagram in datagrams:
-                events = [line for line in datagram.split(b"\n") if is_json(line)]
-                shadow.take(events)
-                garbage += not events
-            for line in good:
-                ours.sendto(line, place)
-            shadow.take(good)
-            assert process.received(len(written)) == written
-            written.clear()
-            if piece == count // 200:  # by then all of its room has been used once
-                least = process.memory()
-        assert process.memory() < least + 4096, "memory grows"
-        log = process.end()
-    assert garbage > 0.5 * count
-    assert f"{count + 2 * (count // 100)} datagrams taken in, 0 lost" in log

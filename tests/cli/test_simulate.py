@@ -1,7 +1,5 @@
 """`pumafuse simulate` and many runs at a time: real files, real signals."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os
@@ -129,6 +127,7 @@ def test_many_runs_are_resumed(scenario: Path, tmp_path: Path) -> None:
     assert "there already: " in pumafuse("fuse", given[0], *same, "-o", out / "seed-3", "--resume").stdout
     for option, what in (
         (["--smooth"], "with another mode"),
+        (["--as-live"], "with another mode"),
         (["--sensors", "eye"], "with other --sensors"),
         (["--to", 1.0], "with another --from or --to"),
         (["--figures"], "with no fused.png"),

@@ -1,7 +1,5 @@
 """Tables on the screen: whole, however narrow it is."""
 
-from __future__ import annotations
-
 from io import StringIO
 
 import pytest

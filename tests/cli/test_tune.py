@@ -1,7 +1,5 @@
 """`pumafuse tune`: the command line on simulated runs: its files, output, refusals, and Ctrl-C."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re

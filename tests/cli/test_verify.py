@@ -1,7 +1,5 @@
 """`pumafuse verify`: the command line on a simulated white-noise run."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The command line on a log that somebody got wrong: one line, exit code 1, no folder; or a warning before all."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Lag, gain and level of one signal behind another, against signals that were made with known ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

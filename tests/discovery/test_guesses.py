@@ -1,7 +1,5 @@
 """First guesses: where an arm starts, and which gate its sensors need."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Another zero is told apart from a wrong gain, a wrong lag, noise and drift; motion of its own from noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

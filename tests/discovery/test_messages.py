@@ -1,7 +1,5 @@
 """Trajectories, transforms and velocities as commands, and messages that cannot be decoded."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Orientations in logs that nothing describes: which columns, which order, and what becomes of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

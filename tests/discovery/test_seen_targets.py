@@ -1,7 +1,5 @@
 """What is called target may be what a camera looks at, and what only looks like following is not fused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Latencies, scales, steps and jitter of one sensor against another, where all of them were simulated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is found in logs of many kinds, and that the files written load and fuse."""
 
-from __future__ import annotations
-
 import csv
 import json
 import tomllib
@@ -1278,21 +1276,6 @@ def test_names_of_lerobot_are_found_where_converters_write_them(nested: Any, tmp
     assert run.kinds == dict.fromkeys(("hip", "Knee", "lArmYaw"), "angle")
 
 
-def test_doubts_are_said_with_their_numbers(log: Path, tmp_path: Path) -> None:
-    """Exchanged axes, a wrong unit, another clock: a sentence each, and the files are there all the same."""
-    t, u, s, z = recorded()
-    write(log / "goal.csv", {"time_s": t, "x_m": u[:, 0], "y_m": u[:, 1]})
-    write(log / "camera.csv", {"time_s": s, "x_m": z[:, 1], "y_m": z[:, 0]})
-    write(log / "laser.csv", {"time_s": s, "x_m": 1e3 * z[:, 0]})
-    write(log / "encoder.csv", {"time_s": s + 1e6, "x_m": z[:, 0]})
-    found = survey(log)
-    said = "\n".join(asked(found))
-    assert "camera is not used on x: it does not follow the commands (correlation" in said
-    assert "laser moves 1e+03 times as far as commanded on x: is its unit right?" in said
-    assert "is the clock of encoder 1000000.004 s ahead of the commands'?" in said
-    written(found, tmp_path / "out")
-
-
 @pytest.mark.parametrize(
     ("files", "said"),
     [
@@ -1347,15 +1330,6 @@ def test_a_damaged_table_is_surveyed_or_refused_in_a_line(seed: int, tmp_path_fa
         drafts(found, *guess(found), folder / "out")
     except pf.PumafuseError as error:
         assert len(str(error).splitlines()) == 1
-
-
-def test_a_log_without_commands_says_how_they_are_known(tmp_path: Path) -> None:
-    _, _, s, z = recorded()
-    noise = np.random.default_rng(1).normal(scale=5e-4, size=len(s))
-    write(tmp_path / "camera.csv", {"t_s": s, "x_m": z[:, 0]})
-    write(tmp_path / "laser.csv", {"t_s": s, "x_m": z[:, 0] + noise})
-    text = one_line(RunError, lambda: survey(tmp_path))
-    assert "which numbers are the commands? None is called command, goal, target" in text
 
 
 def test_commands_that_never_move_are_named(tmp_path: Path) -> None:
@@ -1419,15 +1393,6 @@ def test_columns_without_a_number_beside_commands_are_named(kind: str, tmp_path:
     else:
         write(log, columns)
     assert "lead: boom_seen_m (no number)" in one_line(RunError, lambda: survey(log))
-
-
-def test_a_folder_with_many_topics_lists_what_it_does_not_use(tmp_path: Path) -> None:
-    t, u, s, z = recorded(100)
-    write(tmp_path / "goal.csv", {"time_s": t, "x_m": u[:, 0], "z_m": np.zeros(100)})
-    write(tmp_path / "camera.csv", {"time_s": s, "x_m": z[:, 0], "quality": np.ones(100), "t_sent_s": s})
-    camera, goal = parts_of(tmp_path)
-    assert dict(camera.left_out) == {"quality": "quality", "t_sent_s": "another clock"}
-    assert dict(goal.left_out) == {"z_m": "always 0"}
 
 
 def test_an_axis_that_does_not_follow_is_left_out_and_the_others_are_fused(log: Path, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Noise that grows where innovations show it: by hand, in both engines, by its derivative, and what it is for."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

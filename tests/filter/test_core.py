@@ -1,7 +1,5 @@
 """What must not change a bit of what the core makes, and what it refuses."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """A library that is not there, or not the right one: one line that says what to do."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

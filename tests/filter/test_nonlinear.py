@@ -1,7 +1,5 @@
 """Axes with a fastest speed, play and sag: an ODE solver that knows no piece of the path, and what must always hold."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import msgspec
@@ -147,26 +145,6 @@ def test_no_limit_is_exceeded(plant: PLANTS, recovery: float | None, fastest: fl
     assert np.abs(np.diff(drive)).max() <= fastest * 3e-3 * (1.0 + 1e-9)
     assert np.abs(np.diff(tool)).max() <= fastest * 3e-3 * (1.0 + 1e-9)
     assert np.abs(tool - drive).max() <= 0.5 * play + 1e-12
-
-
-@pytest.mark.parametrize("plant", [KNOWN["first order"], KNOWN["over-damped"]], ids=["first order", "over-damped"])
-def test_play_makes_a_loop(plant: PLANTS) -> None:
-    """Up a staircase and down, twice: the tool never turns on its way, is the play apart, and comes back each time."""
-    play, size = 0.01, 40
-    way = np.concatenate([np.arange(size), np.arange(size, 0, -1)]) * 1e-3
-    command = START + np.concatenate([way, way, [0.0]])
-    given = np.arange(len(command)) * 2_000 * MS
-    time = np.arange(0, int(given[-1]) + 2_000 * MS, 10 * MS)
-    axis = AxisModel(plant=plant, play=play)
-    rests = moved(axis, given, command, given + 1_990 * MS)
-    levels = np.arange(10, 31)  # commanded, mm; both ways the drive has taken the play up there
-    np.testing.assert_allclose(rests[2 * size - levels] - rests[levels], play, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(rests[size : 2 * size], rests[3 * size : 4 * size], rtol=0.0, atol=1e-12)
-    path = moved(axis, given, command, time)
-    going = np.searchsorted(given + round(DELAY * 1e9), time, side="right") - 1
-    rising = ((going - 1) // size) % 2 == 0
-    steps = np.diff(path)[rising[1:] == rising[:-1]]
-    assert (steps * np.where(rising[1:], 1.0, -1.0)[rising[1:] == rising[:-1]] >= -1e-15).all()
 
 
 @pytest.mark.parametrize("recovery", [None, 0.14])

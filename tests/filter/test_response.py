@@ -1,7 +1,5 @@
 """The position that a sequence of commands makes: superposed steps, the differential equation, and the edges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """The core under the compiler's sanitizers: no access outside of memory, and no arithmetic that C++ does not define."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Transitions in closed form against integrals of exponentials worked out with 160 digits."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import product

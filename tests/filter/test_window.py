@@ -1,7 +1,5 @@
 """The core's window without what stands before it in a live estimator: of any size, fed with anything."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Axes that are angles: in rad and in degrees the same, mixed with lengths, within a turn, in every file."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -71,15 +69,15 @@ def motion(rows: int, seed: int = 3) -> np.ndarray:
     return np.round(20.0 * np.sin(np.arange(rows) * T * 2.0) + np.cumsum(rng.normal(0.0, 0.05, rows)), 6)
 
 
-def write_run(folder: Path, unit: str, values: float = 1.0, rows: int = 300) -> None:
-    """A run with two sensors and a reference, whose numbers are ``values`` times those of degrees."""
+def write_run(folder: Path, unit: str, rows: int = 300) -> None:
+    """A run with two sensors and a reference."""
     rng, time = np.random.default_rng(7), np.arange(rows) * T
     u = motion(rows)
     columns = {"a": u, "b": 0.5 * u}
 
     def table(name: str, at: np.ndarray, sd: float) -> None:
         seen = {
-            f"{axis}_{unit}": np.round(np.interp(at - 0.08, time, value) + rng.normal(0.0, sd, len(at)), 6) * values
+            f"{axis}_{unit}": np.round(np.interp(at - 0.08, time, value) + rng.normal(0.0, sd, len(at)), 6)
             for axis, value in columns.items()
         }
         pacsv.write_csv(pa.table({"time_s": at, **seen}), folder / f"{name}.csv")
@@ -110,28 +108,17 @@ def write_config(folder: Path, angle: bool) -> None:
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """One run in mm, in degrees, in rad and in mrad, each with arm and configuration."""
+    """One run in mm and in degrees, each with arm and configuration."""
     found: dict[str, Path] = {}
-    for unit, values in {"mm": 1.0, "deg": 1.0, "rad": DEG, "mrad": 1e3 * DEG}.items():
+    for unit in ("mm", "deg"):
         found[unit] = tmp_path_factory.mktemp(unit)
-        write_run(found[unit], unit, values)
+        write_run(found[unit], unit)
         write_config(found[unit], unit != "mm")
     return found
 
 
 def fused(folder: Path, **options: Any) -> pf.Estimates:
     return pf.fuse(pf.Run.read(folder), pf.FusionConfig.load(folder / "fusion.toml"), **options)
-
-
-def test_rad_and_degrees_give_the_same(folders: dict[str, Path]) -> None:
-    """Position and sd to 1e-9 of a standard deviation, whichever unit the columns have."""
-    degrees = fused(folders["deg"])
-    for unit in ("rad", "mrad"):
-        other = fused(folders[unit])
-        for axis in "ab":
-            sd = degrees[axis].position_sd
-            assert np.max(np.abs(other[axis].position - degrees[axis].position) / sd) < 1e-9
-            assert np.max(np.abs(other[axis].position_sd / sd - 1.0)) < 1e-9
 
 
 def test_an_angle_is_filtered_like_a_length(folders: dict[str, Path]) -> None:

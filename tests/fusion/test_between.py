@@ -1,7 +1,5 @@
 """A part of a run: commands before it count, measurements outside it do not, and the arm does not pretend to rest."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

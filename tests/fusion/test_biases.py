@@ -1,15 +1,11 @@
 """Constant biases of sensors, and latencies that wander."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-import pumafuse as pf
-from executable import FUSION, SCAN
 from fusion.test_oracle import MS, PANEL, TRACKER, UNDER, Case, Seen, every, one, sensor
 from fusion_oracle import AxisOracle
 from pumafuse.fusion.config import FusionConfig, Process
@@ -33,25 +29,6 @@ def test_a_bias_is_in_the_coordinates_of_the_log(level: float, start: float | No
     bias = fuse(moved, config).biases["panel"]["radial"]
     assert abs(bias.value - 0.6004) < 2.0 * bias.sd**2 / 1.0**2  # all that the prior of 0 ± 1 m takes from it, twice
     assert bias.sd < 0.5e-3
-
-
-def test_a_bias_not_identifiable_apart_from_the_offset_stays_as_uncertain() -> None:
-    """A panel alone: their sum is known to its noise, neither is better known than the other's prior."""
-    case = Case(seen={"panel": PANEL}, process=Process(input_noise=0.0, drift=0.0))
-    estimates = fuse(*case.made())
-    bias = estimates.biases["panel"]["radial"]
-    together = (1.0**-2 + case.offset_sd**-2) ** -0.5  # bias given bias − offset = 0
-    assert bias.sd == pytest.approx(together, rel=1e-3)
-    assert estimates["radial"].offset_sd[-1] == pytest.approx(together, rel=1e-3)
-
-
-def test_the_scans_range_finder_tells_its_bias() -> None:
-    """Camera and range finder: radial RMSE within 0.15 mm, and the bias within 0.1 mm of the 600.4 mm it was given."""
-    est = pf.fuse(pf.Run.read(SCAN), pf.FusionConfig.load(FUSION), sensors=["vision", "range"])
-    score = pf.summarise(est).axes["radial"].score
-    assert score is not None and score.rmse <= 0.15e-3
-    assert list(est.biases) == ["range"]
-    assert abs(est.biases["range"]["radial"].value - 0.6004) <= 0.1e-3
 
 
 # ---- latencies that wander ------------------------------------------------------------------------------------------

@@ -3,8 +3,6 @@
 A run is made by the model; then one thing is changed in what its sensor says, or in what the arm does.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """A sensor whose clock is set in mid-run is named, with when and by how much; outages and rest are no clock."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from itertools import product

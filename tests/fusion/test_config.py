@@ -1,7 +1,5 @@
 """`fusion.toml`: what it means, that it survives being saved, and one line for whatever is wrong in it."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

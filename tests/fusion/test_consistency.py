@@ -3,8 +3,6 @@
 A filter with the true configuration must be consistent; of a wrong one the verdict must name the fault.
 """
 
-from __future__ import annotations
-
 import math
 import re
 

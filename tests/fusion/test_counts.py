@@ -1,17 +1,13 @@
 """No row of a log is lost: each source's rows add up to those of its file, by what became of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec
-import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from executable import FUSION, SCAN
 from fusion.test_segments import MS, ORIGIN, SECOND, TICK, A, config, crowded_runs, measurements, nan, properties
 from pumafuse.arrays import NO_STAMP
 from pumafuse.fusion.summary import summarise
@@ -92,14 +88,3 @@ def test_a_row_of_several_axes_counts_by_the_best_of_them() -> None:
     seen = [ORIGIN + 10 * MS, ORIGIN + 20 * MS], {"radial": [nan, nan], "vertical": [0.5, nan]}
     run = pf.Run.from_arrays([ORIGIN, ORIGIN + TICK], {"radial": [0.5, 0.5], "vertical": [0.5, 0.5]}, {"a": seen})
     assert pf.fuse(run, config(a=A)).counts["a"] == {"fused": 1, "invalid": 1}
-
-
-@pytest.mark.parametrize("how", [{"mode": "as-live"}, {"engine": "filterpy"}], ids=str)
-def test_counts_agree_with_the_outcomes_of_components(how: dict[str, object]) -> None:
-    """A sensor of one axis: its rows are its components, in every mode of either engine."""
-    scan, conf = pf.Run.read(SCAN).between(0.0, 2.0), pf.FusionConfig.load(FUSION)
-    est = pf.fuse(scan, conf, sensors=["range"], **how)
-    components = est.measurements.of("range", "radial")
-    outside = len(scan.sensors["range"].stamp) - len(components.value)
-    assert est.counts["range"] == {**components.counts(), "outside": outside}
-    assert np.count_nonzero(components.outcome == 0) == est.counts["range"]["fused"]

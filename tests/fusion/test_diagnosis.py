@@ -1,7 +1,5 @@
 """Logs with one mistake each: named before anything is filtered, with the number that shows it; good ones: nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -20,7 +18,6 @@ from pumafuse.fusion.faults import not_following, sensor_faults
 from pumafuse.fusion.segments import build
 from pumafuse.fusion.summary import summarise
 from pumafuse.logs.clock import clock_faults
-from pumafuse.logs.run import Source
 from tuning_runs import scenario, with_sensors
 
 REPOSITORY = Path(__file__).parents[2]
@@ -263,26 +260,6 @@ def test_a_misspelt_sensor_is_named_with_the_other_name() -> None:
 
 
 # ---- a sensor that says the same, or is wild -----------------------------------------------------------------------
-
-
-def test_a_frozen_axis_is_held_and_when_it_thaws_estimates_are_as_good_as_ever() -> None:
-    """One value for 20 s: said of this axis alone, from when to when."""
-    axis = "radial"
-    run, config = logged("scan1")
-    since = run.sensors["tracker"].stamp - run.command.stamp.min()
-    frozen = (since >= 20e9) & (since < 40e9)
-
-    def freeze(one: Source) -> Source:
-        value = one.values[axis]
-        return replace(one, values={**one.values, axis: np.where(frozen, value[frozen.argmax()], value)})
-
-    est, good = pf.fuse(of_sensor(logged("scan1")[0], "tracker", freeze), config), pf.fuse(run, config)
-    (note,) = [note for note in est.notes if "repeats its value" in note]
-    assert note.startswith("tracker") and f"{axis} repeats its value" in note
-    assert "from 20.02 to 40.00 s" in note and "1999 are held" in note
-    assert est.measurements.of("tracker", axis).counts()["held"] == 1999
-    after = good.time > 41.0
-    np.testing.assert_allclose(est[axis].position[after], good[axis].position[after], rtol=0.0, atol=1e-5)
 
 
 # ---- no false alarm -------------------------------------------------------------------------------------------------

@@ -4,11 +4,8 @@ A measurement whose innovation is within rounding of its gate may be decided eit
 near.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +22,6 @@ from pumafuse.logs.run import Run
 from pumafuse.model.arm import AxisModel
 
 FIELDS = ("position", "velocity", "offset", "disturbance")
-DATA = Path(pf.__file__).parent / "data"
 
 
 def both(run: Run, config: pf.FusionConfig, rate: float | None = None) -> tuple[Filtered, Filtered]:
@@ -130,21 +126,6 @@ def test_a_smooth_disturbance_is_forgotten_in_any_pause(lasts: float, pause: flo
         sensors={"camera": pf.Sensor(sd=1e-3)},
     )
     agree(*both(run, config))
-
-
-@pytest.mark.long
-@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
-def test_fuse_by_filterpy_says_the_same_of_the_scan() -> None:
-    """Measurements, notes and estimates of `fuse` by either engine, of 10 s with all its sensors; progress goes up."""
-    run, config = Run.read(DATA / "scan1").between(until=10.0), pf.FusionConfig.load(DATA / "fusion.toml")
-    done: list[float] = []
-    got, wanted = pf.fuse(run, config), pf.fuse(run, config, engine="filterpy", progress=done.append)
-    assert (got.engine, wanted.engine) == ("compiled", "filterpy")
-    assert got.notes == wanted.notes
-    for name in ("time", "stamp", "sensor", "axis", "value", "outcome"):
-        np.testing.assert_array_equal(getattr(got.measurements, name), getattr(wanted.measurements, name))
-    agree_on_axes(got.axes, wanted.axes)
-    assert done == sorted(done)
 
 
 @pytest.mark.parametrize(

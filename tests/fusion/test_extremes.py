@@ -3,8 +3,6 @@
 Every run goes through all three modes of the core, twice, with another run in between, and through its derivatives.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -130,17 +128,6 @@ def test_a_day_of_rest_forgets_the_plant_and_widens_the_offset(plant: Plant) -> 
     assert walked == pytest.approx(0.4e-3**2 * 86_400.0, rel=1e-4)
     if slowest * 86_400.0 > 20.0:
         assert radial.position_sd[-1] ** 2 - walked == pytest.approx(0.03e-3**2 * stationary, rel=1e-3)
-
-
-def test_no_measurements_is_a_run() -> None:
-    """No sensor at all, and one with rows only before the first command."""
-    plain = check(*edge(seen={}).made())
-    early = edge(seen={"tracker": Seen(READ, 10 * MS * np.arange(10) - 2000 * MS)})
-    for mode, estimates in check(*early.made()).items():
-        assert set(estimates.measurements.outcome) == {Outcome.BEFORE_START}
-        for name, values in parts(plain[mode]).items():
-            if name.startswith("radial"):
-                np.testing.assert_array_equal(parts(estimates)[name], values)
 
 
 # ---- measurements that are no measurements ---------------------------------------------------------------------------

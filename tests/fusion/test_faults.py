@@ -1,7 +1,5 @@
 """What shows before anything is filtered: another zero, a negative latency, a begin in mid-motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The gate's rule, on constructed runs of an arm at rest and against the filterpy engine, which has its own."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

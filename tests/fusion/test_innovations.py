@@ -1,7 +1,5 @@
 """Innovations without estimates: the numbers of a fusion, and of one whose outcomes are known."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import msgspec

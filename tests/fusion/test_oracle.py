@@ -1,7 +1,5 @@
 """The filter against the conditional Gaussian of section 2 of the design, worked out without any filter."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Commands beyond the fastest speed of an axis are named: how many of how many, when, and how fast the fastest."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

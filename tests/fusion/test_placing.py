@@ -1,7 +1,5 @@
 """Sensors in frames of their own and a tool that turns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

@@ -1,7 +1,5 @@
 """The pose of a tool that turns, in every form in which it is given out, against scipy's rotations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,16 +84,6 @@ def test_the_covariance_is_that_of_sampled_axes(est: pf.Estimates) -> None:
     assert np.abs(np.diag(sd**2) - wanted).max() > 0.05 * wanted.max()  # and not as P itself does
     assert np.array_equal(found[:3, :3], np.diag([est[axis].position_sd[row] ** 2 for axis in "xyz"]))
     assert not found[:3, 3:].any() and not found[3:, :3].any()
-
-
-def test_across_a_turn_sds_shrink_by_the_sine(est: pf.Estimates) -> None:
-    """At an angle of 2 rad about z: sin(1)/1 of the axes' sds across it, and all of it along it."""
-    there = {
-        axis: replace(est[axis], position=np.full(len(est.time), angle))
-        for axis, angle in zip(TURNING, (0.0, 0.0, 2.0), strict=True)
-    }
-    found = with_sds(replace(est, axes={**est.axes, **there}), dict.fromkeys(TURNING, 0.01)).pose.covariance[:, 3:, 3:]
-    np.testing.assert_allclose(found[0], 1e-4 * np.diag([np.sin(1.0) ** 2, np.sin(1.0) ** 2, 1.0]), atol=1e-16)
 
 
 @pytest.mark.parametrize("frame", [Cylindrical(base=(0.1, -0.2), positive="clockwise"), Rotated(azimuth=0.5)])

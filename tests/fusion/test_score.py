@@ -1,17 +1,8 @@
 """Scores of the velocity, on constructed estimates: against the reference's mean velocity over the coming period."""
 
-from __future__ import annotations
-
-import json
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import pumafuse as pf
-from executable import pumafuse
-from pumafuse.fusion import results
 from pumafuse.fusion.score import ReferenceTrack, score_velocity
 from pumafuse.fusion.score import score as score_position
 
@@ -96,28 +87,3 @@ def test_rows_of_a_noisy_reference_that_are_stamped_almost_alike_hide_no_error()
     reference = track(rows, path(rows) + 1e-5 * rng.standard_normal(len(rows)))
     sd, none = np.full(len(time), 1e-4), np.zeros(len(time), dtype=np.int64)
     assert score_position(time, none, path(time) + 1e-3, sd, reference, "radial").coverage < 0.01
-
-
-def estimates(*, smoothed: bool) -> pf.Estimates:
-    """Exact positions, and mean velocities with an error of 2 mm/s where there are any."""
-    time = PERIOD * np.arange(50)
-    velocity = np.full(50, np.nan) if smoothed else mean_velocity(time) + 2e-3
-    axis = pf.AxisEstimate(path(time), np.full(50, 1e-4), velocity, velocity * 0.0 + 1e-3, *np.zeros((4, 50)))
-    run = pf.Run.from_arrays(time, {"radial": path(time)}, reference=(time, {"radial": path(time)}), name="made")
-    est = pf.fuse(run, pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")))
-    return replace(est, axes={"radial": axis}, mode="smoothed" if smoothed else "filtered")
-
-
-def test_summary_table_and_compare_show_the_velocity(tmp_path: Path) -> None:
-    """2 mm/s at an sd of 1 are never covered; `compare` finds the summary's numbers in the files."""
-    summary = results.write(estimates(smoothed=False), tmp_path / "out", force=False)
-    found = summary.axes["radial"].score
-    assert found.velocity_rmse_mm_s == pytest.approx(2.0, rel=1e-6)
-    assert found.velocity_coverage == 0.0
-    (compared,) = json.loads(pumafuse("compare", tmp_path / "out", "--json").stdout)
-    assert compared["axes"]["radial"]["velocity_rmse_mm_s"] == pytest.approx(2.0, rel=1e-6)
-    assert compared["axes"]["radial"]["velocity_coverage"] == 0.0
-    (row,) = [
-        line for line in pumafuse("compare", tmp_path / "out").stdout.splitlines() if line.split()[-1:] == ["0.0%"]
-    ]
-    assert row.split()[-2:] == ["2.000", "0.0%"]

@@ -1,7 +1,5 @@
 """A run as events: their total order, what each measurement is before the filter, which rows command the arm."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -237,15 +235,6 @@ def test_a_command_is_an_event_for_each_distinct_delay() -> None:
     events, _ = segment.events(other)  # another configuration's times need no new segment
     assert events.time.tolist() == [ORIGIN + 10 * MS]
     assert (events.codes == Outcome.FUSED).all()
-
-
-@pytest.mark.parametrize(("clock", "filled"), [("stamps", False), ("regular", True)])
-def test_a_column_at_the_rate_of_the_log_is_one_command_per_change(clock: Clock, filled: bool) -> None:
-    """At 1 kHz rows repeat the command in force or are empty: only those where it changes command the arm."""
-    row = np.arange(2000)
-    value = np.where(filled | (row % 28 == 0), 0.5 + np.floor(row / 28) * 1e-3, nan)
-    wanted = [(ORIGIN + tick * TICK, round(0.5 + tick * 1e-3, 12)) for tick in range(2000 // 28 + 1)]
-    assert commanded((ORIGIN + row * MS).tolist(), value.tolist(), clock) == wanted
 
 
 def commands_by_hand(rows: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:

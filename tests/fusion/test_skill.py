@@ -4,8 +4,6 @@ The constant-velocity filter is judged by regression on all earlier measurements
 superposition of closed-form responses.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

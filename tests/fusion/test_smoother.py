@@ -1,15 +1,11 @@
 """The smoother against the conditional Gaussian given every measurement of the run."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import pumafuse as pf
-from executable import FUSION, SCAN
 from fusion.test_oracle import MODES, MS, UNDER, Case, cases, one, tame
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
@@ -73,15 +69,3 @@ def test_any_gated_run_is_fused_like_the_conditional_gaussian(case: Case, mode: 
 
 
 # ---- the shipped scan -----------------------------------------------------------------------------------------------
-
-LIMITS = {"tangential": 0.050e-3, "radial": 0.034e-3, "vertical": 0.040e-3}
-
-
-def test_the_scan_is_smoothed_as_well_as_promised() -> None:
-    """With tracker and vision: errors within 0.050 / 0.034 / 0.040 mm of the truth, and error bars that hold."""
-    run, config = pf.Run.read(SCAN), pf.FusionConfig.load(FUSION)
-    summary = pf.summarise(pf.fuse(run, config, sensors=["tracker", "vision"], rate=200.0, mode="smoothed"))
-    for axis, limit in LIMITS.items():
-        found = summary.axes[axis].score
-        assert found is not None and found.rows > 11_000
-        assert found.rmse <= limit and 0.90 <= found.coverage <= 0.99

@@ -1,7 +1,5 @@
 """A run with stray stamps is fused as if their rows were not there, to the bit; each of them is counted and noted."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -97,10 +95,3 @@ def test_a_stray_row_changes_no_estimate_and_is_noted(case: str, of_run: dict[st
     for word in words:
         assert any(word in note for note in got.notes), (word, got.notes)
     assert not any("stray" in note for note in wanted.notes)
-
-
-def test_every_row_is_in_the_counts() -> None:
-    """A stray measurement is invalid, one that is far behind too late: no row is lost, no other is touched."""
-    strays = [("tracker", 80, 40.0), ("tracker", 120, -40.0), ("tracker", 160, 40.0), ("tracker", 160, 50.0)]
-    tracker = pf.fuse(recorded(strays), CONFIG).measurements.of("tracker", "radial")
-    assert tracker.counts() == {"fused": 299, "too_late": 1, "invalid": 3}

@@ -1,7 +1,5 @@
 """Estimates leave Python as tables, folders and figures, and say in a line what they are."""
 
-from __future__ import annotations
-
 import math
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Trajectories in the TUM format: what evo, or anyone who splits lines at blanks, reads from them."""
 
-from __future__ import annotations
-
 from decimal import Decimal
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Errors are against the true motion, which the simulation here follows by the filter's own model.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Campaigns of angles: the same trials in mm and in degrees are one arm; numbers are in the units of their names."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What coefficients depend on: sums of squares by hand, confounded factors separated, clean trials not outlying."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 The campaigns are made here, from responses written down by hand: nothing of the simulator or of the fits is used.
 """
 
-from __future__ import annotations
-
 import os
 from collections import defaultdict
 from dataclasses import dataclass, replace

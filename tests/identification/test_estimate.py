@@ -1,7 +1,5 @@
 """Means and regressions of trials: the textbook's where it has an answer, intervals that hold where it has none."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fits of one trial: exact without noise, never worse than a grid, intervals that hold."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +11,6 @@ from pumafuse import FirstOrder, SecondOrder
 from pumafuse.identification.fit import StepFit, fit_steps, flags
 from pumafuse.identification.trials import StepTrials, Trial
 from pumafuse.model.plants import unit_response
-from pumafuse.tuning.arms import Limits, Measured, NoiseModel, Recording
-from pumafuse.tuning.plain import plain_arm
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 TIMES = np.arange(60) * 0.00563  # s, the paper's oscilloscope
@@ -131,38 +127,6 @@ def test_flags_name_what_spoils_a_trial() -> None:
 
 
 # ---- the one search -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("order", "shape"), [(1, SLOW), (2, SWINGING)], ids=["first", "second"])
-def test_the_search_for_arms_finds_the_same_arm(order: int, shape: tuple[float, float]) -> None:
-    """A trial as a run that rests and steps: delay and lag to 2e-6 s, gain to 2e-6, and never a lower sum of squares.
-
-    Plain least squares from the arm that `tune` and `latency` begin with. Its derivatives are differences over 0.1 ms.
-    """
-    one = trial(*shape, 1e-5, 0)
-    fit, n = fit_step(one, order), len(TIMES)
-    run = Recording(
-        told=np.array([-(10**9), 0]),
-        command=np.array([0.0, one.step]),
-        start=0.0,
-        time=np.rint(one.time * 1e9).astype(np.int64),
-        value=one.position,
-        source=np.zeros(n, dtype=np.int64),
-        weight=np.ones(n),
-    )
-    measured = Measured([run], 0.028, ["camera"])
-    plain = plain_arm(measured)
-    names = ["delay", "lag", "gain"] if order == 1 else ["delay", "lag", "damping", "gain"]
-    limits = Limits({"delay": (0.0, 0.6), "lag": (1e-3, 2.0), "damping": (0.2, 8.0), "gain": (-np.inf, np.inf)}, {})
-    start, least = (
-        plain.arm._replace(damping=order - 1.0),
-        NoiseModel(np.array([1e-7])),
-    )  # so little that it never stops early
-    found = measured.fitted(start, names, least, limits).arm
-    assert found.delay == pytest.approx(fit.shape.delay, abs=2e-6)
-    assert found.lag == pytest.approx(fit.shape.q, abs=2e-6)
-    assert found.gain == pytest.approx(fit.gain, rel=2e-6)
-    assert 1.0 - 1e-8 < measured.left(found) @ measured.left(found) / fit.squares < 1.0 + 1e-5
 
 
 # ---- recorded -------------------------------------------------------------------------------------------------------

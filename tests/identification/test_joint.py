@@ -1,7 +1,5 @@
 """One plant for many trials: exact without noise, influences as refits show them, intervals that hold."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

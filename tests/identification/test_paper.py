@@ -1,7 +1,5 @@
 """The paper's own method: what is read off, and equation 10 at its least with that given."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

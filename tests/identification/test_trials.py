@@ -1,7 +1,5 @@
 """Step trials from files: units, factors, and every kind of broken trial named in one line while the rest is read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

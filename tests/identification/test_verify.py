@@ -4,8 +4,6 @@ Where the model is true, the error is the noise itself, to the last digits; wher
 the true one, found from the run alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Sources and receivers on the command line, and which senders a listener accepts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Which command was in force when, and what the latest ones are."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """What a stream says by itself of a sensor that tells nonsense: once, as `fuse` does, and when it is over."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

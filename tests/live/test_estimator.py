@@ -1,7 +1,5 @@
 """What each call answers: outcomes with their reasons, and estimates of the past, the present and the future."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

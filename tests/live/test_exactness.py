@@ -1,7 +1,5 @@
 """Fed event by event, in any order, a run gives the offline numbers bit for bit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files

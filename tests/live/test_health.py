@@ -1,7 +1,5 @@
 """Rate, lateness, dropouts, NIS and outcomes of each sensor."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

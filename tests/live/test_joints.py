@@ -1,7 +1,5 @@
 """Streams whose commands, and encoders, are in joints of a robot: as live, to the last bit."""
 
-from __future__ import annotations
-
 import math
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Messages of a running ROS: a bag's messages, one by one, are the events that reading the whole bag gives."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Lines from the network: in order, bounded, none lost unseen."""
 
-from __future__ import annotations
-
 import socket
 import sys
 import threading

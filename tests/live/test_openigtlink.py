@@ -1,7 +1,5 @@
 """Poses by OpenIGTLink: what pyigtl packs and sends, and what others do by the protocol."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

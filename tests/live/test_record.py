@@ -1,7 +1,5 @@
 """A stream written down while it comes: a recorded run at any moment, and the very run that the estimator believed."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -1,7 +1,5 @@
 """`pumafuse live ros2:` between processes on real ROS 2 (Fast DDS), on this computer alone."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

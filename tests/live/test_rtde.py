@@ -1,7 +1,5 @@
 """A robot of Universal Robots as a source: between a robot's end of our own and `pumafuse live`, by UR's protocol."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Hours of stream."""
 
-from __future__ import annotations
-
 import resource
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """From lines to lines: estimates at commands or on a grid, and bad lines that are counted and reported."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A tool that turns, live: orientations, sensors in frames of their own, and what they are to the last bit."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The window: it grows with a dense stream, within a bound, and nothing in it is lost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

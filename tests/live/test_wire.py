@@ -1,7 +1,5 @@
 """The wire format: decoding of lines into events, encoding of estimates."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Clocks that are set back cut a run."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Field paths and stamps: what pure Python finds in the rows and on the clock, and one line for anything else."""
 
-from __future__ import annotations
-
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Files of other programs: the same numbers as in CSV, and one line for what cannot be read."""
 
-from __future__ import annotations
-
 import csv
 import json
 import sys

@@ -3,8 +3,6 @@
 A path is made from radii and angles with cos and sin; what the frame makes of its x and y must be those numbers again.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """A controller's own ticks are found behind jittered stamps."""
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import combinations
 

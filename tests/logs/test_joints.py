@@ -1,7 +1,5 @@
 """Commands and encoders in joints, as the pose of the tool."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

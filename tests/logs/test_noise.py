@@ -1,7 +1,5 @@
 """Rows that say how noisy they are: the noise of a sensor, row by row."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Orientations of logs, in the conventions of robots and sensors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Recordings by others' libraries: the same numbers as in CSV, and one clear line for whatever is wrong with them."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import struct

@@ -1,7 +1,5 @@
 """Recorded runs: a folder with its manifest, one table, or arrays, all meaning the same."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A run that is saved is the run that is read."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Commands that nobody sent, and values that a sensor repeats: left out, counted, named; nothing else is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Clocks that are set back within a recorded run: their stamps go on; what only comes out of order is left alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

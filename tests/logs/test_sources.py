@@ -1,9 +1,7 @@
 """Sources as they are: the same log in any layout gives the same run, bit for bit, and a wrong one gives one line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,11 +77,10 @@ def same(source: Source, stamp: npt.NDArray[np.int64], **values: npt.NDArray[np.
         assert source.values[axis].tobytes() == wanted.tobytes(), axis  # bit for bit, NaN too
 
 
-def texts(zone: str) -> list[str]:
-    """ISO 8601 to the ns, by the standard library, of local time in a zone ahead of UTC by 5 h 30 min, or of UTC."""
-    ahead = timezone(timedelta(hours=5, minutes=30)) if zone == "+05:30" else UTC
-    whole = [datetime.fromtimestamp(int(stamp) // GIGA, ahead) for stamp in STAMP]
-    return [f"{at:%Y-%m-%dT%H:%M:%S}.{stamp % GIGA:09d}{zone}" for at, stamp in zip(whole, STAMP, strict=True)]
+def texts() -> list[str]:
+    """ISO 8601 to the ns, by the standard library."""
+    whole = [datetime.fromtimestamp(int(stamp) // GIGA, UTC) for stamp in STAMP]
+    return [f"{at:%Y-%m-%dT%H:%M:%S}.{stamp % GIGA:09d}" for at, stamp in zip(whole, STAMP, strict=True)]
 
 
 def axis(column: str) -> str:
@@ -100,7 +97,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[], dict[str, Any]]]] = {
         'time = { column = "t_s", unit = "ns" }\nx = { column = "x_mm", unit = "m" }',
         lambda: {"t_s": STAMP, "x_mm": nullable(X)},
     ),
-    "ISO": (f'time = "t"\n{X_M}', lambda: {"t": texts(""), "x": nullable(X)}),
+    "ISO": (f'time = "t"\n{X_M}', lambda: {"t": texts(), "x": nullable(X)}),
     "timestamp": (f'time = "t"\n{X_M}', lambda: {"t": pa.array(STAMP, pa.timestamp("ns")), "x": nullable(X)}),
     "duration": (f'time = "t"\n{X_M}', lambda: {"t": pa.array(STAMP, pa.duration("ns")), "x": nullable(X)}),
     "two columns": (
@@ -174,24 +171,6 @@ def test_a_unit_beside_the_column_is_the_unit_of_its_name(tmp_path: Path, unit: 
     same(named.command, STAMP, a=X / factor)
     same(beside.command, STAMP, a=X / factor)
     assert named.kinds == beside.kinds == {"a": kind}
-
-
-def test_columns_of_one_axis_are_added_up_whatever_their_units(tmp_path: Path) -> None:
-    """A nominal path in m, nested, and a correction in mm by its name."""
-    axis = 'x = [{ column = "pose.position.x", unit = "m" }, "correction_mm"]'
-    run = read(tmp_path, f'time = "t_ns"\n{axis}', {"t_ns": STAMP, "pose": pose(), "correction_mm": ANGLE})
-    same(run.command, STAMP, x=X + ANGLE / 1e3)
-
-
-@pytest.mark.parametrize("zone", ["", "Z", "+05:30"])
-def test_a_csv_says_what_parquet_says(tmp_path: Path, zone: str) -> None:
-    """Dates, and seconds and nanoseconds apart, are as exact in text."""
-    command = 'time = "t"\nx = "x_m"\n[sensors.s]\nfile = "log.csv"\ntime = ["sec", "nanosec"]\nx = "x_m"'
-    seconds, rest = split()
-    columns = {"t": texts(zone), "sec": seconds, "nanosec": rest, "x_m": nullable(X)}
-    run = read(tmp_path, command, columns, "log.csv")
-    same(run.command, STAMP, x=X)
-    same(run.sensors["s"], STAMP, x=X)
 
 
 def episodes(**more: object) -> dict[str, Any]:
@@ -323,12 +302,6 @@ def test_when_rows_came_is_a_column_of_any_unit(tmp_path: Path) -> None:
     assert "arrived: axes with rows of their own have none" in refusal(
         partial(read, tmp_path, arrived + own_rows, columns)
     )
-
-
-def test_a_value_of_where_is_in_the_unit_of_its_column(tmp_path: Path) -> None:
-    """``height_mm = 250`` finds the rows with 250 in them, though Python is in metres."""
-    run = read(tmp_path, f"{AXIS}\nwhere = {{ height_mm = 250 }}", episodes(height_mm=np.arange(ROWS) // 50 * 50))
-    same(run.command, STAMP[250:300], x=X[250:300])
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Stamps go on where a counter begins anew or a clock is set by an hour; packets are spread by their counter."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

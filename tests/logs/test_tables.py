@@ -1,7 +1,5 @@
 """Tables: columns in SI units to the last digit, and one clear line for whatever else a file may hold."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import random
@@ -409,18 +407,6 @@ def test_gzip_and_parquet_say_what_the_csv_says(tmp_path: Path) -> None:
         for name in ("x_mm", "word_mm"):
             np.testing.assert_array_equal(other.numbers(name)[0], plain.numbers(name)[0])
         assert "'bad' in row 3" in str(other.numbers("word_mm")[1])
-
-
-@pytest.mark.parametrize(
-    ("kind", "value"),
-    [(pa.float16(), np.float16(2)), (pa.float32(), 2), (pa.uint8(), 2), (pa.large_string(), "2"), (pa.null(), None)],
-    ids=str,
-)
-def test_parquet_kinds_that_are_numbers(tmp_path: Path, kind: pa.DataType, value: object) -> None:
-    """Small floats and integers, long strings and a column of nothing are read like any number."""
-    table = written(tmp_path, t_s=pa.array([value], kind), x_mm=pa.array([value], kind))
-    np.testing.assert_array_equal(table.numbers("x_mm")[0], [np.nan if value is None else 2e-3])
-    assert table.stamps("t_s")[0].tolist() == [NO_STAMP if value is None else 2 * 10**9]
 
 
 UNREADABLE: dict[str, tuple[str, bytes | None, str]] = {

@@ -1,7 +1,5 @@
 """Long runs piece by piece: the results of the whole run, whatever is wrong with rows beside a cut."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable, Sequence

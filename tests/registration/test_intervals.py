@@ -1,7 +1,5 @@
 """Intervals by the jackknife over blocks of the motion."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

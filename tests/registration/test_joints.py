@@ -1,7 +1,5 @@
 """Commands in joints that do not answer alike: by the tool alone it is found how much later each is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Sensor against sensor."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

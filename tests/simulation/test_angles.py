@@ -1,7 +1,5 @@
 """Scenarios of axes that are angles, and of both kinds."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

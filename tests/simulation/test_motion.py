@@ -5,8 +5,6 @@ quadrature. The motion is linear in the numbers it draws, so its covariance is f
 turn as 1.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Processes that revert to 0 against their covariance functions, which nothing of how they are drawn knows."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """``scenario.toml``: what it says reaches the simulation, and what it says wrongly is one line on the screen."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Statistics are over tens of thousands of rows; each band is four standard errors
 false alarm 6e-5 each, and the seeds are fixed.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

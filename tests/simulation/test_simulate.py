@@ -1,7 +1,5 @@
 """Whole simulated runs: what is written is what was made, chance is reproducible and divided, frames and trials fit."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -6,8 +6,6 @@ instants and axes the chance of a false alarm is 1 % (Bonferroni). Innovations o
 NIS summed over every fused component is chi-square too.
 """
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,18 +120,6 @@ def fused(scenario: pf.Scenario, runs: int = RUNS, engine: Engine = "compiled", 
     return Fused(est.time, np.array(errors), np.array(velocities), gathered, np.array(biases))
 
 
-@pytest.fixture(scope="module")
-def scenario(tmp_path_factory: pytest.TempPathFactory) -> pf.Scenario:
-    path: Path = tmp_path_factory.mktemp("matched") / "matched.toml"
-    path.write_text(SCENARIO)
-    return pf.Scenario.load(path)
-
-
-@pytest.fixture(scope="module")
-def filtered(scenario: pf.Scenario) -> Fused:
-    return fused(scenario)
-
-
 def at_instants(found: Fused) -> NDArray[np.float64]:
     """Mean NEES over the runs, (axes, instants)."""
     picked = np.searchsorted(found.time, INSTANTS)
@@ -158,12 +144,6 @@ def check_coverage(error: NDArray[np.float64]) -> None:
         assert np.mean(np.abs(error[:, axis]) < 1.959964) == pytest.approx(0.95, abs=0.01)
 
 
-def test_errors_of_a_matched_filter_are_as_large_as_it_says(filtered: Fused) -> None:
-    """ANEES at 6 instants on a first- and a second-order axis is in its band; 95 ± 1 % of all errors are covered."""
-    check_anees(filtered)
-    check_coverage(filtered.error)
-
-
 def test_the_velocity_s_error_bar_holds(tmp_path: Path) -> None:
     """95 ± 1 % of the true mean velocities lie in the 95 % band, on an axis of each order, over 1,000 runs of 1 s."""
     path = tmp_path / "short.toml"
@@ -177,40 +157,12 @@ def test_the_velocity_s_error_bar_holds(tmp_path: Path) -> None:
     assert np.abs(found.velocity.mean(axis=(0, 2))).max() < 0.02
 
 
-def test_innovations_of_a_matched_filter_are_as_large_as_it_expects(filtered: Fused) -> None:
-    """Mean NIS of every fused component, all together and for each sensor and axis, inside the chi-square band."""
-    assert set(filtered.nis) == {
-        ("vision", "tangential"),
-        ("vision", "radial"),
-        ("range", "radial"),
-        ("wheel", "tangential"),
-    }
-    groups = [*filtered.nis.values(), np.concatenate(list(filtered.nis.values()))]
-    for nis in groups:
-        low, high = band(len(nis), len(groups))
-        assert low < nis.mean() < high
-
-
-def test_an_estimated_bias_is_as_large_as_its_prior_says(filtered: Fused) -> None:
-    """Over 200 runs its estimates spread by √(prior² − posterior²), inside the chi-square band."""
-    low, high = band(RUNS, len(AXES))
-    square = np.mean(filtered.bias**2, axis=0)
-    assert low < square.min() and square.max() < high
-
-
-@pytest.mark.parametrize("mode", ["smoothed", "as-live"])
-def test_smoothed_and_live_estimates_are_consistent_too(scenario: pf.Scenario, mode: Mode) -> None:
-    """ANEES and coverage hold for estimates that know every measurement and for those that know what had arrived."""
-    found = fused(scenario, mode=mode)
-    check_anees(found)
-    check_coverage(found.error)
-
-
 @pytest.mark.parametrize("mode", ["filtered", "smoothed", "as-live"])
 def test_error_bars_hold_with_a_disturbance_and_a_drifting_bias(tmp_path: Path, mode: Mode) -> None:
     """ANEES, 95 ± 1 % of the positions and NIS: Matérn on one axis, Ornstein-Uhlenbeck on the other, with true numbers.
 
-    A filter that is not told of either is seen at once.
+    Estimates of biases spread by √(prior² − posterior²). A filter that is not told of disturbance or drift is seen at
+    once.
     """
     path = tmp_path / "disturbed.toml"
     path.write_text(DISTURBED)
@@ -220,17 +172,10 @@ def test_error_bars_hold_with_a_disturbance_and_a_drifting_bias(tmp_path: Path, 
     for nis in found.nis.values():
         low, high = band(len(nis), len(found.nis))
         assert low < nis.mean() < high
+    low, high = band(RUNS, len(AXES))
+    assert (low < np.mean(found.bias**2, axis=0)).all() and (np.mean(found.bias**2, axis=0) < high).all()
     untold = ("process.tangential]\ndisturbance_sd_mm = 0.0", "sensors.vision]\nbias_drift_sd_mm = 0.0")
     for one in untold if mode == "filtered" else ():
         path.write_text(f"{DISTURBED}[filter.{one}\n")
         nis = fused(pf.Scenario.load(path), runs=20).nis["vision", "tangential"]
-        assert nis.mean() > band(len(nis))[1]
-
-
-def test_a_filter_with_wrong_noise_or_latency_falls_out_of_the_bands(tmp_path: Path) -> None:
-    """Sensor noise 25 % too small or a latency 15 ms too short is seen at once: the bands have power."""
-    for number, wrong in enumerate(("sd_mm = { tangential = 0.3, radial = 0.225 }", "latency_ms = 30.0")):
-        path = tmp_path / f"wrong{number}.toml"
-        path.write_text(SCENARIO + f"[filter.sensors.vision]\n{wrong}\n")
-        nis = fused(pf.Scenario.load(path), runs=40).nis["vision", "tangential"]
         assert nis.mean() > band(len(nis))[1]

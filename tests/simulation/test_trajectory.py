@@ -1,7 +1,5 @@
 """Commands against what the scenario's words say, by geometry and by counting."""
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from pathlib import Path

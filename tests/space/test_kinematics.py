@@ -1,7 +1,5 @@
 """Forward kinematics of a URDF's chain, against Denavit-Hartenberg, products of 4x4 matrices, and recorded commands."""
 
-from __future__ import annotations
-
 import csv
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Orientations, against scipy's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -49,16 +47,6 @@ def test_axes_of_an_orientation_are_its_rotation_vector_from_the_reference(
 def test_euler_angles_of_every_convention_are_those_of_scipy(angle: np.ndarray, order: str) -> None:
     """Capital letters turn about axes that turn along, small ones about axes that stay."""
     same(rotations.of_angles(angle, order), Rotation.from_euler(order, angle))
-
-
-def test_kuka_and_fanuc_name_the_same_matrix() -> None:
-    """KUKA's Rz(A) Ry(B) Rx(C) is FANUC's Rz(R) Ry(P) Rx(W) with the angles in the other order."""
-    a, b, c = 0.3, -0.7, 1.9
-    kuka = rotations.of_angles(np.array([[a, b, c]]), rotations.CONVENTIONS["kuka"])
-    fanuc = rotations.of_angles(np.array([[c, b, a]]), rotations.CONVENTIONS["fanuc"])
-    np.testing.assert_allclose(kuka, fanuc, atol=1e-15)
-    z, y, x = (Rotation.from_euler(axis, value).as_matrix() for axis, value in zip("zyx", (a, b, c), strict=True))
-    same(kuka, Rotation.from_matrix(z @ y @ x))
 
 
 def test_the_mean_orientation_is_that_of_scipy_whatever_the_signs() -> None:

@@ -1,7 +1,5 @@
 """The search for an arm: odds and quantiles are those of a brute-force integral over all arms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Arms against a recorded motion: likelihoods are those of the dense joint Gaussian, fits are maxima."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

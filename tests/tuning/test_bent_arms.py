@@ -1,7 +1,5 @@
 """Play, a fastest speed and a sag of an axis are fitted, whether arm.toml has them or not."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A bias that is not configured is found and estimated; where there is none, none is found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

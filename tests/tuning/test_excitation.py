@@ -1,7 +1,5 @@
 """Runs that nothing can be fitted to are refused in one line that gives the reason and the remedy."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Correlated and not identifiable parameters are named, and values at a bound are reported."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Intervals end where the likelihood has dropped by 1.92, and contain the truth as often as they should."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +13,7 @@ import pumafuse as pf
 from pumafuse.tuning.intervals import ConfidenceInterval, Profile, _Side, _views, confidence_intervals, lag_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise, maximise_with_gates, point
-from pumafuse.tuning.parameters import Fit, changed, moved, rounded, with_own_delays
+from pumafuse.tuning.parameters import Fit, changed, rounded, with_own_delays
 from pumafuse.tuning.summary import fitted_lags
 from tuning_runs import contains, fit_stage, free_of, intervals_of, outage, scenario, spoiled, spoiled_arm
 
@@ -173,31 +171,6 @@ def test_a_noise_of_0_has_an_interval_from_0_on() -> None:
     assert drift.open == (True, False) and drift.profiled
     none, end = (profile_of_drift(values, 1e3 * value) for value in (1e-7, drift.ci95[1]))
     assert none - end == pytest.approx(0.5 * ROOT**2, rel=0.08)
-
-
-def test_a_shared_parameter_has_the_profile_of_all_measurements() -> None:
-    """A camera's latency, two axes, their noises following by Nelder and Mead: dropped by 1.92 (± 8 %) at both ends."""
-    sim = outage(2)
-    names = ["sensors.vision.latency_ms", "sensors.vision.sd_mm.tangential", "sensors.vision.sd_mm.vertical"]
-    likelihood = Likelihood([sim.run], sim.config, ["vision"])
-    best, found = intervals(likelihood, sim.config, *names)
-    free = {one.key: one for one in free_of(likelihood, best, ("noise", "latency"))}
-    latency, *noise = (free[name] for name in names)
-    outcomes = likelihood.evaluate(best).outcomes
-    start = [other.coordinate(other.get(best)) for other in noise]
-
-    def highest(value: float) -> float:
-        fixed = latency.put(best, value)
-        cost = minimize(
-            lambda at: -likelihood.evaluate(moved(fixed, noise, at), outcomes).log_likelihood,
-            start,
-            method="Nelder-Mead",
-        )
-        return -float(cost.fun)
-
-    top, ends = highest(latency.get(best)), found[latency.key].ci95
-    for end in ends:
-        assert top - highest(end) == pytest.approx(0.5 * ROOT**2, rel=0.08)
 
 
 def test_an_axis_has_the_information_of_the_others_on_a_shared_parameter() -> None:

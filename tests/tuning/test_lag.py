@@ -1,7 +1,5 @@
 """The lag's interval: its covariance, its ends at bounds, and that it holds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

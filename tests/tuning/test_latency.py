@@ -1,7 +1,5 @@
 """How late is it? Lags, latencies, drifts and gains that were simulated are found, and what cannot be told is said."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess
@@ -171,16 +169,6 @@ def test_shifts_of_parts_are_those_of_a_dense_regression() -> None:
     assert information == pytest.approx(X.T @ weighted, rel=2e-2, abs=1e-3 * float(information.max()))
     assert shift == pytest.approx(expected, abs=1e-4)
     assert shift == pytest.approx(-0.004, abs=1e-3)
-
-
-@pytest.mark.long
-def test_the_held_command_is_half_a_period_late_itself() -> None:
-    """What follows the path through the commanded points 100 ms late is 100 ms less T/2 behind the held command."""
-    time, command = path("smooth")
-    stamp = np.arange(0.5, LENGTH - 0.5, 0.013)
-    value = np.interp(stamp - 0.1, time, command) + np.random.default_rng(7).normal(0.0, 1e-5, len(stamp))
-    axis = pf.latency(pf.Run.from_arrays(time, {"x": command}, {"tracker": (stamp, {"x": value})})).details.axes["x"]
-    assert axis.lag == pytest.approx(0.1 - 0.5 * PERIOD, abs=1e-3)
 
 
 @pytest.mark.long

@@ -1,7 +1,5 @@
 """The likelihood is that of the filter and of the joint Gaussian; score and information are its derivatives."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Maximising: each step is the best in its box, and the search ends at a maximum."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every parameter has the name of its key in the files, moves alone, and can be fixed by its name."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable
 from functools import reduce

@@ -1,7 +1,5 @@
 """Least squares finds an arm of which nothing is known, and refutes one that the likelihood has mistaken."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The posterior over models and delays: its quantiles, shared delays, and that it finds what was simulated."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The search finds the highest maximum that a slow global search finds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

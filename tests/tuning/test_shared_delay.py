@@ -1,7 +1,5 @@
 """Axes share one delay unless the measurements say otherwise; a sensor's drift is fitted where it is asked for."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A disturbance, the kind of a gain and a scale are found where they are, and not where they are not."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -197,17 +195,6 @@ def test_a_slow_disturbance_is_found_beside_quick_noise() -> None:
 # ---- gains and scales -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-def test_a_constant_gain_is_found() -> None:
-    """0.9 for ever, configured as 1: constant, within 1 %; delay and lag are not bent to make up for it."""
-    config, command, path = moving(gain=0.9)
-    found, _ = fitted(measured(command, path, 1), config, "noise", "delay", "plant", "gain")
-    model = found.best.config.arm.axes["tip"]
-    assert model.gain_recovery is None and "gain: constant" in found.orders["tip"]
-    assert model.gain.intercept == pytest.approx(0.9, abs=0.01)
-    assert found.best.config.arm.delay_of("tip") + model.plant.lag == pytest.approx(0.09, abs=0.003)
-
-
 def test_a_gain_that_recovers_is_kept() -> None:
     """1.2 that is back in 100 ms, configured as 1 for ever: recovering, both within 20 %."""
     config, command, path = moving(gain=1.2, recovery=0.1)
@@ -249,18 +236,6 @@ def test_the_prior_of_a_noise_can_be_turned_off() -> None:
     assert with_prior.details.sd_prior and not without.details.sd_prior
     sds = [found.config.sensors["camera"].sd_of("tip") for found in (with_prior, without)]
     assert sds[0] is not None and sds[1] is not None and 0.9 * 3e-4 < sds[0] < sds[1] == pytest.approx(3e-4, rel=0.1)
-
-
-@pytest.mark.long
-def test_the_configured_noise_changes_nothing() -> None:
-    """All noise a tenth of what it is and ten times as much: the same numbers, to a thousandth of themselves."""
-    config, command, path = moving()
-    run, found = measured(command, path, 1), list[dict[str, float]]()
-    for times in (0.1, 1.0, 10.0):
-        process = {axis: replaced(one, drift=times * one.drift) for axis, one in config.process.items()}
-        start = replaced(with_sensors(config, sd=times * 3e-4), process=process)
-        found.append(dict(quietly(lambda start=start: pf.tune([run], start, fit=["noise", "delay", "plant"])).params))
-    assert found[0] == pytest.approx(found[1], rel=1e-3) and found[2] == pytest.approx(found[1], rel=1e-3)
 
 
 def lever(command: np.ndarray, period: float) -> np.ndarray:

@@ -1,7 +1,5 @@
 """Tuning as a whole: the result can be used, has its provenance, and is kept when interrupted."""
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib

@@ -1,7 +1,5 @@
 """Validation has the numbers of `fuse`, and a verdict that allows for chance."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Figures are drawn for every kind of run and show what the estimates say."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

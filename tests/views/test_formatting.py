@@ -1,7 +1,5 @@
 """Numbers and their intervals as text."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

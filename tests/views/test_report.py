@@ -1,7 +1,5 @@
 """Pages stand alone, hold every table and figure with its sentence, and cannot be broken by what users name things."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A tool that turns, as Rerun is given it, against scipy's rotations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

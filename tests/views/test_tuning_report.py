@@ -1,7 +1,5 @@
 """The report of a tuning stands alone, has every number and sentence, and draws the right likelihood."""
 
-from __future__ import annotations
-
 import html
 import re
 from functools import cache, partial
