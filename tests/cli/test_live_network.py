@@ -48,7 +48,7 @@ def test_datagrams_in_and_out_and_a_record_of_them(scan: list[bytes], tmp_path: 
         found = send(process, scan)
         log = process.end()
     expected: list[bytes] = []
-    Stream(pf.LiveEstimator(pf.FusionConfig.load(FUSION)), expected.extend, lambda _: None).take(scan)
+    Stream(pf.LiveEstimator(pf.FusionConfig.load(FUSION)), expected.extend, lambda _: None).add(scan)
     assert found == expected
     assert f"{len(scan)} datagrams taken in, 0 lost" in log
     assert f"{run}: {len(scan)} rows written" in log
@@ -153,11 +153,11 @@ def test_a_million_broken_datagrams() -> None:
                 ours.sendto(datagram, place)
             for datagram in datagrams:
                 events = [line for line in datagram.split(b"\n") if is_json(line)]
-                shadow.take(events)
+                shadow.add(events)
                 garbage += not events
             for line in good:
                 ours.sendto(line, place)
-            shadow.take(good)
+            shadow.add(good)
             assert process.received(len(written)) == written
             written.clear()
             if piece == count // 200:  # by then all of its room has been used once

@@ -14,7 +14,7 @@ import pumafuse as pf
 from pumafuse.fusion.clock_steps import leaps
 from pumafuse.fusion.faults import Fault, faults_of
 from pumafuse.fusion.placing import in_base
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.segments import build_segment
 from pumafuse.logs.run import Source
 from pumafuse.tuning.parameters import changed
 from tuning_runs import SCENARIOS, later
@@ -38,7 +38,7 @@ def clock_set(run: pf.Run, sensor: str, by: float, at: float = AT) -> pf.Run:
 
 def named(run: pf.Run, config: pf.FusionConfig) -> list[Fault]:
     in_place, _, config = in_base(run, config)
-    return [one for one in faults_of(build(in_place, config), config) if one.cause == "set"]
+    return [one for one in faults_of(build_segment(in_place, config), config) if one.cause == "set"]
 
 
 def lost(source: Source, begin: float, end: float) -> Source:

@@ -133,7 +133,7 @@ def _clock_step(
         return None
     left = lateness(*earlier), lateness(*later)  # log of the share of motion that is left at each shift, (2m + 1,)
     before, after = (best_shift(unexplained, earlier.grid) for unexplained in left)
-    if not all(map(_follows, left)):
+    if not all(map(_is_following, left)):
         return None
     if _gain(left[0], before, after) < _BETTER or _gain(left[1], after, before) < _BETTER:
         return None
@@ -157,11 +157,11 @@ def _side(segment: Segment, arm: ArmModel, positions: Mapping[str, Rows], begin:
     if last - first < _SHORTEST_NS:
         return None
     grid = Grid.around(first, (last - first) / 1e9, _BIN, round(_REACH / _BIN))
-    led = {axis: segment.led(arm, axis, grid.time) for axis in rows}
+    led = {axis: segment.response(arm, axis, grid.time) for axis in rows}
     return _Side({axis: grid.mean(*row) for axis, row in rows.items()}, led, grid)
 
 
-def _follows(unexplained: FloatArray) -> bool:
+def _is_following(unexplained: FloatArray) -> bool:
     """Whether a sensor follows at the best shift and beside it: where little is commanded there may be no valley."""
     lag = int(np.argmin(unexplained))
     return float(np.pad(unexplained, 1)[lag : lag + 3].max()) < _FOLLOWS

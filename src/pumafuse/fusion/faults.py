@@ -146,7 +146,7 @@ def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
     return [
         f"the run begins in motion ({speeds[most] * screen.scale:.3g} {screen.unit}/s on {most}), the model at rest:"
         f" estimates are wrong by up to {off[most] * screen.scale:.2g} {screen.unit} at first; record from rest, or use"
-        f" --from {max(settled(config, axis) for axis in speeds):.2g} or later"
+        f" --from {max(settling_time(config, axis) for axis in speeds):.2g} or later"
     ]
 
 
@@ -221,14 +221,14 @@ def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) ->
     return trackings
 
 
-def _led_at(segment: Segment, config: FusionConfig, axis: str, valid: TimeArray) -> tuple[FloatArray, FloatArray]:
+def _response_at(segment: Segment, config: FusionConfig, axis: str, valid: TimeArray) -> tuple[FloatArray, FloatArray]:
     """Where the commands lead an axis at some instants, and where they had led shortly before."""
-    early = segment.led(config.arm, axis, valid - round(SMALL_SHIFT * 1e9))
-    return segment.led(config.arm, axis, valid), early
+    early = segment.response(config.arm, axis, valid - round(SMALL_SHIFT * 1e9))
+    return segment.response(config.arm, axis, valid), early
 
 
 def _tracking(segment: Segment, config: FusionConfig, name: str, axis: str, rows: Rows) -> Tracking:
-    (valid, position), (led, before) = rows, _led_at(segment, config, axis, rows[0])
+    (valid, position), (led, before) = rows, _response_at(segment, config, axis, rows[0])
     sensor, process = config.sensors[name], config.process[axis]
     of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_drift_sd_of(axis)) / abs(sensor.scale)
     noise = math.hypot(of_sensor, process.disturbance_sd)
@@ -381,7 +381,7 @@ def _not_following(segment: Segment, config: FusionConfig, positions: _Positions
 
 def _matches(segment: Segment, config: FusionConfig, positions: Mapping[str, Rows], grid: Grid) -> dict[str, Match]:
     """What explains the motion that a sensor measures on each axis, without single outliers."""
-    led = {axis: segment.led(config.arm, axis, grid.time) for axis in segment.axes}
+    led = {axis: segment.response(config.arm, axis, grid.time) for axis in segment.axes}
     measured: dict[str, FloatArray] = {}
     for axis, (valid, position) in positions.items():
         alike = without_spikes(position)
@@ -558,7 +558,7 @@ def _turned_frame(
     valid, value = valid[alike], value[alike]
     if len(valid) < _FEW:
         return None
-    ends = [_led_at(segment, config, axis, valid) for axis in axes]
+    ends = [_response_at(segment, config, axis, valid) for axis in axes]
     led, before = (np.column_stack(part) for part in zip(*ends, strict=True))
     over = round(_MOVE / max(float(np.median(np.diff(valid))), 1.0))
     if not 1 <= over < len(valid) // _PARTS:
@@ -626,7 +626,7 @@ def _first_speed(segment: Segment, axis: str) -> float:
     return float(command[-1] - command[0]) / (int(told_at[-1] - told_at[0]) / 1e9)
 
 
-def settled(config: FusionConfig, axis: str) -> float:
+def settling_time(config: FusionConfig, axis: str) -> float:
     """How long the model of an axis remembers where it began [s]."""
     return config.arm.delay_of(axis) + _SETTLED * config.arm.axes[axis].plant.lag
 
@@ -640,7 +640,7 @@ def _evidence(
     constant of each sensor. Score over information is the share, 1/√information its standard deviation.
     """
     model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
-    until, score, information = settled(config, axis), 0.0, 0.0
+    until, score, information = settling_time(config, axis), 0.0, 0.0
     (told_at, command), start = segment.commands_of(axis), segment.start[axis]
     before = np.arange(-min(int(until / period) + 1, _MOST), 0.0)
     earlier = np.concatenate([told_at[0] + np.rint(before * (period * 1e9)).astype(np.int64), told_at])

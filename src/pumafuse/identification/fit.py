@@ -165,7 +165,7 @@ def _search(batch: Batch, order: Order, starts: FloatArray) -> FloatArray:
 
 def _starts(trial: Trial) -> FloatArray:
     """The best cells of a grid for one trial, of either order and each of another delay, (2, s, 3)."""
-    measured, span = _measured(trial), float(trial.time[-1])
+    measured, span = _to_recording(trial), float(trial.time[-1])
     spacing = span / min(int(np.count_nonzero(trial.time > 0.0)), _MOST_DELAYS)
     delays: list[float] = np.arange(0.0, 0.8 * span, spacing).tolist()
     lags: list[float] = np.geomspace(0.5 * spacing, span, _LAGS).tolist()
@@ -181,7 +181,7 @@ def _starts(trial: Trial) -> FloatArray:
     return np.array(starts)
 
 
-def _measured(trial: Trial) -> Measured:
+def _to_recording(trial: Trial) -> Measured:
     """A trial as the search for arms takes it: a recording of one command, in steps; its zero is free."""
     n, value = len(trial.time), trial.position / trial.step
     time, source = np.rint(trial.time * 1e9).astype(np.int64), np.zeros(n, dtype=np.int64)
@@ -202,10 +202,10 @@ def _fit(trial: Trial, numbers: FloatArray, order: Order) -> StepFit:
     freedom = max(len(time) - len(fitted), 1)
     covariance = np.zeros((5, 5))
     covariance[np.ix_(fitted, fitted)] = inverse(jacobian) * (rms**2 * len(time) / freedom)
-    return StepFit(order, shape, gain, zero, rms, len(time), covariance, reached(time, shape), len(fitted))
+    return StepFit(order, shape, gain, zero, rms, len(time), covariance, share_reached(time, shape), len(fitted))
 
 
-def reached(time: FloatArray, shape: Shape) -> float:
+def share_reached(time: FloatArray, shape: Shape) -> float:
     """Share of its final value that a response has reached with the last sample."""
     return float(unit_response(np.array(time[-1] - shape.delay), shape.q, shape.p))
 

@@ -28,9 +28,9 @@ from .frame_start import FrameStart
 from .health import Counts, Health, by_word
 from .joints import Joints
 from .rate_limit import RateLimitedLog
-from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
+from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refuse, update_result
 from .screening import NEWS, CommandScreen, HoldWatch, Screened
-from .tool import NO_TOOL, NOISE, ORIENTATION, Row, axes_of, check_tool, row_noise, tool_of
+from .tool import NO_TOOL, NOISE, ORIENTATION, Row, axes_of, check_tool, parse_noise, tool_of
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
@@ -145,7 +145,7 @@ class LiveEstimator:
         self._screen, self._holds = CommandScreen(config.arm.update_period), HoldWatch(self._clock.window // 2)
         self._follows = [[latest_follow(config, name, axis) for axis in self.axes] for name in config.sensors]
         self._start = dict(start or {})
-        self._begin(Counts(len(self._sensors)))
+        self._restart(Counts(len(self._sensors)))
 
     def command(self, t: Time, /, **axes: Any) -> UpdateResult:
         """Add a command: the arm is to go to a position [m] on each of ``axes``.
@@ -155,7 +155,7 @@ class LiveEstimator:
             **axes: u [m] of each commanded axis; x, y and z with a frame; and ``orientation``, a quaternion x, y, z, w,
                 for a tool that turns. Or all joints [rad or m] of the configuration's robot.
         """
-        return self._take(t, None, axes)
+        return self._add(t, None, axes)
 
     def measurement(self, t: Time, sensor: str, /, **axes: Any) -> UpdateResult:
         """Add a measurement of where the tool was.
@@ -167,7 +167,7 @@ class LiveEstimator:
                 a sensor with a frame or a marker all are as it measures them. ``noise`` is by what that of the sensor
                 is scaled.
         """
-        return self._take(t, str(sensor), axes)
+        return self._add(t, str(sensor), axes)
 
     def estimate(self, at: Time | None = None) -> LiveEstimate:
         """Where the tool is.
@@ -263,10 +263,10 @@ class LiveEstimator:
             sensor: Its name; empty for a command.
             values: As it came.
         """
-        parsed = self._parsed(sensor or None, {name: value for name, value in values.items() if name != NOISE})
+        parsed = self._parse(sensor or None, {name: value for name, value in values.items() if name != NOISE})
         if self._tool is None or not sensor:
             return parsed
-        return self._tool.of_tool(sensor, stamp_of(t), parsed).values
+        return self._tool.to_tool(sensor, stamp_of(t), parsed).values
 
     def health(self, at: Time | None = None) -> Health:
         """How each sensor does, and what became of everything so far.
@@ -290,10 +290,10 @@ class LiveEstimator:
         faults = (*self._diagnosis.shown, *rejected)
         return Health(newest, self.segment + 1, commands, sensors, self._strangers, faults)
 
-    def _begin(self, counts: Counts) -> None:
+    def _restart(self, counts: Counts) -> None:
         """An empty window; ``counts`` go on."""
         self._frame_start = FrameStart(self.config.frame, self.axes)
-        model = live_model(self.config, self._frame_start.start(self._start))
+        model = live_model(self.config, self._frame_start.start_at_level(self._start))
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
         self._tool = tool_of(self.config, self._log)
         self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled, as is known
@@ -308,18 +308,18 @@ class LiveEstimator:
         """No event stamped before is taken [ns]."""
         return max(self._clock.sure - self._clock.window, self._window.port.floor)
 
-    def _take(self, t: Time, sensor: str | None, values: _Values) -> UpdateResult:
+    def _add(self, t: Time, sensor: str | None, values: _Values) -> UpdateResult:
         """Put an event where its stamp says, if that can be."""
         try:
             event = _Event(stamp_of(t), sensor, values)
-            parsed = self._parsed(sensor, values)
+            parsed = self._parse(sensor, values)
         except ValueError as error:
             return self._refuse(sensor, values, _INVALID, str(error))
         if sensor is not None and sensor not in self._sensors:
             return self._refuse(sensor, values, _UNKNOWN, f"unknown sensor; {suggestion(sensor, self._sensors)}")
         clock, stamp = self._clock, event.stamp
         if not clock.low <= stamp <= clock.high:
-            if (refusal := self._judged(event)) is not None:
+            if (refusal := self._judge(event)) is not None:
                 return refusal
         elif clock.newest is not None and stamp > clock.newest:
             clock.settle(stamp)
@@ -328,7 +328,7 @@ class LiveEstimator:
         if self._event_log is not None:
             self._event_log.append(*event)
         result = self._take_in_time(event, parsed)
-        if self._set_back.take(COMMAND if sensor is None else self._sensors[sensor], stamp):
+        if self._set_back.add(COMMAND if sensor is None else self._sensors[sensor], stamp):
             return self._watch_clocks(event, result)
         return result
 
@@ -337,13 +337,13 @@ class LiveEstimator:
         stamp, sensor, values = event
         if sensor is not None:
             if stamp > self._screen.until:
-                self._settle(self._screen.believed())
+                self._settle(self._screen.release())
             return self._enter(stamp, sensor, parsed)
         self._counts.outcomes[COMMAND, _STRAY] += 1  # as long as it waits for the next
         in_joints = not self.joints.keys().isdisjoint(values)  # which are screened: a pose is of all of them
-        settled = self._settle(self._screen.take(stamp, values if in_joints else parsed))
+        settled = self._settle(self._screen.add(stamp, values if in_joints else parsed))
         waits = "leaps by many times the usual step: not used unless the next one is there, too"
-        return settled.get(stamp) or refused(values, _STRAY, waits)
+        return settled.get(stamp) or refuse(values, _STRAY, waits)
 
     def _watch_clocks(self, event: _Event, result: UpdateResult) -> UpdateResult:
         """Say that a sensor's clock was set back within the window, and start anew where all clocks were."""
@@ -366,12 +366,12 @@ class LiveEstimator:
         self._log.write("clock", told)
         return self._begin_segment(self._behind)
 
-    def _parsed(self, sensor: str | None, values: _Values) -> _Values:
+    def _parse(self, sensor: str | None, values: _Values) -> _Values:
         """An event's values with a pose in the place of joints, and a commanded orientation as axes."""
-        if self._joints is not None and (told := self._joints.told(values)) is not None:
-            values = self._joints.posed(values, told)
+        if self._joints is not None and (told := self._joints.parse(values)) is not None:
+            values = self._joints.to_pose(values, told)
         if self._tool is not None:
-            return self._tool.parsed(sensor, values)
+            return self._tool.parse(sensor, values)
         if ORIENTATION in values:
             raise ValueError(NO_TOOL)
         return values
@@ -390,19 +390,19 @@ class LiveEstimator:
                 values = {name: value for name, value in values.items() if name not in self.joints}
             if values or not stray:
                 self._counts.outcomes[COMMAND, _STRAY] -= 1
-                settled[stamp] = self._enter_command(stamp, values)
+                settled[stamp] = self._add_command(stamp, values)
         return settled
 
-    def _enter_command(self, stamp: int, values: _Values) -> UpdateResult:
+    def _add_command(self, stamp: int, values: _Values) -> UpdateResult:
         """Take a command that is to be used; one in joints changes the poses of others, where joints are later."""
         oldest = self._oldest()
-        if self._joints is None or (told := self._joints.told(values)) is None:
+        if self._joints is None or (told := self._joints.parse(values)) is None:
             return self._enter(stamp, None, values)
         by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
         try:
-            first = self._parsed(None, self._joints.posed(values, by_stamp.pop(stamp)))
+            first = self._parse(None, self._joints.to_pose(values, by_stamp.pop(stamp)))
             others = {
-                other: self._parsed(None, self._joints.posed({}, joints_told))
+                other: self._parse(None, self._joints.to_pose({}, joints_told))
                 for other, joints_told in by_stamp.items()
             }
         except ValueError as error:
@@ -418,16 +418,16 @@ class LiveEstimator:
             return self._feed(stamp, sensor, values, judged=again)
         if again:
             self._early = [event for event in self._early if event.sensor is not None or event.stamp != stamp]
-        return self._take_early(_Event(stamp, sensor, dict(values)), again)
+        return self._add_early(_Event(stamp, sensor, dict(values)), again)
 
-    def _judged(self, event: _Event) -> UpdateResult | None:
+    def _judge(self, event: _Event) -> UpdateResult | None:
         """What becomes of an event whose stamp is not plainly right; None if it is to be taken."""
         clock, (stamp, sensor, values) = self._clock, event
         newest, command = clock.newest, sensor is None
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
                 # The commands' clock counts: what came before is of another.
-                self._begin(self._counts.snapshot(self._window))
+                self._restart(self._counts.snapshot(self._window))
                 if self._event_log is not None:
                     self._event_log.begin_segment()
             clock.start(stamp)
@@ -468,7 +468,7 @@ class LiveEstimator:
             if part is not None:
                 part.forget(after)
         if self._tool is not None:
-            self._place_again(self._tool.forget(after))
+            self._amend_placed(self._tool.forget(after))
         self._screen.restart()
         if self._event_log is not None:
             self._event_log.discard(after)
@@ -498,13 +498,13 @@ class LiveEstimator:
         self._start = {}
         if self._joints is not None:
             self._joints.restart()
-        self._begin(self._counts.snapshot(self._window))
+        self._restart(self._counts.snapshot(self._window))
         if self._event_log is not None:
             self._event_log.begin_segment()
         self._clock.start(next(event.stamp for event in events if event.sensor is None))
-        return [self._take(*event) for event in events][-1]
+        return [self._add(*event) for event in events][-1]
 
-    def _take_early(self, event: _Event, again: bool) -> UpdateResult:
+    def _add_early(self, event: _Event, again: bool) -> UpdateResult:
         """Take an event while the frame's place may still change; a command before all others moves it."""
         assert self._early is not None
         oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
@@ -515,11 +515,11 @@ class LiveEstimator:
         if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
             frame_start = FrameStart(self.config.frame, self.axes)
             try:
-                frame_start.begin(event.stamp, x, y)
+                frame_start.start_at_command(event.stamp, x, y)
             except RunError as error:
                 return self._refuse(None, event.values, _INVALID, str(error))
             early = [earlier for earlier in self._early if earlier.stamp >= oldest]
-            self._begin(self._before)
+            self._restart(self._before)
             self._early, self._frame_start = early, frame_start
             for earlier in early:
                 self._feed(*earlier)
@@ -537,10 +537,10 @@ class LiveEstimator:
             if self._spreads:
                 window.spread[:] = self._no_spread
             if NOISE in values:
-                noise, self._spreads = row_noise(values), True
+                noise, self._spreads = parse_noise(values), True
                 values = {name: value for name, value in values.items() if name != NOISE}
             if tool is not None:
-                told = tool.of_tool(measured, stamp, values)
+                told = tool.to_tool(measured, stamp, values)
                 values = told.values
         for name, value in values.items():
             axis = self._bits.get(name)
@@ -550,7 +550,7 @@ class LiveEstimator:
             new[axis] = value if type(value) is float else number(value)
             bits |= 1 << axis
         if stranger and self.config.frame is not None:
-            bits |= self._turned(stamp, sensor, values)
+            bits |= self._put_axes(stamp, sensor, values)
             stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
         oldest = self._oldest()
         if stamp < oldest:
@@ -562,10 +562,10 @@ class LiveEstimator:
             window.spread[:] = [noise * factor for factor in window.spread]
         if measured is not None:
             if tool is not None and told is not None and told.seen is not None:
-                tool.keep(measured, Row(stamp, told.seen, [*new, *window.spread], noise), oldest)
-            held, released = self._held(stamp, measured, bits)
+                tool.add(measured, Row(stamp, told.seen, [*new, *window.spread], noise), oldest)
+            held, released = self._find_held(stamp, measured, bits)
             if released or held:
-                return self._without_held(stamp, measured, bits, held, released)
+                return self._add_news(stamp, measured, bits, held, released)
         if not bits:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
@@ -573,30 +573,30 @@ class LiveEstimator:
             return self._refuse(sensor, values, outcome, why, counts.outcomes)
         rows, diagnosis = window.port.end, self._diagnosis
         source = COMMAND if sensor is None else self._sensors[sensor]
-        diagnosis.recent.keep(stamp, source, bits, new, window.spread)
+        diagnosis.recent.add(stamp, source, bits, new, window.spread)
         taken = window.add(stamp, source, bits, oldest)
         if not taken:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
         codes = bytes(window.outcome)
         result = self._answers.get(codes) if not stranger else None
         result = result or self._answer(codes, stranger)
-        counts.read(window)
+        counts.count(window)
         is_due = self._clock.sure >= diagnosis.due or Outcome.REACQUIRED in codes
         if is_due and self._screen.until == NEVER:  # a command that waits may explain it all
-            diagnosis.look(window, self._clock.sure)
+            diagnosis.diagnose(window, self._clock.sure)
         if sensor is None:
             if not judged:
                 counts.outcomes[COMMAND, result.outcome] += 1
                 self._doubtful += result.outcome is _FUSED and self._clock.doubtful
                 if result.outcome in (_FUSED, Outcome.DUPLICATE):
-                    self._watch.intervals(stamp, values)
+                    self._watch.watch_intervals(stamp, values)
             self._commands.add(stamp, codes, window.value[:], oldest)
-            self._watch.limits(self._commands)
+            self._watch.watch_limits(self._commands)
             if self._tool is not None:
-                self._place_again(self._tool.command(stamp, values, oldest))
+                self._amend_placed(self._tool.command(stamp, values, oldest))
             return result
         if not judged:
-            counts.came(source, stamp, self._clock.sure)
+            counts.add_row(source, stamp, self._clock.sure)
         if window.port.end == rows:  # it repeats another
             for code in codes.replace(_ABSENT, b""):
                 counts.outcomes[source, code] += 1
@@ -606,20 +606,20 @@ class LiveEstimator:
             del self._contradicting[sensor]
         return result
 
-    def _without_held(
+    def _add_news(
         self, stamp: int, sensor: str, bits: int, held: int, released: Sequence[tuple[int, str, float, float]]
     ) -> UpdateResult:
         """Give the window what is news of a measurement that has come to it, and what was not used before and is."""
-        self._counts.came(self._sensors[sensor], stamp, self._clock.sure)
+        self._counts.add_row(self._sensors[sensor], stamp, self._clock.sure)
         kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (bits & ~held) >> axis & 1}
         again = [name for name, axis in self._bits.items() if held >> axis & 1]
-        result = self._feed(stamp, sensor, kept, judged=True) if kept else refused(again, _HELD, REASONS[_HELD])
+        result = self._feed(stamp, sensor, kept, judged=True) if kept else refuse(again, _HELD, REASONS[_HELD])
         for earlier, name, value, spread in released:
             self._window.spread[self._bits[name]] = spread
             self._feed(earlier, sensor, {name: value}, judged=True)
         return result
 
-    def _held(self, stamp: int, sensor: str, bits: int) -> tuple[int, list[tuple[int, str, float, float]]]:
+    def _find_held(self, stamp: int, sensor: str, bits: int) -> tuple[int, list[tuple[int, str, float, float]]]:
         """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
         held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
         follows, values, spread = self._follows[number], self._window.value, self._window.spread
@@ -640,7 +640,7 @@ class LiveEstimator:
                 )
         return held, released
 
-    def _place_again(self, since: int | None) -> None:
+    def _amend_placed(self, since: int | None) -> None:
         """Put measurements that the commands place where they are by now, those valid from an instant [ns] on."""
         if self._tool is None or since is None:
             return
@@ -653,13 +653,13 @@ class LiveEstimator:
                 for name in values.keys() & self._bits.keys():
                     window.value[self._bits[name]] = values[name]
                 if self.config.frame is not None:
-                    self._turned(row.stamp, sensor, values, row.noise)
+                    self._put_axes(row.stamp, sensor, values, row.noise)
                 row.numbers = [*window.value, *window.spread]
             stamps, now = np.array([row.stamp for row in rows]), np.array([row.numbers for row in rows])
             window.amend(self._sensors[sensor], stamps, before, now)
         window.spread[:] = self._no_spread
 
-    def _turned(self, stamp: int, sensor: str | None, values: _Values, noise: float = 1.0) -> int:
+    def _put_axes(self, stamp: int, sensor: str | None, values: _Values, noise: float = 1.0) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
         window, bits, near = self._window, 0, None
         if sensor is not None:
@@ -712,7 +712,7 @@ class LiveEstimator:
     def _refuse_late(self, stamp: int, sensor: str | None, values: _Values, outcomes: IntArray) -> UpdateResult:
         """Count an event that is behind the window; how late it is shows which window it would take."""
         if sensor is not None:
-            self._counts.came(self._sensors[sensor], stamp, self._clock.now)
+            self._counts.add_row(self._sensors[sensor], stamp, self._clock.now)
         late, window = self._clock.sure - stamp, self._clock.window
         why = f"stamped {late / 1e9:.3f} s behind the newest; the window is {window / 1e9:g} s"
         if late <= window:
@@ -723,7 +723,7 @@ class LiveEstimator:
         self, sensor: str | None, values: _Values, outcome: Outcome, reason: str, outcomes: IntArray | None = None
     ) -> UpdateResult:
         """Count an event that never comes into the window, a measurement for each of its axes, among ``outcomes``."""
-        outcomes, result = self._refused if outcomes is None else outcomes, refused(axes_of(values), outcome, reason)
+        outcomes, result = self._refused if outcomes is None else outcomes, refuse(axes_of(values), outcome, reason)
         if sensor is None:
             outcomes[COMMAND, outcome] += 1
         elif sensor in self._sensors:

@@ -167,7 +167,7 @@ class Reader:
         self._coming: Iterator[SimpleNamespace] = iter(())
         self._next: SimpleNamespace | None = None  # of the path; then come the others
 
-    def lacks(self, empty: Any) -> list[str]:
+    def missing_fields(self, empty: Any) -> list[str]:
         """The fields that a type of messages has not, of which this is an empty one."""
         parts = _rows(empty, self._asks_whole)
         if self._is_of_paths:

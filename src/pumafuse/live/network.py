@@ -73,7 +73,7 @@ class UdpListener:
         if not self._backlog:
             select.select([self._socket], [], [], QUIET)
         self._receive(_MOST_RECEIVED)
-        if (lost := self._lost()) > self._reported:
+        if (lost := self._count_lost()) > self._reported:
             self._reported = lost
             self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
         return _lines(self._backlog.some(time.monotonic()))
@@ -81,7 +81,7 @@ class UdpListener:
     def stop(self) -> list[bytes]:
         """Close the socket, and return the lines that have come and were not given yet."""
         self._receive(_MOST_LEFT)
-        self._lost()  # for the last time
+        self._count_lost()  # for the last time
         self._socket.close()
         return _lines(self._backlog.remaining())
 
@@ -89,7 +89,7 @@ class UdpListener:
         """How many came, and how many were lost or refused."""
         waited = self._backlog
         taken = waited.received - waited.dropped - waited.shed
-        text = f"{self._name}: {taken} datagrams taken in, {self._lost()} lost{waited.shed_words}"
+        text = f"{self._name}: {taken} datagrams taken in, {self._count_lost()} lost{waited.shed_words}"
         return f"{text}, {self._refused} refused" if self._refused else text
 
     def _receive(self, most: int) -> None:
@@ -104,9 +104,9 @@ class UdpListener:
                 self._refused += 1
                 self._log.write("refused", f"a datagram from {sender[0]}, which --allow does not name: refused")
                 continue
-            self._backlog.append(now, bytes(self._room[:size]))
+            self._backlog.add(now, bytes(self._room[:size]))
 
-    def _lost(self) -> int:
+    def _count_lost(self) -> int:
         """How many datagrams were dropped, here or by the system."""
         if sys.platform == "linux" and self._socket.fileno() >= 0:
             with contextlib.suppress(OSError):
@@ -329,18 +329,18 @@ class EventClient(_Client):
         with connection, contextlib.suppress(OSError):
             _keep_alive(connection)
             try:
-                for events in self._received(connection):
+                for events in self._receive(connection):
                     now = time.monotonic()
                     with self._came:
                         for event in events:
-                            self._backlog.append(now, event)
+                            self._backlog.add(now, event)
                         self._came.notify()
                     some = True
             except (Refused, ConfigError, struct.error) as error:
                 self._log.write("refused", f"{self._name}: {self.REFUSED}{error}")
         return some
 
-    def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
+    def _receive(self, connection: socket.socket) -> Iterator[list[Event]]:
         """The events of each message; what is refused, or too short, is raised as Refused or struct.error."""
         raise NotImplementedError
 

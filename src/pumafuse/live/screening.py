@@ -51,7 +51,7 @@ class Steps:
             steps = np.array(self._recent)
             self._new, self.usual = 0, max(usual_of(steps), _BELIEVED * float(steps.max()))
 
-    def leapt(self, value: float) -> bool:
+    def has_leapt(self, value: float) -> bool:
         """Whether the next value is many times the usual step away."""
         return self.usual > 0.0 and leaps(value, self.value, max(self.usual, self.pace))
 
@@ -173,7 +173,7 @@ class CommandScreen:
         self._last, self.until = ALWAYS, NEVER  # who waits is believed when something is stamped later [ns]
         self._waiting: list[tuple[int, dict[str, Any]]] = []
 
-    def take(self, stamp: int, values: Mapping[str, Any]) -> list[Screened]:
+    def add(self, stamp: int, values: Mapping[str, Any]) -> list[Screened]:
         """Take a command; those that are decided by now, without what is stray, and that."""
         consecutive, self._last = 0 < stamp - self._last <= self._apart, stamp
         told = list[Screened]()
@@ -182,14 +182,14 @@ class CommandScreen:
             if not told and len(self._waiting) < MOST_STRAY:
                 self._waiting.append((stamp, dict(values)))
                 return []
-        told = told or self.believed()
+        told = told or self.release()
         if consecutive and any(self._leaps(name, value) for name, value in values.items()):
             self._waiting, self.until = [(stamp, dict(values))], stamp + self._patience
             return told
         self._learn(values, consecutive)
         return [*told, Screened(stamp, dict(values), {})]
 
-    def believed(self) -> list[Screened]:
+    def release(self) -> list[Screened]:
         """Those that wait, as nothing has shown that they are stray."""
         told, self._waiting, self.until = self._waiting, [], NEVER
         for _, values in told:
@@ -209,7 +209,7 @@ class CommandScreen:
         return told
 
     def _leaps(self, name: str, value: Any) -> bool:
-        return name in self._axes and self._axes[name].leapt(number(value))
+        return name in self._axes and self._axes[name].has_leapt(number(value))
 
     def _learn(self, values: Mapping[str, Any], consecutive: bool) -> None:
         for name, value in values.items():

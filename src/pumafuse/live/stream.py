@@ -59,7 +59,7 @@ class Stream:
         self._out: list[bytes] = []
         self._log = RateLimitedLog(notify)
 
-    def take(self, items: Iterable[bytes | Event]) -> None:
+    def add(self, items: Iterable[bytes | Event]) -> None:
         """Take in lines and events, and write the estimates that are due after each."""
         for item in items:
             self.line(item) if isinstance(item, bytes) else self.event(item)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray
 from .motion import Motion, Plant
-from .register import Quantity, Registration, rows_of, thinned, within
+from .register import Quantity, Registration, rows_of, thin, within
 from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, residual, slopes, tell
 
 Later = Mapping[str, float]  # of each joint [s]
@@ -66,7 +66,7 @@ def joint_lags(
 
 def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Registration) -> _Step:
     """How much later each joint is beside a registration."""
-    sensor = _seen(told(later), sensor)
+    sensor = _drop_start(told(later), sensor)
     attitude = registration.rms_rotation is not None
     mean = np.concatenate([motion.position for motion in sensor]).mean(axis=0)
     state = _state(registration, mean)
@@ -93,10 +93,10 @@ def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Regi
     return _Step(step[of_joints], after.half_widths(np.eye(len(step))[of_joints]), off.noise())
 
 
-def _seen(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:
+def _drop_start(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:
     """What the sensor told once it is forgotten how the arm moved before the first command."""
     both = zip(command, sensor, strict=True)
-    return thinned(
+    return thin(
         [within(motion.valid(), command_motion.valid().time, _SETTLED) for command_motion, motion in both], _ROWS
     )
 
