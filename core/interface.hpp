@@ -17,15 +17,15 @@ struct Size {};
 template <template <class> class Of, class Real, class In>
 std::vector<Of<Real>> lifted(const In* in, Time count, const std::vector<const In*>& tangents) {
     constexpr std::size_t fields = sizeof(In) / sizeof(double);
-    std::vector<Of<Real>> found(count);
-    Real* to = reinterpret_cast<Real*>(found.data());
+    std::vector<Of<Real>> numbers(count);
+    Real* to = reinterpret_cast<Real*>(numbers.data());
     for (std::size_t i = 0; i < count * fields; ++i) {
         to[i] = reinterpret_cast<const double*>(in)[i];
         if constexpr (!std::is_same_v<Real, double>)
             for (std::size_t k = 0; k < tangents.size(); ++k)
                 to[i].d[k / 2][k % 2] = reinterpret_cast<const double*>(tangents[k])[i];
     }
-    return found;
+    return numbers;
 }
 
 template <class Real>

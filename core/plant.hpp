@@ -79,8 +79,8 @@ class Plant {
     // are remembered, as what comes regularly has few. The residual asks first: the response may share what it got.
     const Driven<Real>& driven_over(Real t) const { return looked_up(driven, t); }
     const Transition<Real>& over(Real t) const {
-        const auto& [last, found] = driven[slot(t)];
-        return is_zero(t - last) ? found : looked_up(undriven, t);
+        const auto& [last, transition] = driven[slot(t)];
+        return is_zero(t - last) ? transition : looked_up(undriven, t);
     }
 
     // Of an interval that will not come again.
@@ -130,9 +130,9 @@ class Plant {
 
     template <class Of>
     const Of& looked_up(Some<Of>& some, Real t) const {
-        auto& [last, found] = some[slot(t)];
-        if (!is_zero(t - last)) last = t, compute(t, found);  // in place: a copy would wait for it
-        return found;
+        auto& [last, transition] = some[slot(t)];
+        if (!is_zero(t - last)) last = t, compute(t, transition);  // in place: a copy would wait for it
+        return transition;
     }
 
     template <class Of>

@@ -13,7 +13,7 @@ struct pf_filter {
     virtual ~pf_filter() = default;
     virtual void run(int mode, const Table& rows, Time begin, Time end, Time n, const Time* time, const Time* asked,
                      double* outputs) = 0;
-    virtual bool bias(Time sensor, Time axis, double found[2]) const = 0;
+    virtual bool bias(Time sensor, Time axis, double numbers[2]) const = 0;
 };
 
 namespace {
@@ -33,10 +33,10 @@ struct Recorded final : pf_filter {
         else pumafuse::run(filter, state, rows, begin, end, mode == PF_REPEATED, n, time, outputs);
     }
 
-    bool bias(Time sensor, Time axis, double found[2]) const override {
+    bool bias(Time sensor, Time axis, double numbers[2]) const override {
         const int i = filter.bias[sensor * axes + axis];
         const Residual<N, double>& xi = state.axes[axis].residual;
-        if (i >= 0) found[0] = xi.x[i], found[1] = filter.axes[axis].sd_of(xi, i);
+        if (i >= 0) numbers[0] = xi.x[i], numbers[1] = filter.axes[axis].sd_of(xi, i);
         return i >= 0;
     }
 };
@@ -53,9 +53,9 @@ void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     const Decay<double> e = arm.plant.decaying(f, dt);
     const double lambda = std::sqrt(3.0) / axis->disturbance_time, density = 4.0 / lambda;
     const Driven<double> d = Plant<double>(lambda, 1.0, 0.0).driven_over(dt);
-    const double found[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, e.position, e.rate, e.left, d.f11, d.f12, d.f21,
-                            d.f22, density * d.q11, density * d.q12, density * d.q22};
-    std::copy_n(found, 17, step);
+    const double numbers[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, e.position, e.rate, e.left, d.f11, d.f12,
+                              d.f21, d.f22, density * d.q11, density * d.q12, density * d.q22};
+    std::copy_n(numbers, 17, step);
 }
 
 int pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int64_t* given, const double* command,

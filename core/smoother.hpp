@@ -141,7 +141,7 @@ template <int COLUMNS, int N>
 void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& history,
                  std::vector<Filtered<N>>& at, Time origin, Time n, const Time* times, double* outputs) {
     const Time A = filter.size();
-    const Known<N, double>& axis = filter.axes[a];
+    const AxisModel<N, double>& axis = filter.axes[a];
     Later<N, COLUMNS> later;
     Time k = n - 1;
     const auto smoothed = [&] {  // estimate k, and on to the one before
@@ -182,7 +182,7 @@ void run_smoothed(const Filter<N>& filter, State<N, double>& state, const Table&
             filter.step(state, rows[row], rows.fate(row), false, &history);
         for (Time a = 0; a < A && k < n; ++a) {
             AxisState<N, double> now = state.axes[a];
-            filter.advance(now, a, {times[k], 0.0});
+            filter.predict(now, a, {times[k], 0.0});
             const Response<double>& r = now.response;
             at.push_back({r.position(filter.axes[a].arm), filter.axes[a].doubt(r), now.residual});
         }

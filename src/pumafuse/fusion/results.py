@@ -133,7 +133,7 @@ class Making:
 
 
 def write_stamps(folder: Path, stamps: Mapping[str, tuple[int, int]]) -> None:
-    """Write into a result folder of which files it was made, for :meth:`Making.read_summary`; ``stamps`` are of before."""
+    """Write of which files a result was made, for :meth:`Making.read_summary`; ``stamps`` are of before."""
     (folder / _LOG).write_bytes(msgspec.json.format(msgspec.json.encode(stamps)) + b"\n")
 
 

@@ -327,21 +327,21 @@ class LiveEstimator:
             clock.other, self._set_aside = [], []
         if self._event_log is not None:
             self._event_log.append(*event)
-        result = self._take_in_time(event, parsed)
+        result = self._screen_event(event, parsed)
         if self._set_back.add(COMMAND if sensor is None else self._sensors[sensor], stamp):
             return self._watch_clocks(event, result)
         return result
 
-    def _take_in_time(self, event: _Event, parsed: _Values) -> UpdateResult:
+    def _screen_event(self, event: _Event, parsed: _Values) -> UpdateResult:
         """Take an event whose stamp is right, as it came and as it is used."""
         stamp, sensor, values = event
         if sensor is not None:
             if stamp > self._screen.until:
-                self._settle(self._screen.release())
-            return self._enter(stamp, sensor, parsed)
+                self._add_screened(self._screen.release())
+            return self._add_in_frame(stamp, sensor, parsed)
         self._counts.outcomes[COMMAND, _STRAY] += 1  # as long as it waits for the next
         in_joints = not self.joints.keys().isdisjoint(values)  # which are screened: a pose is of all of them
-        settled = self._settle(self._screen.add(stamp, values if in_joints else parsed))
+        settled = self._add_screened(self._screen.add(stamp, values if in_joints else parsed))
         waits = "leaps by many times the usual step: not used unless the next one is there, too"
         return settled.get(stamp) or refuse(values, _STRAY, waits)
 
@@ -376,7 +376,7 @@ class LiveEstimator:
             raise ValueError(NO_TOOL)
         return values
 
-    def _settle(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
+    def _add_screened(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
         """Enter commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
         settled = dict[int, UpdateResult]()
         for stamp, values, stray in commands:
@@ -397,7 +397,7 @@ class LiveEstimator:
         """Take a command that is to be used; one in joints changes the poses of others, where joints are later."""
         oldest = self._oldest()
         if self._joints is None or (told := self._joints.parse(values)) is None:
-            return self._enter(stamp, None, values)
+            return self._add_in_frame(stamp, None, values)
         by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
         try:
             first = self._parse(None, self._joints.to_pose(values, by_stamp.pop(stamp)))
@@ -407,15 +407,15 @@ class LiveEstimator:
             }
         except ValueError as error:
             return self._refuse(None, values, _INVALID, str(error))
-        result = self._enter(stamp, None, first)
+        result = self._add_in_frame(stamp, None, first)
         for other, pose in others.items():
-            self._enter(other, None, pose, again=True)
+            self._add_in_frame(other, None, pose, again=True)
         return result
 
-    def _enter(self, stamp: int, sensor: str | None, values: _Values, again: bool = False) -> UpdateResult:
+    def _add_in_frame(self, stamp: int, sensor: str | None, values: _Values, again: bool = False) -> UpdateResult:
         """Take an event that is to be used; ``again``: in the place of a command of the same stamp."""
         if self._early is None:
-            return self._feed(stamp, sensor, values, judged=again)
+            return self._add_to_window(stamp, sensor, values, judged=again)
         if again:
             self._early = [event for event in self._early if event.sensor is not None or event.stamp != stamp]
         return self._add_early(_Event(stamp, sensor, dict(values)), again)
@@ -510,7 +510,7 @@ class LiveEstimator:
         oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
         if origin is not None and self._clock.sure - origin > self._clock.window:
             self._early = None
-            return self._feed(*event, judged=again)
+            return self._add_to_window(*event, judged=again)
         x, y = (number(event.values.get(name)) for name in ("x", "y"))
         if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
             frame_start = FrameStart(self.config.frame, self.axes)
@@ -522,26 +522,50 @@ class LiveEstimator:
             self._restart(self._before)
             self._early, self._frame_start = early, frame_start
             for earlier in early:
-                self._feed(*earlier)
+                self._add_to_window(*earlier)
         if len(self._early) >= _MOST_ASIDE:
             del self._early[: _MOST_ASIDE // 2]
         self._early.append(event)
-        return self._feed(*event, judged=again)
+        return self._add_to_window(*event, judged=again)
 
-    def _feed(self, stamp: int, sensor: str | None, values: _Values, judged: bool = False) -> UpdateResult:
-        """Give an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
-        window, counts, bits, stranger = self._window, self._counts, 0, ""
-        new, told, noise, tool = window.value, None, 1.0, self._tool
-        measured = None if judged else sensor  # whose row it is that comes for the first time
-        if measured is not None:
-            if self._spreads:
-                window.spread[:] = self._no_spread
-            if NOISE in values:
-                noise, self._spreads = parse_noise(values), True
-                values = {name: value for name, value in values.items() if name != NOISE}
-            if tool is not None:
-                told = tool.to_tool(measured, stamp, values)
-                values = told.values
+    def _add_to_window(self, stamp: int, sensor: str | None, values: _Values, judged: bool = False) -> UpdateResult:
+        """Put an event that is in time into the window; ``judged``: it is not held, nor counted anew."""
+        if sensor is not None and not judged:
+            return self._add_row(stamp, sensor, values)
+        bits, stranger = self._fill(stamp, sensor, values)
+        if stamp < (oldest := self._oldest()):
+            return self._refuse_late(stamp, sensor, values, self._counts.outcomes)
+        return self._update(stamp, sensor, values, bits, stranger, oldest, judged)
+
+    def _add_row(self, stamp: int, sensor: str, values: _Values) -> UpdateResult:
+        """Put a measurement into the window: as it tells of the tool, as noisy as it says, without what is no news."""
+        window, tool, told, noise = self._window, self._tool, None, 1.0
+        if self._spreads:
+            window.spread[:] = self._no_spread
+        if NOISE in values:
+            noise, self._spreads = parse_noise(values), True
+            values = {name: value for name, value in values.items() if name != NOISE}
+        if tool is not None:
+            told = tool.to_tool(sensor, stamp, values)
+            values = told.values
+        bits, stranger = self._fill(stamp, sensor, values)
+        if stamp < (oldest := self._oldest()):
+            return self._refuse_late(stamp, sensor, values, self._counts.outcomes)
+        if told is not None:
+            for name in told.spread.keys() & self._bits.keys():
+                window.spread[self._bits[name]] = told.spread[name]
+        if noise != 1.0:
+            window.spread[:] = [noise * factor for factor in window.spread]
+        if tool is not None and told is not None and told.seen is not None:
+            tool.add(sensor, Row(stamp, told.seen, [*window.value, *window.spread], noise), oldest)
+        held, released = self._find_held(stamp, sensor, bits)
+        if released or held:
+            return self._add_news(stamp, sensor, bits, held, released)
+        return self._update(stamp, sensor, values, bits, stranger, oldest)
+
+    def _fill(self, stamp: int, sensor: str | None, values: _Values) -> tuple[int, str]:
+        """Put an event's values into the window's ``value``; which axes these are, as bits, and a name that is none."""
+        new, bits, stranger = self._window.value, 0, ""
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
@@ -552,30 +576,28 @@ class LiveEstimator:
         if stranger and self.config.frame is not None:
             bits |= self._put_axes(stamp, sensor, values)
             stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
-        oldest = self._oldest()
-        if stamp < oldest:
-            return self._refuse_late(stamp, sensor, values, counts.outcomes)
-        if told is not None:
-            for name in told.spread.keys() & self._bits.keys():
-                window.spread[self._bits[name]] = told.spread[name]
-        if noise != 1.0:
-            window.spread[:] = [noise * factor for factor in window.spread]
-        if measured is not None:
-            if tool is not None and told is not None and told.seen is not None:
-                tool.add(measured, Row(stamp, told.seen, [*new, *window.spread], noise), oldest)
-            held, released = self._find_held(stamp, measured, bits)
-            if released or held:
-                return self._add_news(stamp, measured, bits, held, released)
+        return bits, stranger
+
+    def _update(
+        self,
+        stamp: int,
+        sensor: str | None,
+        values: _Values,
+        bits: int,
+        stranger: str,
+        oldest: int,
+        judged: bool = False,
+    ) -> UpdateResult:
+        """Let the filter run on from the place of an event that fills the window's ``value``; what became of it."""
+        window, counts, diagnosis = self._window, self._counts, self._diagnosis
         if not bits:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
             outcome = Outcome.BEFORE_START if missing else _UNKNOWN
             return self._refuse(sensor, values, outcome, why, counts.outcomes)
-        rows, diagnosis = window.port.end, self._diagnosis
-        source = COMMAND if sensor is None else self._sensors[sensor]
-        diagnosis.recent.add(stamp, source, bits, new, window.spread)
-        taken = window.add(stamp, source, bits, oldest)
-        if not taken:
+        rows, source = window.port.end, COMMAND if sensor is None else self._sensors[sensor]
+        diagnosis.recent.add(stamp, source, bits, window.value, window.spread)
+        if not window.add(stamp, source, bits, oldest):
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
         codes = bytes(window.outcome)
         result = self._answers.get(codes) if not stranger else None
@@ -590,10 +612,7 @@ class LiveEstimator:
                 self._doubtful += result.outcome is _FUSED and self._clock.doubtful
                 if result.outcome in (_FUSED, Outcome.DUPLICATE):
                     self._watch.watch_intervals(stamp, values)
-            self._commands.add(stamp, codes, window.value[:], oldest)
-            self._watch.watch_limits(self._commands)
-            if self._tool is not None:
-                self._amend_placed(self._tool.command(stamp, values, oldest))
+            self._follow_command(stamp, values, codes, oldest)
             return result
         if not judged:
             counts.add_row(source, stamp, self._clock.sure)
@@ -606,6 +625,13 @@ class LiveEstimator:
             del self._contradicting[sensor]
         return result
 
+    def _follow_command(self, stamp: int, values: _Values, codes: bytes, oldest: int) -> None:
+        """Let a command that is in the window move what goes by commands: watches, and measurements on the tool."""
+        self._commands.add(stamp, codes, self._window.value[:], oldest)
+        self._watch.watch_limits(self._commands)
+        if self._tool is not None:
+            self._amend_placed(self._tool.command(stamp, values, oldest))
+
     def _add_news(
         self, stamp: int, sensor: str, bits: int, held: int, released: Sequence[tuple[int, str, float, float]]
     ) -> UpdateResult:
@@ -613,10 +639,10 @@ class LiveEstimator:
         self._counts.add_row(self._sensors[sensor], stamp, self._clock.sure)
         kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (bits & ~held) >> axis & 1}
         again = [name for name, axis in self._bits.items() if held >> axis & 1]
-        result = self._feed(stamp, sensor, kept, judged=True) if kept else refuse(again, _HELD, REASONS[_HELD])
+        result = self._add_to_window(stamp, sensor, kept, judged=True) if kept else refuse(again, _HELD, REASONS[_HELD])
         for earlier, name, value, spread in released:
             self._window.spread[self._bits[name]] = spread
-            self._feed(earlier, sensor, {name: value}, judged=True)
+            self._add_to_window(earlier, sensor, {name: value}, judged=True)
         return result
 
     def _find_held(self, stamp: int, sensor: str, bits: int) -> tuple[int, list[tuple[int, str, float, float]]]:

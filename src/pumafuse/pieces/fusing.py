@@ -1,8 +1,8 @@
 """Fusion of a long run piece by piece: one filter whose state goes on from piece to piece.
 
-Each piece is a table of events of its own (:func:`pumafuse.fusion.segments.build_segment`) with some rows of the pieces before
-and after it, so that every row has the neighbours that it has in the whole run: estimates and outcomes are the same to
-the last bit. What the neighbourhood of a row says in words (notes, skill) is said piece by piece.
+Each piece is a table of events of its own (:func:`pumafuse.fusion.segments.build_segment`) with some rows of the pieces
+before and after it, so that every row has the neighbours that it has in the whole run: estimates and outcomes are the
+same to the last bit. What the neighbourhood of a row says in words (notes, skill) is said piece by piece.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ event, the gain error e decays as exp(−bt) with b = 1 / recovery, so that over
 
     z⁺ = e^(pΔ) z + (e^(pΔ) − 1)/p · u + (e^(pΔ) − e^(−bΔ))/(p + b) · e + ∫ e^(p(Δ−s)) dW(s).
 
-A drive with a fastest speed is no sum of poles: what the commands make of it is integrated (:func:`_limit_speed`), and the
-noise moves it as it moves the plant below that speed.
+A drive with a fastest speed is no sum of poles: what the commands make of it is integrated (:func:`_limit_speed`), and
+the noise moves it as it moves the plant below that speed.
 
 Nothing of the filter's discretisation is used here: the filter is tested against this.
 """
