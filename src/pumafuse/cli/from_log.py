@@ -81,7 +81,7 @@ def run(
                 fitted = tune(recorded, begun, fit=_FITTED, intervals=_FITTED_ARM, progress=progress)
             break
         except LostError as error:
-            if (others := _without(surveyed, error)) is None:
+            if (others := _drop_lost(surveyed, error)) is None:
                 advice = _its_run_toml(surveyed, log) if "run.toml" in str(error) else ""
                 raise RunError(f"{error}{advice}") from None
             surveyed = others
@@ -117,7 +117,7 @@ def _its_run_toml(survey: Survey, log: Path) -> str:
     return f" (`pumafuse init {shlex.quote(str(log))}` writes one)" if survey.roles else ""
 
 
-def _without(survey: Survey, lost: LostError) -> Survey | None:
+def _drop_lost(survey: Survey, lost: LostError) -> Survey | None:
     """What was found, without axes on which a sensor follows nothing; None if nothing else follows."""
     bad = {(name, axis) for name in lost.fault.sensors for axis in lost.fault.axes}
     measured = {name: sensor.values for name, sensor in survey.run.sensors.items()}

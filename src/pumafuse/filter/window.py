@@ -70,7 +70,7 @@ class Window(Handle):
         return None if origin == NEVER else origin
 
     def add(self, stamp: int, source: int, bits: int, oldest: int) -> bool:
-        """Take in an event whose axes are ``bits`` as bits; no event stamped before ``oldest`` will ever come [ns].
+        """Add an event whose axes are ``bits`` as bits; no event stamped before ``oldest`` will ever come [ns].
 
         Returns:
             False if to make room the window had to let go of its time.

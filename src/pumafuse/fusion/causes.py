@@ -434,10 +434,10 @@ def _sensors(part: _Part, base: Model) -> Iterator[tuple[Tried, Model]]:
         gaps = np.diff(measured.time[measured.sensor == number])
         interval = median(gaps) if len(gaps) else 0.0
         for factor in _FACTORS:
-            yield Tried(Cause.NOISE, name, factor), _seen(base, number, sd=factor * sd)
+            yield Tried(Cause.NOISE, name, factor), _change_view(base, number, sd=factor * sd)
         for which, ((drifting, white), lasting) in enumerate(product(_CORRELATED, _TIMES) if interval > 0.0 else ()):
             noise = {"sd": white * sd, "bias_drift_sd": drifting * sd, "bias_time": lasting * interval}
-            yield Tried(Cause.CORRELATED, name, which), _seen(base, number, **noise)
+            yield Tried(Cause.CORRELATED, name, which), _change_view(base, number, **noise)
 
 
 def _jitters(part: _Part, base: Model) -> Iterator[tuple[Tried, FloatArray]]:
@@ -449,7 +449,7 @@ def _jitters(part: _Part, base: Model) -> Iterator[tuple[Tried, FloatArray]]:
             yield Tried(Cause.JITTER, part.measured.sensors[number], latency_sd), np.hypot(1.0, latency_sd * noise)
 
 
-def _seen(base: Model, sensor: int, **numbers: float) -> Model:
+def _change_view(base: Model, sensor: int, **numbers: float) -> Model:
     view = base.view.copy()
     for name, value in numbers.items():
         view[name][sensor, 0] = value

@@ -81,12 +81,14 @@ class _Side(NamedTuple):
         return math.sqrt(_PARTS - 1) * float(np.std(each))
 
 
-def clock_steps(segment: Segment, arm: ArmModel, valid: TimeArray, positions: Mapping[str, Rows]) -> list[ClockStep]:
+def find_clock_steps(
+    segment: Segment, arm: ArmModel, valid: TimeArray, positions: Mapping[str, Rows]
+) -> list[ClockStep]:
     """Where the clock of a sensor was set, in the order of time.
 
     Its rows are ``valid`` at these instants, also those that measure nothing, ascending [ns], (n,).
     """
-    steps, every, edges = list[ClockStep](), leaps(valid), list[int]()
+    steps, every, edges = list[ClockStep](), find_leaps(valid), list[int]()
     while every:
         likely = [step for leap in every if (step := _clock_step(segment, arm, positions, leap, edges))]
         if likely:  # near a clock that was set, an outage looks like another one until rows beyond are left out
@@ -96,7 +98,7 @@ def clock_steps(segment: Segment, arm: ArmModel, valid: TimeArray, positions: Ma
     return sorted(steps, key=lambda step: step.leap.first)
 
 
-def leaps(stamp: TimeArray) -> list[Leap]:
+def find_leaps(stamp: TimeArray) -> list[Leap]:
     """Where ascending stamps leap [ns], (n,); the longest first."""
     interval = np.diff(stamp)
     if len(interval) < _FEW or (usual := median(interval)) <= 0.0:

@@ -22,7 +22,7 @@ from ..units import Kind, seconds
 from .config import FusionConfig
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
-from .faults import Fault, by_axis, latency_questions, sensor_faults, starts_in_motion
+from .faults import Fault, by_axis, check_sensors, latency_questions, starts_in_motion
 from .overruns import overrun_notes, overruns
 from .placing import in_base
 from .score import late_rows, reference_track
@@ -89,7 +89,7 @@ def fuse(
         measuring = [name for name in config.sensor_names(selected) if name in part.sensors]
         clocks += clock_faults(part, config.arm.update_period, measuring)
         segment = build_segment(part, config, selected)
-        faults += sensor_faults(segment, config)
+        faults += check_sensors(segment, config)
         moving += starts_in_motion(segment, config)
         times = output_times(segment, config, rate, mode == "as-live")
         share = None if progress is None else partial(_share, progress, len(parts), len(logged))

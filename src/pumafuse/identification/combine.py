@@ -19,7 +19,7 @@ from ..units import MS, SCREEN, Kind
 from .anova import order_levels, outlying, speed_levels
 from .batch import Order
 from .estimate import Estimate, common, fit_weighted, mean, regression, robust
-from .fit import StepFit, doubt, least_p, plant_of
+from .fit import StepFit, doubt_words, least_p, plant_of
 from .joint import JointFit, fit_together, inverse_square
 from .paper import minimise
 from .trials import Trial
@@ -114,7 +114,7 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool, kind: Kind) ->
     if usual == 0.0:
         return "the arm does not move"
     left_out = _find_unseen(fitted) if paper else _outlying(fitted)
-    left_out |= {fit.trial.name: why for fit in fitted if (why := doubt(fit.first, usual)) is not None}
+    left_out |= {fit.trial.name: why for fit in fitted if (why := doubt_words(fit.first, usual)) is not None}
     used = [fit for fit in fitted if fit.trial.name not in left_out]
     if len(used) < _FEWEST:
         why = "; ".join(f"trial '{name}' {reason}" for name, reason in list(left_out.items())[:3])

@@ -45,7 +45,7 @@ class Backlog(Generic[T]):
         return f", {self.shed} shed" if self.shed else ""
 
     def add(self, now: float, item: T) -> None:
-        """Let an item wait that has come at ``now`` [s]."""
+        """Add an item that has come at ``now`` [s]."""
         self.received += 1
         self._waiting.append((now, item))
         self._bytes += _size(item)

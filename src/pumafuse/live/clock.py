@@ -169,7 +169,7 @@ class _Source:
     told: int = 0  # the ``since`` that was told of
 
     def add(self, stamp: int, event: int) -> None:
-        """Take the stamp [ns] of the next row, which is the ``event``-th of all."""
+        """Add the stamp [ns] of the next row, which is the ``event``-th of all."""
         step, self.last, self.event = stamp - self.last, stamp, event
         if stamp > self.newest:
             if 0 < step <= _MOST * self.usual:
@@ -213,7 +213,7 @@ class SetBack:
         self._sources, self._events = [_Source() for _ in range(self._count + 1)], 0
 
     def add(self, source: int, stamp: int) -> bool:
-        """Take the stamp [ns] of the next event of ``COMMAND`` or a sensor; whether it is worth to ask for more."""
+        """Add the stamp [ns] of the next event of ``COMMAND`` or a sensor; whether it is worth to ask for more."""
         self._events += 1
         clock, commands = self._sources[source], self._sources[-1]
         clock.add(stamp, self._events)

@@ -109,7 +109,7 @@ class CommandWatch:
             self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
 
     def watch_intervals(self, stamp: int, values: Mapping[str, Any]) -> None:
-        """Take a fused command; say if they come at another interval than the update period, or many are missing."""
+        """Look at a fused command; say if they come at another interval than the update period, or many are missing."""
         recent = self._recent
         recent.append((stamp, values))
         if len(recent) == _FIRST and not self._knows_interval:

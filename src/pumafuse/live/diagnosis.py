@@ -25,7 +25,7 @@ from ..fusion.chi_square import upper_quantile
 from ..fusion.config import FusionConfig, Start
 from ..fusion.consistency import Finding, consistency
 from ..fusion.estimates import Estimates
-from ..fusion.faults import Fault, faults_of, settling_time
+from ..fusion.faults import Fault, find_faults, settling_time
 from ..fusion.offline import judge
 from ..fusion.segments import Segment, build_segment
 from ..fusion.verdicts import SHOWS, likeliest, sentence
@@ -67,7 +67,7 @@ class Recent:
         self._latest, self._start, self._first = [ALWAYS] * len(self._sensors), dict[str, float](), NEVER
 
     def add(self, stamp: int, source: int, bits: int, values: Array[c_double], spread: Array[c_double]) -> None:
-        """Keep an event: its values [m or rad], (A,), of axes that ``bits`` name, and by what their noise is scaled.
+        """Add an event: its values [m or rad], (A,), of axes that ``bits`` name, and by what their noise is scaled.
 
         Of a dense sensor some are kept.
         """
@@ -209,7 +209,7 @@ class Diagnosis:
         explained = {name for (names, *_), trouble in self._troubles.items() if trouble.is_said for name in names}
         faults = [
             fault
-            for fault in faults_of(segment, config, origin=0)
+            for fault in find_faults(segment, config, origin=0)
             if fault.cause != "nothing" or explained.isdisjoint(fault.sensors)
         ]
         faults += self._unexpected_innovations(judge(run, segment, config), faults)
@@ -223,14 +223,14 @@ class Diagnosis:
                 self._log.write(str(key), f"{fault.sentence} (by {now / 1e9:.3f} s)")
         keys, named = set(map(_key, faults)), {name for fault in faults for name in fault.sensors}
         for key in [key for key in self._troubles if key not in keys]:
-            self._not_found(key, travel, not named.isdisjoint(key[0]), now)
+            self._count_missed(key, travel, not named.isdisjoint(key[0]), now)
 
     def _is_set_back(self, fault: Fault) -> bool:
         """Whether stamps alone have shown, and it was said, that a clock was set back."""
         told = [self.set_back.get(name, ALWAYS) for name in fault.sensors]
         return fault.cause == "set" and fault.size < 0.0 and max(told) > fault.at - _BEFORE_NS
 
-    def _not_found(self, key: _Key, travel: Mapping[str, float], is_replaced: bool, now: int) -> None:
+    def _count_missed(self, key: _Key, travel: Mapping[str, float], is_replaced: bool, now: int) -> None:
         """Count that a fault does not show, and say so where the commands would show it, unless another one does."""
         (sensors, cause, _), trouble = key, self._troubles[key]
         moved = max((travel.get(axis, 0.0) for axis in trouble.fault.axes), default=0.0)

@@ -1,4 +1,17 @@
-"""The estimator that a program feeds event by event: :class:`LiveEstimator`."""
+"""The estimator that a program feeds event by event: :class:`LiveEstimator`.
+
+The road of an event, late or not:
+
+    command, measurement    what a program calls
+    _add                    reads its stamp and its values; a clock judges the stamp; the record gets the event
+    _screen_event           lets a command that leaps wait for the next one
+    _add_in_frame           places x, y and z, as soon as a command tells where a cylindrical frame starts
+    _add_row                of a measurement: where it sees the tool, how noisy it is, which values are no news
+    _update                 gives it to :meth:`.Window.add`, and counts what became of it
+
+That an event is late matters to ``Window::insert`` of the core alone (``core/window.hpp``): it puts the event in its
+place by time and restores the state before it, from where the filter runs on over all rows that are later.
+"""
 
 from __future__ import annotations
 
@@ -179,6 +192,85 @@ class LiveEstimator:
         """
         return self._estimate(at, NEVER)
 
+    def estimate_as_live(self, stamp: int) -> LiveEstimate:
+        """The estimate for an instant [ns] in the window by nothing that is stamped later, as if that had not come."""
+        return self._estimate(stamp, stamp)
+
+    def health(self, at: Time | None = None) -> Health:
+        """How each sensor does, and what became of everything so far.
+
+        Args:
+            at: Until when a sensor that is silent has been so; None: until the newest stamp.
+
+        Raises:
+            ValueError: ``at`` is no time.
+        """
+        newest = None if self._clock.newest is None else max(self._clock.now, stamp_of(at or 0))
+        counts = self._counts.snapshot(self._window)
+        sensors = {
+            name: counts.health(sensor, self._refused[sensor], newest, self._stale_ns)
+            for name, sensor in self._sensors.items()
+        }
+        commands = by_word(counts.outcomes[COMMAND] + self._refused[COMMAND])
+        rejected = (
+            f"sensor '{name}' contradicts '{other}': {_REJECTED}" for name, other in self._contradicting.items()
+        )
+        faults = (*self._diagnosis.shown, *rejected)
+        return Health(newest, self.segment + 1, commands, sensors, self._strangers, faults)
+
+    @property
+    def joints(self) -> Mapping[str, Kind]:
+        """What the joints that events may be in move by; empty without a robot."""
+        return {} if self._joints is None else self._joints.kinds
+
+    @property
+    def placed(self) -> Placed | None:
+        """The frame at its start; None without one, or before it has started."""
+        return self._frame_start.placed
+
+    @property
+    def newest(self) -> int | None:
+        """The newest stamp that is believed, int ns; None before any event."""
+        return self._clock.newest
+
+    @property
+    def sure(self) -> int | None:
+        """The newest stamp that nothing will take back, int ns: behind ``newest`` just after a jump ahead."""
+        return None if self._clock.newest is None else self._clock.sure
+
+    @property
+    def origin(self) -> int | None:
+        """The first command's stamp (of this segment), int ns; None before it."""
+        return self._window.origin
+
+    def until(self, t: Time, sensor: str | None = None) -> int | None:
+        """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
+
+        That is the event's stamp, if it is plausible or confirms a jump ahead; else the newest stamp that is confirmed.
+        """
+        try:
+            stamp = stamp_of(t)
+        except ValueError:
+            return self.sure
+        is_configured = sensor is None or sensor in self._sensors
+        right = self._clock.low <= stamp <= self._clock.high or (
+            is_configured and self._clock.ends_doubt(stamp, sensor)
+        )
+        return stamp if right else self.sure
+
+    def of_tool(self, t: Time, sensor: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What an event that was taken tells of the tool: its orientation as axes, its position along the base's axes.
+
+        Args:
+            t: Its stamp.
+            sensor: Its name; empty for a command.
+            values: As it came.
+        """
+        parsed = self._parse(sensor or None, {name: value for name, value in values.items() if name != NOISE})
+        if self._tool is None or not sensor:
+            return parsed
+        return self._tool.to_tool(sensor, stamp_of(t), parsed).values
+
     def _estimate(self, at: Time | None, after: int) -> LiveEstimate:
         """The same by nothing that is stamped after ``after`` [ns]."""
         newest = self._clock.newest
@@ -211,105 +303,10 @@ class LiveEstimator:
             orientation = self._tool.orientation([axes[axis].position for axis in TURNING if axis in axes])
         return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason, orientation, self._diagnosis.doubtful)
 
-    @property
-    def joints(self) -> Mapping[str, Kind]:
-        """What the joints that events may be in move by; empty without a robot."""
-        return {} if self._joints is None else self._joints.kinds
-
-    @property
-    def placed(self) -> Placed | None:
-        """The frame at its start; None without one, or before it has started."""
-        return self._frame_start.placed
-
-    @property
-    def newest(self) -> int | None:
-        """The newest stamp that is believed, int ns; None before any event."""
-        return self._clock.newest
-
-    @property
-    def sure(self) -> int | None:
-        """The newest stamp that nothing will take back, int ns: behind ``newest`` just after a jump ahead."""
-        return None if self._clock.newest is None else self._clock.sure
-
-    @property
-    def origin(self) -> int | None:
-        """The first command's stamp (of this segment), int ns; None before it."""
-        return self._window.origin
-
-    def estimate_as_live(self, stamp: int) -> LiveEstimate:
-        """The estimate for an instant [ns] in the window by nothing that is stamped later, as if that had not come."""
-        return self._estimate(stamp, stamp)
-
-    def until(self, t: Time, sensor: str | None = None) -> int | None:
-        """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
-
-        That is the event's stamp, if it is plausible or confirms a jump ahead; else the newest stamp that is confirmed.
-        """
-        try:
-            stamp = stamp_of(t)
-        except ValueError:
-            return self.sure
-        is_configured = sensor is None or sensor in self._sensors
-        right = self._clock.low <= stamp <= self._clock.high or (
-            is_configured and self._clock.ends_doubt(stamp, sensor)
-        )
-        return stamp if right else self.sure
-
-    def of_tool(self, t: Time, sensor: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """What an event that was taken tells of the tool: its orientation as axes, its position along the base's axes.
-
-        Args:
-            t: Its stamp.
-            sensor: Its name; empty for a command.
-            values: As it came.
-        """
-        parsed = self._parse(sensor or None, {name: value for name, value in values.items() if name != NOISE})
-        if self._tool is None or not sensor:
-            return parsed
-        return self._tool.to_tool(sensor, stamp_of(t), parsed).values
-
-    def health(self, at: Time | None = None) -> Health:
-        """How each sensor does, and what became of everything so far.
-
-        Args:
-            at: Until when a sensor that is silent has been so; None: until the newest stamp.
-
-        Raises:
-            ValueError: ``at`` is no time.
-        """
-        newest = None if self._clock.newest is None else max(self._clock.now, stamp_of(at or 0))
-        counts = self._counts.snapshot(self._window)
-        sensors = {
-            name: counts.health(sensor, self._refused[sensor], newest, self._stale_ns)
-            for name, sensor in self._sensors.items()
-        }
-        commands = by_word(counts.outcomes[COMMAND] + self._refused[COMMAND])
-        rejected = (
-            f"sensor '{name}' contradicts '{other}': {_REJECTED}" for name, other in self._contradicting.items()
-        )
-        faults = (*self._diagnosis.shown, *rejected)
-        return Health(newest, self.segment + 1, commands, sensors, self._strangers, faults)
-
-    def _restart(self, counts: Counts) -> None:
-        """An empty window; ``counts`` go on."""
-        self._frame_start = FrameStart(self.config.frame, self.axes)
-        model = live_model(self.config, self._frame_start.start_at_level(self._start))
-        self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
-        self._tool = tool_of(self.config, self._log)
-        self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled, as is known
-        for part in (self._watch, self._screen, self._holds, self._diagnosis, self._set_back, counts):
-            part.restart()
-        # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
-        # what came is fed again then, and counted anew.
-        self._early: list[_Event] | None = [] if self._frame_start.waits else None
-        self._counts, self._before = counts, copy.deepcopy(counts)
-
-    def _oldest(self) -> int:
-        """No event stamped before is taken [ns]."""
-        return max(self._clock.sure - self._clock.window, self._window.port.floor)
+    # ---- the road of an event ----------------------------------------------------------------------------------------
 
     def _add(self, t: Time, sensor: str | None, values: _Values) -> UpdateResult:
-        """Put an event where its stamp says, if that can be."""
+        """Add an event where its stamp says, if that can be."""
         try:
             event = _Event(stamp_of(t), sensor, values)
             parsed = self._parse(sensor, values)
@@ -332,40 +329,6 @@ class LiveEstimator:
             return self._watch_clocks(event, result)
         return result
 
-    def _screen_event(self, event: _Event, parsed: _Values) -> UpdateResult:
-        """Take an event whose stamp is right, as it came and as it is used."""
-        stamp, sensor, values = event
-        if sensor is not None:
-            if stamp > self._screen.until:
-                self._add_screened(self._screen.release())
-            return self._add_in_frame(stamp, sensor, parsed)
-        self._counts.outcomes[COMMAND, _STRAY] += 1  # as long as it waits for the next
-        in_joints = not self.joints.keys().isdisjoint(values)  # which are screened: a pose is of all of them
-        settled = self._add_screened(self._screen.add(stamp, values if in_joints else parsed))
-        waits = "leaps by many times the usual step: not used unless the next one is there, too"
-        return settled.get(stamp) or refuse(values, _STRAY, waits)
-
-    def _watch_clocks(self, event: _Event, result: UpdateResult) -> UpdateResult:
-        """Say that a sensor's clock was set back within the window, and start anew where all clocks were."""
-        stamp, sensor, values = event
-        if sensor is not None and (back := self._set_back.of_sensor(self._sensors[sensor])):
-            self._diagnosis.set_back[sensor] = stamp
-            told = (
-                f"sensor '{sensor}': its stamps step back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s and go on there:"
-                " was its clock set? If it was right before, its measurements are stamped too early by that now"
-            )
-            self._log.write(f"{sensor} set back", told)
-        if sensor is None and self._set_back.commands == 1:
-            self._behind = []
-        if not self._set_back.commands:
-            return result
-        self._behind.append(_Counted(event._replace(values=dict(values)), result, True))
-        if not (back := self._set_back.of_all()):
-            return result
-        told = f"all clocks were set back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s: new segment, filter restarted"
-        self._log.write("clock", told)
-        return self._begin_segment(self._behind)
-
     def _parse(self, sensor: str | None, values: _Values) -> _Values:
         """An event's values with a pose in the place of joints, and a commanded orientation as axes."""
         if self._joints is not None and (told := self._joints.parse(values)) is not None:
@@ -375,50 +338,6 @@ class LiveEstimator:
         if ORIENTATION in values:
             raise ValueError(NO_TOOL)
         return values
-
-    def _add_screened(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
-        """Enter commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
-        settled = dict[int, UpdateResult]()
-        for stamp, values, stray in commands:
-            for name in stray:
-                self._log.write(
-                    f"stray {name}",
-                    f"a command of {name} at {stamp / 1e9:.3f} s leaps away from those before and after it: stray, not"
-                    " used",
-                )
-            if not self.joints.keys().isdisjoint(stray):  # a pose is of all joints
-                values = {name: value for name, value in values.items() if name not in self.joints}
-            if values or not stray:
-                self._counts.outcomes[COMMAND, _STRAY] -= 1
-                settled[stamp] = self._add_command(stamp, values)
-        return settled
-
-    def _add_command(self, stamp: int, values: _Values) -> UpdateResult:
-        """Take a command that is to be used; one in joints changes the poses of others, where joints are later."""
-        oldest = self._oldest()
-        if self._joints is None or (told := self._joints.parse(values)) is None:
-            return self._add_in_frame(stamp, None, values)
-        by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
-        try:
-            first = self._parse(None, self._joints.to_pose(values, by_stamp.pop(stamp)))
-            others = {
-                other: self._parse(None, self._joints.to_pose({}, joints_told))
-                for other, joints_told in by_stamp.items()
-            }
-        except ValueError as error:
-            return self._refuse(None, values, _INVALID, str(error))
-        result = self._add_in_frame(stamp, None, first)
-        for other, pose in others.items():
-            self._add_in_frame(other, None, pose, again=True)
-        return result
-
-    def _add_in_frame(self, stamp: int, sensor: str | None, values: _Values, again: bool = False) -> UpdateResult:
-        """Take an event that is to be used; ``again``: in the place of a command of the same stamp."""
-        if self._early is None:
-            return self._add_to_window(stamp, sensor, values, judged=again)
-        if again:
-            self._early = [event for event in self._early if event.sensor is not None or event.stamp != stamp]
-        return self._add_early(_Event(stamp, sensor, dict(values)), again)
 
     def _judge(self, event: _Event) -> UpdateResult | None:
         """What becomes of an event whose stamp is not plainly right; None if it is to be taken."""
@@ -461,51 +380,65 @@ class LiveEstimator:
             self._set_aside.append(_Counted(event._replace(values=dict(values)), result, is_late))
         return result
 
-    def _forget(self, after: int) -> None:
-        """Take back all that is stamped after ``after`` [ns]."""
-        self._counts.forget(self._window, after)
-        for part in (self._window, self._commands, self._watch, self._diagnosis.recent, self._joints):
-            if part is not None:
-                part.forget(after)
-        if self._tool is not None:
-            self._amend_placed(self._tool.forget(after))
-        self._screen.restart()
-        if self._event_log is not None:
-            self._event_log.discard(after)
-        self._counts.outcomes[COMMAND, _FUSED] -= self._doubtful
-        self._counts.outcomes[COMMAND, _INVALID] += self._doubtful
-        self._doubtful = 0
+    def _screen_event(self, event: _Event, parsed: _Values) -> UpdateResult:
+        """Add an event whose stamp is right, as it came and as it is used; a command that leaps waits for the next."""
+        stamp, sensor, values = event
+        if sensor is not None:
+            if stamp > self._screen.until:
+                self._add_screened(self._screen.release())
+            return self._add_in_frame(stamp, sensor, parsed)
+        self._counts.outcomes[COMMAND, _STRAY] += 1  # as long as it waits for the next
+        in_joints = not self.joints.keys().isdisjoint(values)  # which are screened: a pose is of all of them
+        settled = self._add_screened(self._screen.add(stamp, values if in_joints else parsed))
+        waits = "leaps by many times the usual step: not used unless the next one is there, too"
+        return settled.get(stamp) or refuse(values, _STRAY, waits)
 
-    def _start_anew(self, event: _Event, newest: int) -> UpdateResult:
-        """A new segment from the events that have shown the commands' clock to be another."""
-        set_aside, self._set_aside = self._set_aside, []
-        first = next(counted.event.stamp for counted in set_aside if counted.event.sensor is None)
-        way = "back" if first < newest else "ahead"
-        moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
-        self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
-        return self._begin_segment(set_aside, event)
+    def _add_screened(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
+        """Add commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
+        settled = dict[int, UpdateResult]()
+        for stamp, values, stray in commands:
+            for name in stray:
+                self._log.write(
+                    f"stray {name}",
+                    f"a command of {name} at {stamp / 1e9:.3f} s leaps away from those before and after it: stray, not"
+                    " used",
+                )
+            if not self.joints.keys().isdisjoint(stray):  # a pose is of all joints
+                values = {name: value for name, value in values.items() if name not in self.joints}
+            if values or not stray:
+                self._counts.outcomes[COMMAND, _STRAY] -= 1
+                settled[stamp] = self._add_command(stamp, values)
+        return settled
 
-    def _begin_segment(self, counted: Sequence[_Counted], *new: _Event) -> UpdateResult:
-        """Begin a segment with events of the new clock, which are counted anew; what becomes of the last."""
-        for (_, sensor, _), result, as_row in counted:
-            source = COMMAND if sensor is None else self._sensors[sensor]
-            for outcome in [result.outcome] if sensor is None else result.axes.values():
-                self._counts.outcomes[source, outcome] -= 1
-            if sensor is not None:
-                self._counts.rows[source] -= as_row
-        events = [*(entry.event for entry in counted), *new]
-        self.segment += 1
-        self._start = {}
-        if self._joints is not None:
-            self._joints.restart()
-        self._restart(self._counts.snapshot(self._window))
-        if self._event_log is not None:
-            self._event_log.begin_segment()
-        self._clock.start(next(event.stamp for event in events if event.sensor is None))
-        return [self._add(*event) for event in events][-1]
+    def _add_command(self, stamp: int, values: _Values) -> UpdateResult:
+        """Add a command that is to be used; one in joints changes the poses of others, where joints are later."""
+        oldest = self._oldest()
+        if self._joints is None or (told := self._joints.parse(values)) is None:
+            return self._add_in_frame(stamp, None, values)
+        by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
+        try:
+            first = self._parse(None, self._joints.to_pose(values, by_stamp.pop(stamp)))
+            others = {
+                other: self._parse(None, self._joints.to_pose({}, joints_told))
+                for other, joints_told in by_stamp.items()
+            }
+        except ValueError as error:
+            return self._refuse(None, values, _INVALID, str(error))
+        result = self._add_in_frame(stamp, None, first)
+        for other, pose in others.items():
+            self._add_in_frame(other, None, pose, again=True)
+        return result
+
+    def _add_in_frame(self, stamp: int, sensor: str | None, values: _Values, again: bool = False) -> UpdateResult:
+        """Add an event that is to be used; ``again``: in the place of a command of the same stamp."""
+        if self._early is None:
+            return self._add_to_window(stamp, sensor, values, judged=again)
+        if again:
+            self._early = [event for event in self._early if event.sensor is not None or event.stamp != stamp]
+        return self._add_early(_Event(stamp, sensor, dict(values)), again)
 
     def _add_early(self, event: _Event, again: bool) -> UpdateResult:
-        """Take an event while the frame's place may still change; a command before all others moves it."""
+        """Add an event while the frame's place may still change; a command before all others moves it."""
         assert self._early is not None
         oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
         if origin is not None and self._clock.sure - origin > self._clock.window:
@@ -529,7 +462,7 @@ class LiveEstimator:
         return self._add_to_window(*event, judged=again)
 
     def _add_to_window(self, stamp: int, sensor: str | None, values: _Values, judged: bool = False) -> UpdateResult:
-        """Put an event that is in time into the window; ``judged``: it is not held, nor counted anew."""
+        """Add an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
         if sensor is not None and not judged:
             return self._add_row(stamp, sensor, values)
         bits, stranger = self._fill(stamp, sensor, values)
@@ -574,9 +507,58 @@ class LiveEstimator:
             new[axis] = value if type(value) is float else number(value)
             bits |= 1 << axis
         if stranger and self.config.frame is not None:
-            bits |= self._put_axes(stamp, sensor, values)
+            bits |= self._fill_axes(stamp, sensor, values)
             stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
         return bits, stranger
+
+    def _fill_axes(self, stamp: int, sensor: str | None, values: _Values, noise: float = 1.0) -> int:
+        """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
+        window, bits, near = self._window, 0, None
+        if sensor is not None:
+            told = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
+            near = np.array([told or 0.0])
+        point = {name: number(values[name]) for name in CARTESIAN if name in values}
+        placed = self._frame_start.in_axes(point, near)
+        for name, component in placed.items():
+            axis = self._bits[name]
+            window.value[axis], spread = component
+            window.spread[axis] = noise * spread
+            bits |= 1 << axis
+        return bits
+
+    def _find_held(self, stamp: int, sensor: str, bits: int) -> tuple[int, list[tuple[int, str, float, float]]]:
+        """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
+        held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
+        follows, values, spread = self._follows[number], self._window.value, self._window.spread
+        for axis, name in enumerate(self.axes):
+            if not bits >> axis & 1:
+                continue
+            judge = self._holds.judge((number, axis), stamp, values[axis], spread, self._commands, follows[axis])
+            if judge is NEWS:
+                continue
+            held |= judge.held << axis
+            self._counts.outcomes[number, _HELD] += judge.held - len(judge.released)
+            released += [(earlier, name, component, factor) for earlier, component, factor in judge.released]
+            if judge.sure:
+                self._log.write(
+                    f"{sensor} {name} held",
+                    f"sensor '{sensor}' repeats its value of {name} to the last digit at {stamp / 1e9:.3f} s: did it"
+                    " freeze, or is it slower than its rows? Held, not used",
+                )
+        return held, released
+
+    def _add_news(
+        self, stamp: int, sensor: str, bits: int, held: int, released: Sequence[tuple[int, str, float, float]]
+    ) -> UpdateResult:
+        """Add to the window what is news of a measurement that has come to it, and what was not used before and is."""
+        self._counts.add_row(self._sensors[sensor], stamp, self._clock.sure)
+        kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (bits & ~held) >> axis & 1}
+        again = [name for name, axis in self._bits.items() if held >> axis & 1]
+        result = self._add_to_window(stamp, sensor, kept, judged=True) if kept else refuse(again, _HELD, REASONS[_HELD])
+        for earlier, name, value, spread in released:
+            self._window.spread[self._bits[name]] = spread
+            self._add_to_window(earlier, sensor, {name: value}, judged=True)
+        return result
 
     def _update(
         self,
@@ -630,43 +612,9 @@ class LiveEstimator:
         self._commands.add(stamp, codes, self._window.value[:], oldest)
         self._watch.watch_limits(self._commands)
         if self._tool is not None:
-            self._amend_placed(self._tool.command(stamp, values, oldest))
+            self._amend(self._tool.command(stamp, values, oldest))
 
-    def _add_news(
-        self, stamp: int, sensor: str, bits: int, held: int, released: Sequence[tuple[int, str, float, float]]
-    ) -> UpdateResult:
-        """Give the window what is news of a measurement that has come to it, and what was not used before and is."""
-        self._counts.add_row(self._sensors[sensor], stamp, self._clock.sure)
-        kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (bits & ~held) >> axis & 1}
-        again = [name for name, axis in self._bits.items() if held >> axis & 1]
-        result = self._add_to_window(stamp, sensor, kept, judged=True) if kept else refuse(again, _HELD, REASONS[_HELD])
-        for earlier, name, value, spread in released:
-            self._window.spread[self._bits[name]] = spread
-            self._add_to_window(earlier, sensor, {name: value}, judged=True)
-        return result
-
-    def _find_held(self, stamp: int, sensor: str, bits: int) -> tuple[int, list[tuple[int, str, float, float]]]:
-        """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
-        held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
-        follows, values, spread = self._follows[number], self._window.value, self._window.spread
-        for axis, name in enumerate(self.axes):
-            if not bits >> axis & 1:
-                continue
-            judge = self._holds.judge((number, axis), stamp, values[axis], spread, self._commands, follows[axis])
-            if judge is NEWS:
-                continue
-            held |= judge.held << axis
-            self._counts.outcomes[number, _HELD] += judge.held - len(judge.released)
-            released += [(earlier, name, component, factor) for earlier, component, factor in judge.released]
-            if judge.sure:
-                self._log.write(
-                    f"{sensor} {name} held",
-                    f"sensor '{sensor}' repeats its value of {name} to the last digit at {stamp / 1e9:.3f} s: did it"
-                    " freeze, or is it slower than its rows? Held, not used",
-                )
-        return held, released
-
-    def _amend_placed(self, since: int | None) -> None:
+    def _amend(self, since: int | None) -> None:
         """Put measurements that the commands place where they are by now, those valid from an instant [ns] on."""
         if self._tool is None or since is None:
             return
@@ -679,61 +627,17 @@ class LiveEstimator:
                 for name in values.keys() & self._bits.keys():
                     window.value[self._bits[name]] = values[name]
                 if self.config.frame is not None:
-                    self._put_axes(row.stamp, sensor, values, row.noise)
+                    self._fill_axes(row.stamp, sensor, values, row.noise)
                 row.numbers = [*window.value, *window.spread]
             stamps, now = np.array([row.stamp for row in rows]), np.array([row.numbers for row in rows])
             window.amend(self._sensors[sensor], stamps, before, now)
         window.spread[:] = self._no_spread
 
-    def _put_axes(self, stamp: int, sensor: str | None, values: _Values, noise: float = 1.0) -> int:
-        """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
-        window, bits, near = self._window, 0, None
-        if sensor is not None:
-            told = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
-            near = np.array([told or 0.0])
-        point = {name: number(values[name]) for name in CARTESIAN if name in values}
-        placed = self._frame_start.in_axes(point, near)
-        for name, component in placed.items():
-            axis = self._bits[name]
-            window.value[axis], spread = component
-            window.spread[axis] = noise * spread
-            bits |= 1 << axis
-        return bits
+    # ---- events that are refused, and what is said of them -----------------------------------------------------------
 
-    def _say_contradiction(self, stamp: int, sensor: str) -> None:
-        """Say which other sensor one contradicts, by how much, and since when."""
-        window = self._window
-        other = tuple(self._sensors)[window.port.contradicts]
-        if self._contradicting.get(sensor) == other:
-            return
-        self._contradicting[sensor] = other
-        screens = map(self.config.arm.screen_of, self.axes)
-        off = ", ".join(
-            f"{axis} by {nu * screen.scale:+.4g} {screen.unit}"
-            for axis, screen, outcome, nu in zip(self.axes, screens, window.outcome, window.innovation, strict=True)
-            if outcome == Outcome.REJECTED
-        )
-        self._log.write(
-            f"{sensor} contradicts {other}",
-            f"sensor '{sensor}' contradicts '{other}' since {stamp / 1e9:.3f} s ({off}): {_REJECTED}",
-        )
-
-    def _no_axis(self, stranger: str) -> str:
-        """Why what an event gives under a name is of no axis."""
-        if stranger in CARTESIAN and self.config.frame is None:
-            return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
-        if not stranger:
-            return "gives no axis"
-        return f"unknown axis '{stranger:.40}'; {suggestion(stranger, [*self.axes, *self.joints])}"
-
-    def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
-        """The result of an event by the codes of its axes; the same object for equal codes, but for unknown names."""
-        outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
-        result = update_result(outcomes)
-        if stranger:
-            axes = MappingProxyType({**outcomes, stranger: _UNKNOWN})
-            return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
-        return self._answers.setdefault(codes, result)
+    def _oldest(self) -> int:
+        """No event stamped before is taken [ns]."""
+        return max(self._clock.sure - self._clock.window, self._window.port.floor)
 
     def _refuse_late(self, stamp: int, sensor: str | None, values: _Values, outcomes: IntArray) -> UpdateResult:
         """Count an event that is behind the window; how late it is shows which window it would take."""
@@ -757,3 +661,118 @@ class LiveEstimator:
         else:
             self._strangers += 1
         return result
+
+    def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
+        """The result of an event by the codes of its axes; the same object for equal codes, but for unknown names."""
+        outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
+        result = update_result(outcomes)
+        if stranger:
+            axes = MappingProxyType({**outcomes, stranger: _UNKNOWN})
+            return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
+        return self._answers.setdefault(codes, result)
+
+    def _no_axis(self, stranger: str) -> str:
+        """Why what an event gives under a name is of no axis."""
+        if stranger in CARTESIAN and self.config.frame is None:
+            return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
+        if not stranger:
+            return "gives no axis"
+        return f"unknown axis '{stranger:.40}'; {suggestion(stranger, [*self.axes, *self.joints])}"
+
+    def _say_contradiction(self, stamp: int, sensor: str) -> None:
+        """Say which other sensor one contradicts, by how much, and since when."""
+        window = self._window
+        other = tuple(self._sensors)[window.port.contradicts]
+        if self._contradicting.get(sensor) == other:
+            return
+        self._contradicting[sensor] = other
+        screens = map(self.config.arm.screen_of, self.axes)
+        off = ", ".join(
+            f"{axis} by {nu * screen.scale:+.4g} {screen.unit}"
+            for axis, screen, outcome, nu in zip(self.axes, screens, window.outcome, window.innovation, strict=True)
+            if outcome == Outcome.REJECTED
+        )
+        self._log.write(
+            f"{sensor} contradicts {other}",
+            f"sensor '{sensor}' contradicts '{other}' since {stamp / 1e9:.3f} s ({off}): {_REJECTED}",
+        )
+
+    # ---- other clocks ------------------------------------------------------------------------------------------------
+
+    def _watch_clocks(self, event: _Event, result: UpdateResult) -> UpdateResult:
+        """Say that a sensor's clock was set back within the window, and start anew where all clocks were."""
+        stamp, sensor, values = event
+        if sensor is not None and (back := self._set_back.of_sensor(self._sensors[sensor])):
+            self._diagnosis.set_back[sensor] = stamp
+            told = (
+                f"sensor '{sensor}': its stamps step back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s and go on there:"
+                " was its clock set? If it was right before, its measurements are stamped too early by that now"
+            )
+            self._log.write(f"{sensor} set back", told)
+        if sensor is None and self._set_back.commands == 1:
+            self._behind = []
+        if not self._set_back.commands:
+            return result
+        self._behind.append(_Counted(event._replace(values=dict(values)), result, True))
+        if not (back := self._set_back.of_all()):
+            return result
+        told = f"all clocks were set back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s: new segment, filter restarted"
+        self._log.write("clock", told)
+        return self._begin_segment(self._behind)
+
+    def _forget(self, after: int) -> None:
+        """Take back all that is stamped after ``after`` [ns]."""
+        self._counts.forget(self._window, after)
+        for part in (self._window, self._commands, self._watch, self._diagnosis.recent, self._joints):
+            if part is not None:
+                part.forget(after)
+        if self._tool is not None:
+            self._amend(self._tool.forget(after))
+        self._screen.restart()
+        if self._event_log is not None:
+            self._event_log.discard(after)
+        self._counts.outcomes[COMMAND, _FUSED] -= self._doubtful
+        self._counts.outcomes[COMMAND, _INVALID] += self._doubtful
+        self._doubtful = 0
+
+    def _start_anew(self, event: _Event, newest: int) -> UpdateResult:
+        """A new segment from the events that have shown the commands' clock to be another."""
+        set_aside, self._set_aside = self._set_aside, []
+        first = next(counted.event.stamp for counted in set_aside if counted.event.sensor is None)
+        way = "back" if first < newest else "ahead"
+        moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
+        self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
+        return self._begin_segment(set_aside, event)
+
+    def _begin_segment(self, counted: Sequence[_Counted], *new: _Event) -> UpdateResult:
+        """Begin a segment with events of the new clock, which are counted anew; what becomes of the last."""
+        for (_, sensor, _), result, as_row in counted:
+            source = COMMAND if sensor is None else self._sensors[sensor]
+            for outcome in [result.outcome] if sensor is None else result.axes.values():
+                self._counts.outcomes[source, outcome] -= 1
+            if sensor is not None:
+                self._counts.rows[source] -= as_row
+        events = [*(entry.event for entry in counted), *new]
+        self.segment += 1
+        self._start = {}
+        if self._joints is not None:
+            self._joints.restart()
+        self._restart(self._counts.snapshot(self._window))
+        if self._event_log is not None:
+            self._event_log.begin_segment()
+        self._clock.start(next(event.stamp for event in events if event.sensor is None))
+        return [self._add(*event) for event in events][-1]
+
+    def _restart(self, counts: Counts) -> None:
+        """An empty window; ``counts`` go on."""
+        self._frame_start = FrameStart(self.config.frame, self.axes)
+        model = live_model(self.config, self._frame_start.start_at_level(self._start))
+        self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
+        self._tool = tool_of(self.config, self._log)
+        self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled, as is known
+        for part in (self._watch, self._screen, self._holds, self._diagnosis, self._set_back, counts):
+            part.restart()
+        # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
+        # what came is fed again then, and counted anew.
+        self._early: list[_Event] | None = [] if self._frame_start.waits else None
+        self._counts, self._before = counts, copy.deepcopy(counts)

@@ -71,7 +71,7 @@ class Joints:
         return pose | {ORIENTATION: tuple(orientation[0].tolist())} if self._turns else pose
 
     def command(self, stamp: int, told: Told, oldest: int) -> dict[int, Told]:
-        """Take a command in: by stamps where it tells each joint to be, and where those tell it that it changes.
+        """Add a command; by stamps where it tells each joint to be, and where those tell it that it changes.
 
         A joint that answers later is told later, on the line from command to command, as
         :meth:`pumafuse.logs.run.Source.delayed` has it.

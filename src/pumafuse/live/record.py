@@ -266,7 +266,7 @@ class Writer:
         self._thread.start()
 
     def add(self, job: Job) -> bool:
-        """Take a job in if there is room for it; whether there was."""
+        """Add a job if there is room for it; whether there was."""
         size = sum(map(len, job.rows.values()))
         if self._taken - self._done + size > _MOST_WAITING:
             return False

@@ -38,7 +38,7 @@ class Steps:
         self._recent, self._new = deque[float](maxlen=_REMEMBERED), 0
 
     def add(self, value: float, consecutive: bool = True) -> None:
-        """Take the next value; one that is not ``consecutive`` tells of no step."""
+        """Add the next value; one that is not ``consecutive`` tells of no step."""
         self.pace, self.value = abs(value - self.value) if consecutive else 0.0, value
         if not self.pace > 0.0:
             return
@@ -68,7 +68,7 @@ class _Repeated:
         self._new = 0
 
     def is_new(self, stamp: int, value: float) -> bool:
-        """Take the next value; whether it is another one."""
+        """Add the next value; whether it is another one."""
         self.stamp = stamp
         if value == self.value:
             self.count += 1
@@ -174,11 +174,11 @@ class CommandScreen:
         self._waiting: list[tuple[int, dict[str, Any]]] = []
 
     def add(self, stamp: int, values: Mapping[str, Any]) -> list[Screened]:
-        """Take a command; those that are decided by now, without what is stray, and that."""
+        """Add a command; those that are decided by now, without what is stray, and that."""
         consecutive, self._last = 0 < stamp - self._last <= self._apart, stamp
         told = list[Screened]()
         if self._waiting and consecutive:
-            told = self._back(values)
+            told = self._judge_waiting(values)
             if not told and len(self._waiting) < MOST_STRAY:
                 self._waiting.append((stamp, dict(values)))
                 return []
@@ -196,7 +196,7 @@ class CommandScreen:
             self._learn(values, True)
         return [Screened(stamp, values, {}) for stamp, values in told]
 
-    def _back(self, now: Mapping[str, Any]) -> list[Screened]:
+    def _judge_waiting(self, now: Mapping[str, Any]) -> list[Screened]:
         """Those that wait, without what is stray, if each axis that has leapt is back now; else none."""
         told = list[Screened]()
         for stamp, values in self._waiting:

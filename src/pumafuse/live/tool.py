@@ -163,14 +163,14 @@ class Tool:
         return self._placings[sensor].lever(rotations.quaternions(turn, self._reference))
 
     def add(self, sensor: str, row: Row, oldest: int) -> None:
-        """Keep a row that the commands place; nothing that is stamped before ``oldest`` [ns] will come any more."""
+        """Add a row that the commands place; nothing that is stamped before ``oldest`` [ns] will come any more."""
         if (rows := self._rows.get(sensor)) is not None:
             rows.insert(bisect_right(rows, row.stamp, key=_stamp), row)
             if rows[0].stamp < oldest - self._behind:
                 del rows[0]
 
     def command(self, stamp: int, values: Mapping[str, Any], oldest: int) -> int | None:
-        """Take a command in; from which instant on it turns the tool otherwise than was known [ns], if from any."""
+        """Add a command; from which instant on it turns the tool otherwise than was known [ns], if from any."""
         if self._turn is None or any(axis not in values for axis in TURNING):
             return None
         return self._turn.add(stamp, [values[axis] for axis in TURNING], oldest - self._behind)

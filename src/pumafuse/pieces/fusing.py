@@ -22,7 +22,7 @@ from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.engine import filter_piece
 from ..fusion.estimates import Estimates
-from ..fusion.faults import by_axis, latency_questions, sensor_faults, starts_in_motion
+from ..fusion.faults import by_axis, check_sensors, latency_questions, starts_in_motion
 from ..fusion.offline import Part, estimates_of, row_notes
 from ..fusion.placing import in_base
 from ..fusion.results import Making
@@ -135,7 +135,7 @@ def _piece(run: Run, how: Making, begun: Segment, core: Filter, span: tuple[int,
         segment = replace(segment, start={axis: float(segment.commands_of(axis)[1][0]) for axis in segment.axes})
     part = Part(in_place, segment, times, filtered)
     est = estimates_of(run, in_place, placed, config, [part])
-    faults = sensor_faults(segment, config)
+    faults = check_sensors(segment, config)
     notes = [*clock_faults(in_place, config.arm.update_period, []), *(fault.sentence for fault in faults)]
     notes += row_notes(est, [part])
     if first:

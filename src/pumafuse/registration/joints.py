@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import FloatArray
 from .motion import Motion, Plant
 from .register import Quantity, Registration, rows_of, thin, within
-from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, residual, slopes, tell
+from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, information_of, residual, slopes
 
 Later = Mapping[str, float]  # of each joint [s]
 Told = Callable[[Later], Sequence[Motion]]  # the commands of each run, with joints told later [s]
@@ -85,10 +85,10 @@ def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Regi
         np.concatenate([slope[:, :, _BESIDE], by], axis=2)
         for slope, by in zip(slopes(rows, state, off.poses), by_joint, strict=True)
     ]
-    before = tell(slope, off.blocks, off.whitening(), expected=False)
+    before = information_of(slope, off.blocks, off.whitening(), expected=False)
     step = before.step()
     left = [block + by @ step for block, by in zip(off.blocks, slope, strict=True)]
-    after = tell(slope, left, off.whitening(), expected=True)
+    after = information_of(slope, left, off.whitening(), expected=True)
     of_joints = slice(-len(later), None)
     return _Step(step[of_joints], after.half_widths(np.eye(len(step))[of_joints]), off.noise())
 

@@ -137,7 +137,7 @@ def register(
     framed = {name for run in every for name in own_frames(run)} & set(left) if left and config is None else set[str]()
     instead = _AS_CONFIGURED if config else _ALONG_BASE
     notes = [_missing_note(every, name, _LEFT_OUT if name in framed else instead) for name in left]
-    every = [_without(run, framed | (_incomplete(run) & set(names))) for run in every]
+    every = [_drop_sensors(run, framed | (_incomplete(run) & set(names))) for run in every]
     if config is not None and any(run.command.joints is None for run in every):
         notes += config.arm.joint_doubts()
     joints = _joints([_complete(run) for run in every], names) if config is None else config.arm.joints
@@ -183,7 +183,7 @@ def register(
 
 def _complete(run: Run) -> Run:
     """A run with the sensors that give x, y and z."""
-    return _without(run, _incomplete(run))
+    return _drop_sensors(run, _incomplete(run))
 
 
 def _incomplete(run: Run) -> set[str]:
@@ -191,7 +191,7 @@ def _incomplete(run: Run) -> set[str]:
     return {name for name, sensor in run.sensors.items() if not set(CARTESIAN) <= sensor.values.keys()}
 
 
-def _without(run: Run, names: Collection[str]) -> Run:
+def _drop_sensors(run: Run, names: Collection[str]) -> Run:
     """A run without some sensors."""
     return replace(run, sensors={name: sensor for name, sensor in run.sensors.items() if name not in names})
 

@@ -166,7 +166,9 @@ def _normal(
     rows: Rows, state: State, off: Off, whitening: Sequence[FloatArray], free: FloatArray, *, expected: bool
 ) -> Blocks:
     """The information of the free steps and the slope of half the sum, of each block of rows."""
-    return tell([slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, whitening, expected=expected)
+    return information_of(
+        [slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, whitening, expected=expected
+    )
 
 
 def _of_poses(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArray:
@@ -179,7 +181,7 @@ def _of_poses(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArra
     return covariance
 
 
-def tell(
+def information_of(
     slope: Sequence[FloatArray], off: Sequence[FloatArray], whitening: Sequence[FloatArray], *, expected: bool
 ) -> Blocks:
     """The information and the score of rows, by how far they are off and how that changes with a step.

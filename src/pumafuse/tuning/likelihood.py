@@ -29,7 +29,7 @@ from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovation_derivatives, innovations
-from ..fusion.faults import Fault, not_following, starts_in_motion, within_a_turn
+from ..fusion.faults import Fault, find_not_following, find_turns, starts_in_motion
 from ..fusion.overruns import overrun_notes, overruns
 from ..fusion.placing import in_base
 from ..fusion.segments import Segment, build_segment, sum_counts
@@ -147,7 +147,7 @@ class Likelihood:
             asked = [name for name in chosen if name in part.sensors]
             clocks = clock_faults(part, config.arm.update_period, asked)
             built.append(build_segment(part, config, chosen))
-            turns = [fault.sentence for fault in within_a_turn(built[-1], config)]
+            turns = [fault.sentence for fault in find_turns(built[-1], config)]
             notes = (*clocks, *built[-1].notes, *turns, *starts_in_motion(built[-1], config))
             self.notes += [f"run '{name}': {note}" for note in notes]
             counted.setdefault(name, []).append(built[-1])
@@ -289,7 +289,7 @@ class Likelihood:
 
     def faults(self, config: FusionConfig) -> list[Fault]:
         """Why sensors do not follow the commands, those that do not."""
-        return [fault for segment in self._segments for fault in not_following(segment, config)]
+        return [fault for segment in self._segments for fault in find_not_following(segment, config)]
 
     def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> Point:
         """The log-likelihood of the measurements, without priors; for ``outcomes`` of None the gates decide on them."""

@@ -108,7 +108,7 @@ class LiveView:
         self._write(header)
 
     def event(self, event: Event, result: UpdateResult) -> None:
-        """Take in an event and what became of it."""
+        """Add an event and what became of it."""
         if not self._draws or result.outcome not in COMPARED:
             return
         t, sensor, values = event
@@ -118,7 +118,7 @@ class LiveView:
         self._events[sensor].append((moment - self._origin, values, result.axes))
 
     def estimate(self, estimate: LiveEstimate) -> None:
-        """Take in an estimate."""
+        """Add an estimate."""
         if not self._draws or self._origin is None or estimate.outcome is not Outcome.FUSED:
             return
         moment = estimate.stamp / 1e9 - self._origin
