@@ -144,7 +144,7 @@ void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& h
     const AxisModel<N, double>& axis = filter.axes[a];
     Later<N, COLUMNS> later;
     Time k = n - 1;
-    const auto smoothed = [&] {  // estimate k, and on to the one before
+    const auto smooth_back = [&] {  // estimate k, and on to the one before
         double found[PF_OUTPUTS];
         auto& [r, doubt, residual] = at[k * A + a];
         later.smooth(residual);
@@ -152,7 +152,7 @@ void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& h
         for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = found[i];
         --k;
     };
-    while (k >= 0 && (history.empty() || times[k] >= history.back().time)) smoothed();  // nothing is later
+    while (k >= 0 && (history.empty() || times[k] >= history.back().time)) smooth_back();  // nothing is later
     for (auto entry = history.rbegin(); entry != history.rend(); ++entry) {
         if (entry->sensor != NOBODY) later.over_update(filter.H[entry->sensor * A + a], *entry);
         Time here = entry->time;
@@ -161,7 +161,7 @@ void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& h
             if (dt > 0.0) later.over_interval(axis.arm, axis.noise, dt, entry->q, entry->drift, entry->scale);
         };
         const Time before = entry + 1 != history.rend() ? entry[1].time : origin;
-        for (; k >= 0 && times[k] >= before; smoothed()) back_to(times[k]);
+        for (; k >= 0 && times[k] >= before; smooth_back()) back_to(times[k]);
         back_to(before);
     }
 }

@@ -212,7 +212,7 @@ class Window final : public pf_live {
         const Time row = insert(stamp - nanoseconds(model.sensors[sensor].latency), sensor, stamp, given);
         const bool duplicate = repeats_earlier(rows, row, begin, int(size()));
         for (Time a = 0; a < size(); ++a)
-            port.outcome[a] = rows[row].known[a] = classified(row, a, duplicate ? PF_DUPLICATE : PF_FUSED);
+            port.outcome[a] = rows[row].known[a] = classify(row, a, duplicate ? PF_DUPLICATE : PF_FUSED);
         if (duplicate) return remove(row);
         run(row + 1);
         const Fate fate = rows.fate(row);
@@ -261,14 +261,14 @@ class Window final : public pf_live {
         }
     }
 
-    Code classified(Time row, Time a, Code whole) const {
+    Code classify(Time row, Time a, Code whole) const {
         return Policy{model, port.origin}.classify(rows, row, int(a), begin, end, whole, state.axes[a].response.start);
     }
 
     // Look again at the values of an axis from a row on that are not after `until`.
     void reclassify(Time a, Time row, Time until) {
         for (; row < end && rows[row].time <= until; ++row) {
-            const Code now = classified(row, a, PF_FUSED);
+            const Code now = classify(row, a, PF_FUSED);
             if (now != std::exchange(rows[row].known[a], now)) restore(row);
         }
     }
@@ -299,7 +299,7 @@ class Window final : public pf_live {
             if (rows[row].known[a] == PF_ABSENT || !alike || now[a] == before[a]) continue;
             restore(row);
             number[a] = now[a], number[size() + a] = now[size() + a];
-            rows[row].known[a] = classified(row, a, PF_FUSED);
+            rows[row].known[a] = classify(row, a, PF_FUSED);
         }
     }
 

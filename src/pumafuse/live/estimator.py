@@ -468,7 +468,7 @@ class LiveEstimator:
         bits, stranger = self._fill(stamp, sensor, values)
         if stamp < (oldest := self._oldest()):
             return self._refuse_late(stamp, sensor, values, self._counts.outcomes)
-        return self._update(stamp, sensor, values, bits, stranger, oldest, judged)
+        return self._update(_Event(stamp, sensor, values), bits, stranger, oldest, judged)
 
     def _add_row(self, stamp: int, sensor: str, values: _Values) -> UpdateResult:
         """Put a measurement into the window: as it tells of the tool, as noisy as it says, without what is no news."""
@@ -494,7 +494,7 @@ class LiveEstimator:
         held, released = self._find_held(stamp, sensor, bits)
         if released or held:
             return self._add_news(stamp, sensor, bits, held, released)
-        return self._update(stamp, sensor, values, bits, stranger, oldest)
+        return self._update(_Event(stamp, sensor, values), bits, stranger, oldest)
 
     def _fill(self, stamp: int, sensor: str | None, values: _Values) -> tuple[int, str]:
         """Put an event's values into the window's ``value``; which axes these are, as bits, and a name that is none."""
@@ -560,18 +560,9 @@ class LiveEstimator:
             self._add_to_window(earlier, sensor, {name: value}, judged=True)
         return result
 
-    def _update(
-        self,
-        stamp: int,
-        sensor: str | None,
-        values: _Values,
-        bits: int,
-        stranger: str,
-        oldest: int,
-        judged: bool = False,
-    ) -> UpdateResult:
+    def _update(self, event: _Event, bits: int, stranger: str, oldest: int, judged: bool = False) -> UpdateResult:
         """Let the filter run on from the place of an event that fills the window's ``value``; what became of it."""
-        window, counts, diagnosis = self._window, self._counts, self._diagnosis
+        window, counts, diagnosis, (stamp, sensor, values) = self._window, self._counts, self._diagnosis, event
         if not bits:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
@@ -589,30 +580,37 @@ class LiveEstimator:
         if is_due and self._screen.until == NEVER:  # a command that waits may explain it all
             diagnosis.diagnose(window, self._clock.sure)
         if sensor is None:
-            if not judged:
-                counts.outcomes[COMMAND, result.outcome] += 1
-                self._doubtful += result.outcome is _FUSED and self._clock.doubtful
-                if result.outcome in (_FUSED, Outcome.DUPLICATE):
-                    self._watch.watch_intervals(stamp, values)
-            self._follow_command(stamp, values, codes, oldest)
-            return result
-        if not judged:
-            counts.add_row(source, stamp, self._clock.sure)
-        if window.port.end == rows:  # it repeats another
-            for code in codes.replace(_ABSENT, b""):
-                counts.outcomes[source, code] += 1
-        if window.port.contradicts >= 0:
-            self._say_contradiction(stamp, sensor)
-        elif sensor in self._contradicting and result.outcome is _FUSED:
-            del self._contradicting[sensor]
+            self._follow_command(event, codes, result.outcome, oldest, judged)
+        else:
+            self._follow_measurement(stamp, sensor, codes, result.outcome, window.port.end == rows, judged)
         return result
 
-    def _follow_command(self, stamp: int, values: _Values, codes: bytes, oldest: int) -> None:
-        """Let a command that is in the window move what goes by commands: watches, and measurements on the tool."""
+    def _follow_command(self, event: _Event, codes: bytes, outcome: Outcome, oldest: int, judged: bool) -> None:
+        """What a command in the window changes beside the filter: counts, watches, measurements that it places."""
+        stamp, _, values = event
+        if not judged:
+            self._counts.outcomes[COMMAND, outcome] += 1
+            self._doubtful += outcome is _FUSED and self._clock.doubtful
+            if outcome in (_FUSED, Outcome.DUPLICATE):
+                self._watch.watch_intervals(stamp, values)
         self._commands.add(stamp, codes, self._window.value[:], oldest)
         self._watch.watch_limits(self._commands)
         if self._tool is not None:
             self._amend(self._tool.command(stamp, values, oldest))
+
+    def _follow_measurement(
+        self, stamp: int, sensor: str, codes: bytes, outcome: Outcome, repeats: bool, judged: bool
+    ) -> None:
+        """Count a measurement that is in the window, or ``repeats`` one there; say whom it contradicts."""
+        source, counts = self._sensors[sensor], self._counts
+        if not judged:
+            counts.add_row(source, stamp, self._clock.sure)
+        for code in codes.replace(_ABSENT, b"") if repeats else b"":
+            counts.outcomes[source, code] += 1
+        if self._window.port.contradicts >= 0:
+            self._say_contradiction(stamp, sensor)
+        elif sensor in self._contradicting and outcome is _FUSED:
+            del self._contradicting[sensor]
 
     def _amend(self, since: int | None) -> None:
         """Put measurements that the commands place where they are by now, those valid from an instant [ns] on."""

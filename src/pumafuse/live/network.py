@@ -124,6 +124,7 @@ class _Merged:
 
     def __init__(self) -> None:
         self._pieces = queue.Queue[Items](_MOST_PIECES)
+        self.add = self._pieces.put
 
     def get(self) -> Items:
         """Some of one thread; none after a tenth of a second without any."""
@@ -132,17 +133,8 @@ class _Merged:
         except queue.Empty:
             return []
 
-
-class _Tcp(_Merged):
-    """Connections of lines, each read by a thread."""
-
-    def __init__(self, notify: Callable[[str], None]) -> None:
-        super().__init__()
-        self._notify, self._log = notify, RateLimitedLog(notify)
-
-    def stop(self) -> Items:
-        """What has come and was not given yet; the connections end with the process."""
-        self._log = _SILENT
+    def remaining(self) -> Items:
+        """What has come and was not given yet; the threads end with the process."""
         left = list[bytes | Event]()
         with contextlib.suppress(queue.Empty):
             for _ in range(_MOST_PIECES + _MOST_CONNECTIONS):  # and one that each thread holds; a flood has no end
@@ -168,12 +160,13 @@ def _read_lines(
     return some
 
 
-class TcpListener(_Tcp):
+class TcpListener(_Merged):
     """Lines from all who connect."""
 
     def __init__(self, socket_address: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
-        super().__init__(notify)
+        super().__init__()
         self._address, self._allowed = socket_address, allowed
+        self._notify, self._log = notify, RateLimitedLog(notify)
         self._open, self._silent = set[socket.socket](), dict[socket.socket, None]()
         self._accepted = self._refused = 0
 
@@ -184,6 +177,11 @@ class TcpListener(_Tcp):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._name = _listen(self._socket, "tcp-listen", self._address[1], self._notify)
         _in_a_thread(self._accept_all)
+
+    def stop(self) -> Items:
+        """What has come and was not given yet; the connections end with the process."""
+        self._log = _SILENT
+        return self.remaining()
 
     def summary(self) -> str:
         """How many connections there were and are."""
@@ -223,7 +221,7 @@ class TcpListener(_Tcp):
         return False
 
     def _serve(self, connection: socket.socket, peer: str) -> None:
-        _read_lines(connection, self._pieces.put, lambda: self._silent.pop(connection, None))
+        _read_lines(connection, self.add, lambda: self._silent.pop(connection, None))
         self._silent.pop(connection, None)
         self._open.discard(connection)
         self._log.write("gone", f"the connection from {peer} has ended")
@@ -276,20 +274,24 @@ class _Client:
         raise NotImplementedError
 
 
-class TcpClient(_Client, _Tcp):
+class TcpClient(_Client):
     """Lines from a server."""
 
     def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
-        _Tcp.__init__(self, notify)
-        _Client.__init__(self, address, notify)
+        super().__init__(address, notify)
+        self._merged = _Merged()
+
+    def get(self) -> Items:
+        """Some lines; none after a tenth of a second without any."""
+        return self._merged.get()
 
     def stop(self) -> Items:
         """What has come and was not given yet; no connection is made any more."""
         self._end()
-        return super().stop()
+        return self._merged.remaining()
 
     def _read(self, connection: socket.socket) -> bool:
-        return _read_lines(connection, self._pieces.put)
+        return _read_lines(connection, self._merged.add)
 
 
 class Refused(Exception):  # noqa: N818 - what a server does, and never leaves the thread that reads
@@ -400,7 +402,7 @@ class Several(_Merged):
         try:
             while not self._ended.is_set():
                 if items := source.get():
-                    self._pieces.put(items)
+                    self.add(items)
         except Exception as error:  # it is the thread that takes what comes that is to end by it
             self._error = error
 
