@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..arrays import NO_STAMP, TimeArray
 from ..errors import warn
-from ..filter.events import COMMAND
+from ..filter.events import COMMAND, Events
 from ..filter.outcome import ABSENT, Outcome
 from ..logs.clock import clock_faults, segments
 from ..logs.frames import Cylindrical, Placed
@@ -95,7 +95,8 @@ def fuse(
         share = None if progress is None else partial(_share, progress, len(parts), len(logged))
         asked = segment.asking_times(times, rate is not None)
         filtered = filter_segment(segment, config, times, mode, engine, share, asked)
-        parts.append(Part(part, segment.drop_measurements(), times, filtered))  # the result has them
+        segment = replace(segment, measurement_rows=Events.empty(len(segment.axes)))  # the result has them
+        parts.append(Part(part, segment, times, filtered))
         del segment
     est = estimates_of(run, in_place, placed, config, parts, mode, engine)
     notes = [*clocks, *(fault.sentence for fault in faults), *row_notes(est, parts), *moving]

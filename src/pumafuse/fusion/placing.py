@@ -46,7 +46,7 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
     }
     in_axes_of_arm, placed = in_axes(replace(run, sensors={**run.sensors, **of_tool}), config.frame, tool)
     if in_axes_of_arm.tool is not None and not set(TURNING) & set(config.arm.axes):
-        in_axes_of_arm = in_axes_of_arm.each(_still)
+        in_axes_of_arm = in_axes_of_arm.each(_drop_turning)
     return in_axes_of_arm, placed, config
 
 
@@ -56,7 +56,7 @@ def add_tool(config: FusionConfig, run: Run) -> FusionConfig:
     return msgspec.structs.replace(config, tool=config.tool if tool is None else Tool(reference=tool), robot=robot)
 
 
-def _still(_: str, source: Source) -> Source:
+def _drop_turning(_: str, source: Source) -> Source:
     return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 

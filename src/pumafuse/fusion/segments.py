@@ -170,10 +170,6 @@ class Segment:
             turn=self.turn[:, column],
         )
 
-    def drop_measurements(self) -> Segment:
-        """The segment with its commands alone: of a long run its measurements take as much memory as their results."""
-        return replace(self, measurement_rows=Events.empty(len(self.axes)))
-
     def highest_speed(self, axis: str, period: float) -> float:
         """Highest commanded speed on an axis [m/s or rad/s]."""
         return float(np.abs(np.diff(self.commands_of(axis)[1], prepend=self.start[axis])).max(initial=0.0)) / period

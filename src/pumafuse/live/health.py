@@ -201,8 +201,8 @@ class Counts:
         stamp, source, results = window.read(self._unread, end)
         self._unread, sensors, measured = end, len(self.rows), source >= 0
         stamp, source, codes = stamp[measured], source[measured].astype(np.int64), results.outcome[measured]
-        reshape = np.bincount((256 * source[:, None] + codes).ravel(), minlength=256 * sensors).reshape(sensors, 256)
-        self.outcomes[:-1] += reshape[:, : len(Outcome)]
+        table = np.bincount((256 * source[:, None] + codes).ravel(), minlength=256 * sensors).reshape(sensors, 256)
+        self.outcomes[:-1] += table[:, : len(Outcome)]
         cell, is_recent = self._places(source, stamp)
         taken = ((codes == Outcome.FUSED) | (codes == Outcome.REACQUIRED)) & is_recent[:, None]
         nis = (results.innovation[measured][taken] / results.innovation_sd[measured][taken]) ** 2

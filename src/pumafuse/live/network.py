@@ -124,7 +124,10 @@ class _Merged:
 
     def __init__(self) -> None:
         self._pieces = queue.Queue[Items](_MOST_PIECES)
-        self.add = self._pieces.put
+
+    def add(self, items: Items) -> None:
+        """Add what a thread has; it waits where there is no room."""
+        self._pieces.put(items)
 
     def get(self) -> Items:
         """Some of one thread; none after a tenth of a second without any."""
