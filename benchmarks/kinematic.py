@@ -17,8 +17,8 @@ import numpy.typing as npt
 from scipy.optimize import differential_evolution
 
 import pumafuse as pf
-from pumafuse.fusion.score import interpolated
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.score import interpolate
+from pumafuse.fusion.segments import build_segment
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]
@@ -244,7 +244,7 @@ class Axis:
 
 def axes_of(run: pf.Run, config: pf.FusionConfig) -> dict[str, Axis]:
     """The axes of a run that are measured and have a reference."""
-    est, starts, period = pf.fuse(run, config), build(run, config).start, config.arm.update_period
+    est, starts, period = pf.fuse(run, config), build_segment(run, config).start, config.arm.update_period
     assert est.reference is not None
     found: dict[str, Axis] = {}
     for number, name in enumerate(est.measurements.axes):
@@ -260,6 +260,6 @@ def axes_of(run: pf.Run, config: pf.FusionConfig) -> dict[str, Axis]:
             bias = np.where(biased, np.cumsum(biased) - 1, -1)
             known = Known(scale, latency_sd, bias, bias_sd[biased], starts[name], config.start.offset_sd, period)
             measured = Measured(mine.time, np.searchsorted(used, mine.sensor), mine.value)
-            truth = interpolated(est.time, est.segment, est.reference, name)
+            truth = interpolate(est.time, est.segment, est.reference, name)
             found[name] = Axis(name, est.time, truth, known, measured, sds)
     return found

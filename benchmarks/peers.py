@@ -24,7 +24,7 @@ from pumafuse.filter.core import transition
 from pumafuse.filter.events import COMMAND, Events
 from pumafuse.fusion.engine import Filtered, filter_segment, innovations, model_of
 from pumafuse.fusion.estimates import Mode
-from pumafuse.fusion.segments import Segment, build
+from pumafuse.fusion.segments import Segment, build_segment
 
 Array = npt.NDArray[np.float64]
 Answer = Mapping[str, Array]  # outputs (axes, estimates), innovations (events, axes), or the log_likelihood
@@ -53,7 +53,7 @@ class Problem:
         """The scan repeated to so many rows; the shipped one for 0."""
         run = project.repeated(rows) if rows else pf.Run.read(project.SCAN)
         config = pf.FusionConfig.load(project.CONFIG)
-        segment = build(run, config)
+        segment = build_segment(run, config)
         filtered = filter_segment(segment, config, segment.commands, "filtered")
         return Problem(config, segment, filtered.events, segment.commands, filtered, project.values_of(run))
 

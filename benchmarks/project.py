@@ -30,7 +30,7 @@ from page import REPOSITORY
 import pumafuse as pf
 from pumafuse.fusion.engine import innovations
 from pumafuse.fusion.estimates import Mode
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.segments import build_segment
 
 Row = dict[str, Any]
 
@@ -101,7 +101,7 @@ def fuse(job: str, mode: Mode, repeats: int) -> list[Row]:
 def likelihood(repeats: int) -> list[Row]:
     """What one step of a search by likelihood takes."""
     run, config = repeated(ROWS), pf.FusionConfig.load(CONFIG)
-    segment = build(run, config)
+    segment = build_segment(run, config)
     seconds = timed(lambda: innovations(segment, config), repeats)
     note = "the run's table ready; the gates decide"
     return [row("likelihood", "pumafuse, innovations", "ns", [1e9 * s / values_of(run) for s in seconds], note)]

@@ -6,9 +6,9 @@
 // Below V that is the linear plant, and |x'| never exceeds V. The tool is within half the play of the drive, which
 // pushes it: y <- clip(y, x - h, x + h).
 //
-// Between events v = u + e exp(-b t), and x has a closed form while the gap is on one side of L V (`moved`). The path is
-// cut where it crosses to the other side, and where the drive turns, since the tool stays there. s is continuous, so a
-// cut that comes dt too late changes x by dt^2 alone, and not at all how x changes with parameters.
+// Between events v = u + e exp(-b t), and x has a closed form while the gap is on one side of L V (`free`, `at_limit`).
+// The path is cut where it crosses to the other side, and where the drive turns, since the tool stays there. s is
+// continuous, so a cut that comes dt too late changes x by dt^2 alone, and not at all how x changes with parameters.
 #pragma once
 #include <limits>
 #include <numbers>
@@ -114,7 +114,7 @@ struct Arm {
     Real gain_error(double step) const { return (slope * (std::fabs(step) / period) + intercept - 1.0) * step; }
 
     // How fast the drive goes; one of second order that is asked for a speed follows.
-    Real speed(const Drive<Real>& d) const { return plant.order == 1 ? asked(d, side(d)) : d.rate; }
+    Real speed(const Drive<Real>& d) const { return plant.order == 1 ? asked_speed(d, side(d)) : d.rate; }
 
     // How far the tool hangs at a position p [m] as logged, and how that changes with p.
     Real sag(const Real& p) const {
@@ -134,7 +134,7 @@ struct Arm {
     }
     // Over a dt that will not come again, as that of a measurement: to remember it takes longer than to compute it.
     void move_once(Drive<Real>& d, Real& slack, const Real& dt) const {
-        if (linear) d = free(d, plant.computed(dt), dt);
+        if (linear) d = free(d, plant.compute(dt), dt);
         else in_pieces(d, slack, dt);
     }
 
@@ -158,7 +158,7 @@ struct Arm {
     }
 
     // s.
-    Real asked(const Drive<Real>& d, int side) const {
+    Real asked_speed(const Drive<Real>& d, int side) const {
         if (side != 0) return double(side) * max_speed;
         return plant.order == 1 ? plant.rate * d.gap() : per_lag * d.gap();
     }
@@ -168,7 +168,7 @@ struct Arm {
     // It swings about u + c e, which an input that decays draws it along. The energy of that only falls, which bounds how
     // large a gap and how far from its tool it gets. Where the decay is close to a pole there is no such path: then the
     // gain error adds what it can at most.
-    bool undisturbed(const Drive<Real>& d, const Real& slack) const {
+    bool is_undisturbed(const Drive<Real>& d, const Real& slack) const {
         const double e = value_of(d.error), along = drawn * e, forced = drawn == 0.0 ? overshoot * std::fabs(e) : 0.0;
         const double x = value_of(d.x) - d.u, rate = value_of(d.rate) + value_of(plant.decay) * along;
         const double swing = std::sqrt(square(x - along) + (plant.order == 1 ? 0.0 : square(rate / fast))) + forced;
@@ -197,7 +197,7 @@ struct Arm {
         return {d.u, error, x - gained / (2.0 * plant.sigma), d.rate + gained};
     }
 
-    Real pushed(const Real& slack, const Drive<Real>& before, const Drive<Real>& after) const {
+    Real push(const Real& slack, const Drive<Real>& before, const Drive<Real>& after) const {
         return clip<Real>(slack + (before.x - after.x), -half_play, half_play);
     }
 
@@ -207,7 +207,7 @@ struct Arm {
     struct Motion { double rate, closing, slope, slope_rate; };
 
     [[gnu::always_inline]] Motion motion(const Drive<Real>& d, int side) const {
-        const double s = value_of(asked(d, side)), rate = plant.order == 1 ? s : value_of(d.rate);
+        const double s = value_of(asked_speed(d, side)), rate = plant.order == 1 ? s : value_of(d.rate);
         const double decay = value_of(plant.decay), closing = decay * value_of(d.error) + rate;
         if (plant.order == 1) return {rate, closing, decay * rate - (side == 0 ? fast * closing : 0.0), 0.0};
         const double sigma = value_of(plant.sigma), speeding = 2.0 * sigma * (s - rate);
@@ -276,12 +276,12 @@ struct Arm {
         for (int pieces = 1; !is_zero(left); ++pieces) {
             const int side = this->side(d);
             const bool may_cut = pieces < MOST_PIECES;
-            const bool swings = side == 0 && value_of(left) > half_swing && may_cut && !undisturbed(d, slack);
+            const bool swings = side == 0 && value_of(left) > half_swing && may_cut && !is_undisturbed(d, slack);
             Real taken = swings ? Real(half_swing) : left;
             Drive<Real> then = side != 0 ? at_limit(d, side, taken) : free(d, plant.over(taken), taken);
             if ((this->side(then) != side || may_turn(d, then, side)) && may_cut)
                 std::tie(then, taken) = cut(d, then, slack, side, taken);
-            slack = pushed(slack, d, then), d = then, left = left - taken;
+            slack = push(slack, d, then), d = then, left = left - taken;
         }
     }
 
@@ -289,13 +289,13 @@ struct Arm {
     // is small and seldom comes here.
     [[gnu::noinline]] std::tuple<Drive<Real>, Real> cut(Drive<Real> d, Drive<Real> then, Real slack, int side,
                                                         Real taken) const {
-        if (undisturbed(d, slack)) return {then, taken};
+        if (is_undisturbed(d, slack)) return {then, taken};
         const Motion m = at_first(d, side, value_of(taken));
         Motion n = side == 0 ? later(m, then, plant.over(taken), value_of(taken)) : motion(then, side);
         const auto move_to = [&](const Real& t) {
             taken = t;
             if (side == 0) {
-                const Transition<Real> f = plant.computed(t);
+                const Transition<Real> f = plant.compute(t);
                 then = free(d, f, t), n = later(m, then, f, value_of(t));
             } else then = at_limit(d, side, t), n = motion(then, side);
         };

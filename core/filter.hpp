@@ -30,7 +30,7 @@ inline double bar(double variance) { return std::max(std::sqrt(variance), PF_FIN
 
 // What is known of one axis.
 template <int N, class Real>
-struct Known {
+struct AxisModel {
     Arm<Real> arm;
     Noise<N, Real> noise;
     Time ahead;              // T [ns]
@@ -39,7 +39,7 @@ struct Known {
     double start;
     ByDoubt<> sd;            // of the lag [s] and of the gain
 
-    explicit Known(const Axis<Real>& axis)
+    explicit AxisModel(const Axis<Real>& axis)
         : arm(axis), noise(axis), ahead(std::llrint(arm.period * 1e9)),
           motion(noise.motion(arm.plant, double(ahead) / 1e9)), delayed(axis.delay - value_of(axis.delay)),
           start(value_of(axis.start)), sd{value_of(axis.lag_sd), value_of(axis.gain_sd)} {}
@@ -78,7 +78,7 @@ template <int N, class Real = double>
 class Filter {
   public:
     using History = std::vector<std::vector<Entry<N>>>;  // of each axis, by time
-    std::vector<Known<N, Real>> axes;
+    std::vector<AxisModel<N, Real>> axes;
     std::vector<Sensor<Real>> sensors;
     std::vector<View<Real>> views;   // (S, A)
     std::vector<Vector<N, Real>> H;  // of each sensor on each axis, (S, A)
@@ -132,41 +132,41 @@ class Filter {
     void estimate(const State<N, Real>& state, const Rows& rows, Time pending, Time end, Time time, Time stamped,
                   double* outputs, Time count = 1, Time n = 0) const {
         for (Time a = 0; a < size(); ++a) {
-            const Known<N, Real>& axis = axes[a];
+            const AxisModel<N, Real>& axis = axes[a];
             AxisState<N, Real> now = state.axes[a];
-            const Time next = follow(now, a, rows, pending, end, time, stamped);
-            double found[PF_OUTPUTS];
+            const Time next = predict_by_commands(now, a, rows, pending, end, time, stamped);
+            double numbers[PF_OUTPUTS];
             const double r = now.response.position(axis.arm);
-            const ByDoubt<> left = describe(axis, r, axis.doubt(now.response), now.residual, found);
-            const double known = now.residual.variance(axis.motion);
+            const ByDoubt<> left = describe(axis, r, axis.doubt(now.response), now.residual, numbers);
+            const double moving = now.residual.variance(axis.motion);
             now.residual.P = {};  // what comes is noise alone
-            follow(now, a, rows, next, end, time + axis.ahead, stamped);
+            predict_by_commands(now, a, rows, next, end, time + axis.ahead, stamped);
             const double later = now.response.position(axis.arm) + now.residual.along(axis.noise.position);
-            found[PF_VELOCITY] = (later - found[PF_POSITION]) / axis.arm.period;
+            numbers[PF_VELOCITY] = (later - numbers[PF_POSITION]) / axis.arm.period;
             const ByDoubt<> then = now.residual.left(axis.doubt(now.response), 1.0, axis.noise.position);
             const double doubted = axis.variance({then[LAG] - left[LAG], then[GAIN] - left[GAIN]});
-            found[PF_VELOCITY_SD] = bar(known + now.residual.variance(axis.noise.position) + doubted) / axis.arm.period;
-            for (int k = 0; k < PF_OUTPUTS; ++k) outputs[(k * size() + a) * count + n] = found[k];
+            numbers[PF_VELOCITY_SD] = bar(moving + now.residual.variance(axis.noise.position) + doubted) / axis.arm.period;
+            for (int k = 0; k < PF_OUTPUTS; ++k) outputs[(k * size() + a) * count + n] = numbers[k];
         }
     }
 
     // Position, offset and disturbance of an axis whose response is at r; no velocity. Returns how what is not known of
     // the position changes with lag and gain, as the response does by `doubt`.
-    static ByDoubt<> describe(const Known<N, Real>& axis, double r, const ByDoubt<>& doubt,
-                              const Residual<N, double>& xi, double (&found)[PF_OUTPUTS]) {
+    static ByDoubt<> describe(const AxisModel<N, Real>& axis, double r, const ByDoubt<>& doubt,
+                              const Residual<N, double>& xi, double (&numbers)[PF_OUTPUTS]) {
         const ByDoubt<> left = xi.left(doubt, 1.0, axis.noise.position);
         const bool disturbed = axis.noise.smoothness != Smoothness::none;
-        found[PF_POSITION] = r + xi.along(axis.noise.position);
-        found[PF_POSITION_SD] = bar(xi.variance(axis.noise.position) + axis.variance(left));
-        found[PF_VELOCITY] = found[PF_VELOCITY_SD] = std::numeric_limits<double>::quiet_NaN();
-        found[PF_OFFSET] = xi.x[OFFSET], found[PF_OFFSET_SD] = axis.sd_of(xi, OFFSET);
-        found[PF_DISTURBANCE] = disturbed ? xi.x[DISTURBANCE] : 0.0;
-        found[PF_DISTURBANCE_SD] = disturbed ? axis.sd_of(xi, DISTURBANCE) : 0.0;
+        numbers[PF_POSITION] = r + xi.along(axis.noise.position);
+        numbers[PF_POSITION_SD] = bar(xi.variance(axis.noise.position) + axis.variance(left));
+        numbers[PF_VELOCITY] = numbers[PF_VELOCITY_SD] = std::numeric_limits<double>::quiet_NaN();
+        numbers[PF_OFFSET] = xi.x[OFFSET], numbers[PF_OFFSET_SD] = axis.sd_of(xi, OFFSET);
+        numbers[PF_DISTURBANCE] = disturbed ? xi.x[DISTURBANCE] : 0.0;
+        numbers[PF_DISTURBANCE_SD] = disturbed ? axis.sd_of(xi, DISTURBANCE) : 0.0;
         return left;
     }
 
     // Response and residual to an instant.
-    void advance(AxisState<N, Real>& state, Time a, const Instant<Real>& to) const {
+    void predict(AxisState<N, Real>& state, Time a, const Instant<Real>& to) const {
         state.residual.predict(axes[a].arm.plant, axes[a].noise, to);
         state.response.predict(axes[a].arm, to);
     }
@@ -181,10 +181,10 @@ class Filter {
     mutable std::vector<Innovation> innovations;
 
     void command(AxisState<N, Real>& state, Time a, const Event& event, History* history) const {
-        const Known<N, Real>& axis = axes[a];
+        const AxisModel<N, Real>& axis = axes[a];
         const Instant<Real> acts{event.time, axis.delayed};
         Residual<N, Real>& xi = state.residual;
-        if (axis.noise.maneuvers) xi.enter(axis.arm.plant, acts);
+        if (axis.noise.maneuvers) xi.accumulate(axis.arm.plant, acts);
         state.response.predict(axis.arm, acts);
         const double maneuver = state.response.command(axis.arm, event.value[a]);
         if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
@@ -197,13 +197,13 @@ class Filter {
     // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row
     // after.
     template <class Rows>
-    Time follow(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until,
+    Time predict_by_commands(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until,
                 Time stamped) const {
         for (; next < end && rows[next].time <= until; ++next) {
             const Event event = rows[next];
             if (event.commands(a) && event.stamp <= stamped) command(state, a, event, nullptr);
         }
-        advance(state, a, {until, 0.0});
+        predict(state, a, {until, 0.0});
         return next;
     }
 
@@ -230,9 +230,9 @@ class Filter {
         for (Time a = first; a < end; ++a) {
             if (!given) fate.outcome[a] = event.known[a];
             if (event.known[a] != PF_FUSED) continue;
-            advance(state.axes[a], a, {event.time, value_of(sensor.latency) - sensor.latency});
-            const Innovation& found = innovations[a] = innovation(state.axes[a], event, a);
-            store(fate, a, found.nu, found.along.S), fate.noise_scale[a] = value_of(state.axes[a].residual.scale);
+            predict(state.axes[a], a, {event.time, value_of(sensor.latency) - sensor.latency});
+            const Innovation& now = innovations[a] = innovation(state.axes[a], event, a);
+            store(fate, a, now.nu, now.along.S), fate.noise_scale[a] = value_of(state.axes[a].residual.scale);
             beyond |= gate > 0.0 && far(a);
         }
         const bool reacquires = beyond && !given && this->reacquires(state, event, first, end, fate);
@@ -284,8 +284,8 @@ class Filter {
         int other = NOBODY;
         for (Time a = first; a < end; ++a) {
             if (event.known[a] != PF_FUSED || !(std::fabs(fate.innovation[a]) > gate * fate.innovation_sd[a])) continue;
-            const Agreement found = agreement(state, event, a, fate.innovation[a]);
-            all_agree &= found == Agreement::yes, too_soon |= found == Agreement::too_soon;
+            const Agreement agreed = agreement(state, event, a, fate.innovation[a]);
+            all_agree &= agreed == Agreement::yes, too_soon |= agreed == Agreement::too_soon;
             other = std::max(other, state.gates[a].contradicted(event.source, event.time));
         }
         if (all_agree && other == NOBODY) return true;
@@ -300,7 +300,7 @@ class Filter {
     // Whether a rejected measurement agrees with the one before: |nu2 - nu1| <= gate sqrt(R1 + R2 + the variance of the
     // motion between), both predicted by what did not follow them.
     Agreement agreement(State<N, Real>& state, const Event& event, Time a, double nu) const {
-        const Known<N, Real>& axis = axes[a];
+        const AxisModel<N, Real>& axis = axes[a];
         const Sensor<Real>& sensor = sensors[event.source];
         const Gate& before = state.gates[a].sensor[event.source];
         const Residual<N, Real>& xi = state.axes[a].residual;

@@ -15,17 +15,17 @@ struct Size {};
 
 // Structs of numbers with derivatives, by as many tangents of the same type as there are.
 template <template <class> class Of, class Real, class In>
-std::vector<Of<Real>> lifted(const In* in, Time count, const std::vector<const In*>& tangents) {
+std::vector<Of<Real>> lift(const In* in, Time count, const std::vector<const In*>& tangents) {
     constexpr std::size_t fields = sizeof(In) / sizeof(double);
-    std::vector<Of<Real>> found(count);
-    Real* to = reinterpret_cast<Real*>(found.data());
+    std::vector<Of<Real>> numbers(count);
+    Real* to = reinterpret_cast<Real*>(numbers.data());
     for (std::size_t i = 0; i < count * fields; ++i) {
         to[i] = reinterpret_cast<const double*>(in)[i];
         if constexpr (!std::is_same_v<Real, double>)
             for (std::size_t k = 0; k < tangents.size(); ++k)
                 to[i].d[k / 2][k % 2] = reinterpret_cast<const double*>(tangents[k])[i];
     }
-    return found;
+    return numbers;
 }
 
 template <class Real>
@@ -35,14 +35,14 @@ Model<Real> model_of(const pf_model& model, const pf_model* tangents = nullptr, 
     std::vector<const pf_view*> views;
     for (const pf_model* one = tangents; one < tangents + lanes; ++one)
         axes.push_back(one->axis), sensors.push_back(one->sensor), views.push_back(one->view);
-    return {lifted<Axis, Real>(model.axis, model.axes, axes),
-            lifted<Sensor, Real>(model.sensor, model.sensors, sensors),
-            lifted<View, Real>(model.view, model.sensors * model.axes, views)};
+    return {lift<Axis, Real>(model.axis, model.axes, axes),
+            lift<Sensor, Real>(model.sensor, model.sensors, sensors),
+            lift<View, Real>(model.view, model.sensors * model.axes, views)};
 }
 
 // Calls `make` with the compiled size for the states of the axis that has the most: the next larger one serves, and
 // what is left over stays 0.
-inline auto sized(const pf_model& model, auto make) {
+inline auto with_size(const pf_model& model, auto make) {
     int most = 0;
     for (const auto& axis : Filter<64>(model_of<double>(model)).axes) most = std::max(most, axis.noise.size);
     if (most <= 4) return make(Size<4>{});

@@ -24,7 +24,7 @@ int pf_linearise(const pf_model* model, const pf_model* tangents, int64_t k, int
                  const pf_results* results, double* d_innovation, double* d_variance) {
     const Time stride = events->count * model->axes;
     return attempt([&] {
-        sized(*model, [&]<int N>(Size<N>) {
+        with_size(*model, [&]<int N>(Size<N>) {
             const Time passes = std::max((k + LANES - 1) / LANES, Time(1)), each = (k + passes - 1) / passes;
             for (Time first = 0, lanes; first < passes * each || first == 0; first += std::max(each, Time(1))) {
                 lanes = std::min(k - first, each);

@@ -38,9 +38,9 @@ struct Dual {
 
     // f of this number, by its value and its slope there.
     Dual chain(double f, double slope) const {
-        Dual found(f);
-        for (int i = 0; i < PAIRS; ++i) found.d[i] = slope * d[i];
-        return found;
+        Dual result(f);
+        for (int i = 0; i < PAIRS; ++i) result.d[i] = slope * d[i];
+        return result;
     }
 
     friend double value_of(const Dual& a) { return a.value; }
@@ -60,14 +60,14 @@ struct Dual {
         return a;
     }
     friend Dual operator*(const Dual& a, const Dual& b) {
-        Dual found(a.value * b.value);
-        for (int i = 0; i < PAIRS; ++i) found.d[i] = a.d[i] * b.value + a.value * b.d[i];
-        return found;
+        Dual result(a.value * b.value);
+        for (int i = 0; i < PAIRS; ++i) result.d[i] = a.d[i] * b.value + a.value * b.d[i];
+        return result;
     }
     friend Dual operator/(const Dual& a, const Dual& b) {
-        Dual found(a.value / b.value);
-        for (int i = 0; i < PAIRS; ++i) found.d[i] = (a.d[i] - found.value * b.d[i]) / b.value;
-        return found;
+        Dual result(a.value / b.value);
+        for (int i = 0; i < PAIRS; ++i) result.d[i] = (a.d[i] - result.value * b.d[i]) / b.value;
+        return result;
     }
     friend Dual operator+(Dual a, double b) { a.value += b; return a; }
     friend Dual operator+(double a, Dual b) { b.value = a + b.value; return b; }

@@ -77,14 +77,14 @@ class Plant {
 
     // A plant of first order has a rate, too, that is always 0: the algebra is the same for both orders. Some intervals
     // are remembered, as what comes regularly has few. The residual asks first: the response may share what it got.
-    const Driven<Real>& driven_over(Real t) const { return looked_up(driven, t); }
+    const Driven<Real>& driven_over(Real t) const { return look_up(driven, t); }
     const Transition<Real>& over(Real t) const {
-        const auto& [last, found] = driven[slot(t)];
-        return is_zero(t - last) ? found : looked_up(undriven, t);
+        const auto& [last, transition] = driven[slot(t)];
+        return is_zero(t - last) ? transition : look_up(undriven, t);
     }
 
     // Of an interval that will not come again.
-    Transition<Real> computed(Real t) const {
+    Transition<Real> compute(Real t) const {
         Transition<Real> f;
         compute(t, f);
         return f;
@@ -129,10 +129,10 @@ class Plant {
     static std::size_t slot(Real t) { return std::bit_cast<std::uint64_t>(value_of(t)) * 0x9E3779B97F4A7C15u >> 61; }
 
     template <class Of>
-    const Of& looked_up(Some<Of>& some, Real t) const {
-        auto& [last, found] = some[slot(t)];
-        if (!is_zero(t - last)) last = t, compute(t, found);  // in place: a copy would wait for it
-        return found;
+    const Of& look_up(Some<Of>& some, Real t) const {
+        auto& [last, transition] = some[slot(t)];
+        if (!is_zero(t - last)) last = t, compute(t, transition);  // in place: a copy would wait for it
+        return transition;
     }
 
     template <class Of>

@@ -13,7 +13,7 @@ struct pf_filter {
     virtual ~pf_filter() = default;
     virtual void run(int mode, const Table& rows, Time begin, Time end, Time n, const Time* time, const Time* asked,
                      double* outputs) = 0;
-    virtual bool bias(Time sensor, Time axis, double found[2]) const = 0;
+    virtual bool bias(Time sensor, Time axis, double numbers[2]) const = 0;
 };
 
 namespace {
@@ -33,10 +33,10 @@ struct Recorded final : pf_filter {
         else pumafuse::run(filter, state, rows, begin, end, mode == PF_REPEATED, n, time, outputs);
     }
 
-    bool bias(Time sensor, Time axis, double found[2]) const override {
+    bool bias(Time sensor, Time axis, double numbers[2]) const override {
         const int i = filter.bias[sensor * axes + axis];
         const Residual<N, double>& xi = state.axes[axis].residual;
-        if (i >= 0) found[0] = xi.x[i], found[1] = filter.axes[axis].sd_of(xi, i);
+        if (i >= 0) numbers[0] = xi.x[i], numbers[1] = filter.axes[axis].sd_of(xi, i);
         return i >= 0;
     }
 };
@@ -48,21 +48,21 @@ int pf_version(void) { return PF_VERSION; }
 const char* pf_error(void) { return error.c_str(); }
 
 void pf_transition(const pf_axis* axis, double dt, double step[17]) {
-    const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
+    const Arm<double> arm(lift<Axis, double>(axis, 1, {})[0]);
     const Driven<double>& f = arm.plant.driven_over(dt);
     const Decay<double> e = arm.plant.decaying(f, dt);
     const double lambda = std::sqrt(3.0) / axis->disturbance_time, density = 4.0 / lambda;
     const Driven<double> d = Plant<double>(lambda, 1.0, 0.0).driven_over(dt);
-    const double found[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, e.position, e.rate, e.left, d.f11, d.f12, d.f21,
-                            d.f22, density * d.q11, density * d.q12, density * d.q22};
-    std::copy_n(found, 17, step);
+    const double numbers[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, e.position, e.rate, e.left, d.f11, d.f12,
+                              d.f21, d.f22, density * d.q11, density * d.q12, density * d.q22};
+    std::copy_n(numbers, 17, step);
 }
 
 int pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int64_t* given, const double* command,
                 int64_t n, const int64_t* time, double* position) {
     return attempt([&] {
         by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
-            const Arm<double> arm(lifted<Axis, double>(axis + i, 1, {})[0]);
+            const Arm<double> arm(lift<Axis, double>(axis + i, 1, {})[0]);
             respond(arm, axis[i].start, delays, commands, given, command, n, time, position + i * n);
         });
     });
@@ -70,7 +70,7 @@ int pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int6
 
 void pf_follow(const pf_axis* axis, pf_motion* motion, int64_t commands, const int64_t* given, const double* command,
                int64_t n, const int64_t* time, double* position) {
-    const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
+    const Arm<double> arm(lift<Axis, double>(axis, 1, {})[0]);
     const Drive<double> drive{motion->command, motion->error, motion->position, motion->rate};
     Response<double> response{{motion->time}, axis->start, motion->step, drive, motion->slack};
     follow(response, arm, std::llround(axis->delay * 1e9), commands, given, command, n, time, position);
@@ -116,7 +116,7 @@ int pf_classify(const pf_model* model, const pf_events* events, int64_t origin, 
 
 pf_filter* pf_filter_new(const pf_model* model, int64_t origin) {
     pf_filter* made = nullptr;
-    attempt([&] { sized(*model, [&]<int N>(Size<N>) { made = new Recorded<N>(*model, origin); }); });
+    attempt([&] { with_size(*model, [&]<int N>(Size<N>) { made = new Recorded<N>(*model, origin); }); });
     return made;
 }
 
@@ -153,7 +153,7 @@ pf_live* pf_live_new(const pf_model* model, int64_t room, int64_t most) {
     pf_live* made = nullptr;
     attempt([&] {
         if (model->axes > 62) throw std::length_error("a stream is followed on at most 62 axes");
-        sized(*model, [&]<int N>(Size<N>) { made = new Window<N>(model_of<double>(*model), room, most); });
+        with_size(*model, [&]<int N>(Size<N>) { made = new Window<N>(model_of<double>(*model), room, most); });
     });
     return made;
 }

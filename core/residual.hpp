@@ -160,7 +160,7 @@ struct Residual {
 
     // Phi_s <- Phi Phi_s and Q_s <- Phi Q_s Phi^T + q Q1. Commands change q, so that each ends an interval; x and P wait
     // for the next measurement, which saves half of the time of a likelihood.
-    void enter(const Plant<Real>& plant, const Instant<Real>& to) {
+    void accumulate(const Plant<Real>& plant, const Instant<Real>& to) {
         const Real dt = seconds(until, to);
         if (is_zero(dt)) return;
         const Driven<Real>& f = plant.driven_over(dt);
@@ -188,7 +188,7 @@ struct Residual {
     // x <- F x and P <- F P F^T + Q.
     void predict(const Plant<Real>& plant, const Noise<N, Real>& noise, const Instant<Real>& to) {
         using std::expm1;
-        enter(plant, to);
+        accumulate(plant, to);
         const Real dt = seconds(time, to);
         if (is_zero(dt)) return;
         if (plant.order == 1) fade(PLANT, since.f11);

@@ -109,12 +109,12 @@ inline void respond(const Arm<double>& arm, double start, const std::vector<Time
 
 // Calls `work` with the first of each arms in a row that differ in their dead times alone, and with these [ns].
 inline void by_delays(Time count, const pf_axis* axis, auto work) {
-    const auto undelayed = [](pf_axis one) { return one.delay = 0.0, one; };
+    const auto drop_delay = [](pf_axis one) { return one.delay = 0.0, one; };
     for (Time i = 0, end = 0; i < count; i = end) {
-        const pf_axis shape = undelayed(axis[i]);
+        const pf_axis shape = drop_delay(axis[i]);
         std::vector<Time> delays;
         for (; end < count; ++end) {
-            const pf_axis other = undelayed(axis[end]);
+            const pf_axis other = drop_delay(axis[end]);
             if (std::memcmp(&shape, &other, sizeof(shape)) != 0) break;
             delays.push_back(std::llround(axis[end].delay * 1e9));
         }
@@ -132,7 +132,7 @@ inline void weigh(const pf_axis& axis, const std::vector<Time>& delays, const Wh
                           axis.slope == 0.0 && axis.recovery == 0.0;
     std::vector<double> raw[2], plain(n), more(n);
     for (int i = 0; i < (straight ? 1 : 2); ++i) {
-        Axis<double> one = lifted<Axis, double>(&axis, 1, {})[0];
+        Axis<double> one = lift<Axis, double>(&axis, 1, {})[0];
         one.intercept = 1.0 + i;
         raw[i].resize(delays.size() * n);
         respond(Arm<double>(one), axis.start, delays, commands, given, command, n, time, raw[i].data());

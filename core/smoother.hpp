@@ -141,10 +141,10 @@ template <int COLUMNS, int N>
 void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& history,
                  std::vector<Filtered<N>>& at, Time origin, Time n, const Time* times, double* outputs) {
     const Time A = filter.size();
-    const Known<N, double>& axis = filter.axes[a];
+    const AxisModel<N, double>& axis = filter.axes[a];
     Later<N, COLUMNS> later;
     Time k = n - 1;
-    const auto smoothed = [&] {  // estimate k, and on to the one before
+    const auto smooth_back = [&] {  // estimate k, and on to the one before
         double found[PF_OUTPUTS];
         auto& [r, doubt, residual] = at[k * A + a];
         later.smooth(residual);
@@ -152,7 +152,7 @@ void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& h
         for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = found[i];
         --k;
     };
-    while (k >= 0 && (history.empty() || times[k] >= history.back().time)) smoothed();  // nothing is later
+    while (k >= 0 && (history.empty() || times[k] >= history.back().time)) smooth_back();  // nothing is later
     for (auto entry = history.rbegin(); entry != history.rend(); ++entry) {
         if (entry->sensor != NOBODY) later.over_update(filter.H[entry->sensor * A + a], *entry);
         Time here = entry->time;
@@ -161,7 +161,7 @@ void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& h
             if (dt > 0.0) later.over_interval(axis.arm, axis.noise, dt, entry->q, entry->drift, entry->scale);
         };
         const Time before = entry + 1 != history.rend() ? entry[1].time : origin;
-        for (; k >= 0 && times[k] >= before; smoothed()) back_to(times[k]);
+        for (; k >= 0 && times[k] >= before; smooth_back()) back_to(times[k]);
         back_to(before);
     }
 }
@@ -182,7 +182,7 @@ void run_smoothed(const Filter<N>& filter, State<N, double>& state, const Table&
             filter.step(state, rows[row], rows.fate(row), false, &history);
         for (Time a = 0; a < A && k < n; ++a) {
             AxisState<N, double> now = state.axes[a];
-            filter.advance(now, a, {times[k], 0.0});
+            filter.predict(now, a, {times[k], 0.0});
             const Response<double>& r = now.response;
             at.push_back({r.position(filter.axes[a].arm), filter.axes[a].doubt(r), now.residual});
         }

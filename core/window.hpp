@@ -41,7 +41,7 @@ class Window final : public pf_live {
     bool add(Time stamp, int source, std::uint64_t given, Time oldest) override {
         port.contradicts = NOBODY;
         const bool taken = has_room(source == PF_COMMAND ? size() : 1, stamp, oldest);
-        if (taken) source == PF_COMMAND ? put_command(stamp, given) : put_measurement(stamp, source, given);
+        if (taken) source == PF_COMMAND ? add_command(stamp, given) : add_measurement(stamp, source, given);
         run(target);
         port.room = rows.room(), port.begin = begin, port.end = end;
         return taken;
@@ -139,15 +139,15 @@ class Window final : public pf_live {
         Row& at(Time row) const { return places[row & (room() - 1)]; }
 
         Event operator[](Time row) const {
-            Row& found = at(row);
-            double* number = found.numbers.data();
-            return {found.time, found.stamp, found.source, number, number + axes, found.codes.data()};
+            Row& entry = at(row);
+            double* number = entry.numbers.data();
+            return {entry.time, entry.stamp, entry.source, number, number + axes, entry.codes.data()};
         }
 
         Fate fate(Time row) const {
-            Row& found = at(row);
-            double* number = found.numbers.data() + 2 * axes;
-            return {number, number + axes, number + 2 * axes, found.codes.data() + axes, &found.contradicts};
+            Row& entry = at(row);
+            double* number = entry.numbers.data() + 2 * axes;
+            return {number, number + axes, number + 2 * axes, entry.codes.data() + axes, &entry.contradicts};
         }
     };
 
@@ -208,11 +208,11 @@ class Window final : public pf_live {
         return true;
     }
 
-    void put_measurement(Time stamp, int sensor, std::uint64_t given) {
+    void add_measurement(Time stamp, int sensor, std::uint64_t given) {
         const Time row = insert(stamp - nanoseconds(model.sensors[sensor].latency), sensor, stamp, given);
         const bool duplicate = repeats_earlier(rows, row, begin, int(size()));
         for (Time a = 0; a < size(); ++a)
-            port.outcome[a] = rows[row].known[a] = classified(row, a, duplicate ? PF_DUPLICATE : PF_FUSED);
+            port.outcome[a] = rows[row].known[a] = classify(row, a, duplicate ? PF_DUPLICATE : PF_FUSED);
         if (duplicate) return remove(row);
         run(row + 1);
         const Fate fate = rows.fate(row);
@@ -223,7 +223,7 @@ class Window final : public pf_live {
     }
 
     // A row for each delay of the axes that a command moves.
-    void put_command(Time stamp, std::uint64_t given) {
+    void add_command(Time stamp, std::uint64_t given) {
         std::fill_n(port.outcome, size(), Code(PF_ABSENT));
         for (Time a = 0; a < size(); ++a) {
             if (!(given >> a & 1)) continue;
@@ -240,11 +240,11 @@ class Window final : public pf_live {
             }
         }
         for (Time a = 0; a < size(); ++a)
-            if (port.outcome[a] == PF_FUSED && stamp <= first[a]) begin_axis(a, stamp);
+            if (port.outcome[a] == PF_FUSED && stamp <= first[a]) start_axis(a, stamp);
     }
 
     // Let an axis rest until its first command, which is that of `stamp`; all of them if none was before it.
-    void begin_axis(Time a, Time stamp) {
+    void start_axis(Time a, Time stamp) {
         const bool earlier = stamp < port.origin;
         first[a] = stamp, port.origin = std::min(stamp, port.origin);
         restore(begin);
@@ -261,14 +261,14 @@ class Window final : public pf_live {
         }
     }
 
-    Code classified(Time row, Time a, Code whole) const {
+    Code classify(Time row, Time a, Code whole) const {
         return Policy{model, port.origin}.classify(rows, row, int(a), begin, end, whole, state.axes[a].response.start);
     }
 
     // Look again at the values of an axis from a row on that are not after `until`.
     void reclassify(Time a, Time row, Time until) {
         for (; row < end && rows[row].time <= until; ++row) {
-            const Code now = classified(row, a, PF_FUSED);
+            const Code now = classify(row, a, PF_FUSED);
             if (now != std::exchange(rows[row].known[a], now)) restore(row);
         }
     }
@@ -284,10 +284,10 @@ class Window final : public pf_live {
         restore(row);
         for (Time k = end++; k > row; --k) std::swap(rows.at(k), rows.at(k - 1));
         target += row < target;
-        Row& made = rows.at(row);
-        made.time = time, made.stamp = stamp, made.source = source;
-        std::copy_n(numbers.begin(), 2 * size(), made.numbers.begin());
-        for (Time a = 0; a < size(); ++a) made.codes[a] = given >> a & 1 ? PF_FUSED : PF_ABSENT;
+        Row& entry = rows.at(row);
+        entry.time = time, entry.stamp = stamp, entry.source = source;
+        std::copy_n(numbers.begin(), 2 * size(), entry.numbers.begin());
+        for (Time a = 0; a < size(); ++a) entry.codes[a] = given >> a & 1 ? PF_FUSED : PF_ABSENT;
         return row;
     }
 
@@ -299,7 +299,7 @@ class Window final : public pf_live {
             if (rows[row].known[a] == PF_ABSENT || !alike || now[a] == before[a]) continue;
             restore(row);
             number[a] = now[a], number[size() + a] = now[size() + a];
-            rows[row].known[a] = classified(row, a, PF_FUSED);
+            rows[row].known[a] = classify(row, a, PF_FUSED);
         }
     }
 

@@ -18,7 +18,7 @@ from scipy.optimize import minimize_scalar
 
 import pumafuse as pf
 from pumafuse.filter.response import response
-from pumafuse.fusion.score import interpolated
+from pumafuse.fusion.score import interpolate
 from pumafuse.views import colours, step_figures
 
 HERE = Path(__file__).parent
@@ -188,7 +188,7 @@ def main() -> None:
     est = pf.fuse(run, config, sensors=["vision"], rate=200.0)
     smooth = pf.fuse(run, config, sensors=["vision"], rate=200.0, mode="smoothed")
     methods = {axis: {**rows(est, axis), "pumafuse --smooth (afterwards)": smooth[axis].position} for axis in est.axes}
-    reference = {axis: interpolated(est.time, est.segment, est.reference, axis) for axis in est.axes}
+    reference = {axis: interpolate(est.time, est.segment, est.reference, axis) for axis in est.axes}
     figure, (left, right) = plt.subplots(1, 2, figsize=(13.0, 4.4), layout="constrained", width_ratios=[5, 4])
     stretch(left, est, methods, reference)
     errors(right, methods, reference)

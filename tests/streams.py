@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from pumafuse.arrays import NO_STAMP
 from pumafuse.live.record import Recorder
-from pumafuse.live.sources import replayed
+from pumafuse.live.sources import replay
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import Lines
 
@@ -160,8 +160,8 @@ def replay_is_as_live(run: pf.Run, config: pf.FusionConfig) -> None:
     """Assert that a run that is replayed as a stream ends with the last estimate of `fuse`, to the bit."""
     offline, live = pf.fuse(run, config), pf.LiveEstimator(config)
     stream = Stream(live, lambda _: None, lambda _: None)
-    for events in replayed(run, config, np.inf):
-        stream.take(events)
+    for events in replay(run, config, np.inf):
+        stream.add(events)
     last = live.estimate(offline.origin + round(offline.time[-1] * 1e9))
     for axis, track in offline.axes.items():
         assert last[axis].position == track.position[-1]
@@ -189,7 +189,7 @@ def record_is_as_live(folder: Path, run: pf.Run, config: pf.FusionConfig) -> tup
     live, written = pf.LiveEstimator(config, start=run.start, event_log=recorder), list[bytes]()
     stream = Stream(live, written.extend, lambda _: None)
     for one in wired(run):
-        stream.take([one])
+        stream.add([one])
         recorder.tick(live.sure)
     recorder.close(live.sure)
     found = pf.Run.read(folder)
@@ -284,15 +284,15 @@ class Both:
         self.lines = Lines()
 
     def feed(self, piece: bytes) -> None:
-        self.stream.take(self.lines.cut(piece))
+        self.stream.add(self.lines.cut(piece))
 
     def replay(self, run: pf.Run) -> None:
-        for events in replayed(run, self.live.config, np.inf):
-            self.stream.take(events)
+        for events in replay(run, self.live.config, np.inf):
+            self.stream.add(events)
         self.stream.end()
 
     def end(self) -> None:
-        self.stream.take(self.lines.remaining())
+        self.stream.add(self.lines.remaining())
         self.stream.end()
 
     def keep(self, lines: list[bytes]) -> None:

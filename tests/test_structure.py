@@ -82,6 +82,18 @@ def test_names_say_the_thing() -> None:
             assert name.lstrip("_") not in silent or id(node) in keys, f"{path}, line {node.lineno}: {name}"
 
 
+def test_one_verb_stands_for_one_action() -> None:
+    """Of several verbs for one action functions have one, which CONTRIBUTING.md lists; these are the others."""
+    others = {
+        *("make", "create", "produce", "generate", "feed", "enter", "give", "hand", "insert", "deliver", "store"),
+        *("fetch", "seek", "detect", "solve", "display", "tell", "post"),
+    }
+    for path in SOURCE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("__"):
+                assert node.name.lstrip("_").split("_")[0] not in others, f"{path}, line {node.lineno}: {node.name}"
+
+
 def test_no_room_hides_a_public_name() -> None:
     """A module that is imported becomes an attribute of the package: none is called what a function or class is."""
     assert {path.stem for path in SOURCE.iterdir()}.isdisjoint(pf.__all__)

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from pumafuse.arrays import FloatArray, TimeArray
 from pumafuse.filter.core import Filter
-from pumafuse.filter.events import COMMAND, Events, Results, joined
+from pumafuse.filter.events import COMMAND, Events, Results, concatenate
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.engine import model_of
-from pumafuse.fusion.segments import Segment, build
+from pumafuse.fusion.segments import Segment, build_segment
 
 MS = 1_000_000  # ns
 AXES = {
@@ -53,7 +53,7 @@ def segment_of(seed: int) -> Segment:
             )
             values[axis] = near + np.where(rng.random(len(valid)) < 0.05, 0.05, 0.0)
         streams[name] = valid + round(CONFIG.sensors[name].latency * 1e9), values
-    return build(pf.Run.from_arrays(stamp, command, streams), CONFIG)
+    return build_segment(pf.Run.from_arrays(stamp, command, streams), CONFIG)
 
 
 GRID = 20 * MS * np.arange(160)
@@ -134,10 +134,10 @@ def test_late_events_end_as_events_in_time(seed: int) -> None:
 def test_tables_are_joined_with_the_spread_that_one_of_them_has() -> None:
     """A table without one has noise as configured."""
     plain, spread = Events.empty(2, 3), Events.empty(2, 2)._replace(spread=np.full((2, 2), 4.0))
-    assert joined([plain, plain]).spread.shape == (0, 2)
-    assert joined([plain, spread]).spread.tolist() == [[1.0, 1.0]] * 3 + [[4.0, 4.0]] * 2
-    assert joined([plain, spread]).rows(np.array([4, 0])).spread.tolist() == [[4.0, 4.0], [1.0, 1.0]]
-    assert joined([plain, spread]).columns([1]).spread.shape == (5, 1)
+    assert concatenate([plain, plain]).spread.shape == (0, 2)
+    assert concatenate([plain, spread]).spread.tolist() == [[1.0, 1.0]] * 3 + [[4.0, 4.0]] * 2
+    assert concatenate([plain, spread]).rows(np.array([4, 0])).spread.tolist() == [[4.0, 4.0], [1.0, 1.0]]
+    assert concatenate([plain, spread]).columns([1]).spread.shape == (5, 1)
 
 
 def test_a_window_that_grows_says_no_contradiction_of_good_sensors() -> None:

@@ -14,8 +14,8 @@ from plants import PLANT
 from pumafuse import AxisModel, FirstOrder, Gain, Sag, SecondOrder
 from pumafuse.arrays import FloatArray, TimeArray
 from pumafuse.filter.response import at_rest, follow, record_of, response
-from pumafuse.fusion.engine import innovations, linearised
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.engine import innovation_derivatives, innovations
+from pumafuse.fusion.segments import build_segment
 from pumafuse.model.plants import PLANTS
 
 MS = 1_000_000  # ns
@@ -207,7 +207,7 @@ def test_derivatives_are_those_of_the_innovations(plant: PLANTS) -> None:
     run = pf.Run.from_arrays(given, {"x": command}, {"camera": (valid, {"x": np.full(400, START)})})
     arm = pf.ArmModel(name="one", update_period=PERIOD, delay=DELAY, axes={"x": axis})
     config = pf.FusionConfig(arm=arm, process={"x": pf.Process(drift=1e-3)}, sensors={"camera": pf.Sensor(sd=1e-3)})
-    segment = build(run, config)
+    segment = build_segment(run, config)
     outcome = np.zeros_like(segment.measurement_rows.codes)
 
     def with_axis(**fields: Any) -> pf.FusionConfig:
@@ -224,7 +224,7 @@ def test_derivatives_are_those_of_the_innovations(plant: PLANTS) -> None:
     for key in ("slope", "knee", "slope_beyond", "knee_below", "slope_below"):
         sags = (changed(LOWER, **{key: getattr(LOWER, key) + sign * 1e-6}) for sign in (-1, 1))
         beside.append((*(with_axis(sag=one) for one in sags), 2e-6))
-    _, d_nu, _ = linearised(segment, config, outcome, [(high, 0.5 * width) for _, high, width in beside])
+    _, d_nu, _ = innovation_derivatives(segment, config, outcome, [(high, 0.5 * width) for _, high, width in beside])
     fused = segment.measurement_rows.codes[:, 0] == pf.Outcome.FUSED
     for found, (low, high, width) in zip(d_nu[:, fused, 0], beside, strict=True):
         down, up = (innovations(segment, one, outcome).innovation[fused, 0] for one in (low, high))

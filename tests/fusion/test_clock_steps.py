@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.fusion.clock_steps import leaps
-from pumafuse.fusion.faults import Fault, faults_of
+from pumafuse.fusion.clock_steps import find_leaps
+from pumafuse.fusion.faults import Fault, find_faults
 from pumafuse.fusion.placing import in_base
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.segments import build_segment
 from pumafuse.logs.run import Source
 from pumafuse.tuning.parameters import changed
 from tuning_runs import SCENARIOS, later
@@ -36,7 +36,7 @@ def clock_set(run: pf.Run, sensor: str, by: float, at: float = AT) -> pf.Run:
 
 def named(run: pf.Run, config: pf.FusionConfig) -> list[Fault]:
     in_place, _, config = in_base(run, config)
-    return [one for one in faults_of(build(in_place, config), config) if one.cause == "set"]
+    return [one for one in find_faults(build_segment(in_place, config), config) if one.cause == "set"]
 
 
 def lost(source: Source, begin: float, end: float) -> Source:
@@ -104,12 +104,12 @@ def test_leaps_are_as_long_as_time_went_by_without_rows() -> None:
     rng = np.random.default_rng(1)
     even = np.arange(0.0, 20.0, 0.033)
     stamp = np.rint((even + rng.uniform(0.0, 0.01, len(even))) * 1e9).astype(np.int64)
-    assert leaps(stamp) == []
+    assert find_leaps(stamp) == []
     for by in (0.05, 0.2, 0.9, -0.05, -0.2, -0.9):
-        (leap,) = leaps(np.sort(np.where(even >= 10.0, stamp + round(by * 1e9), stamp)))
+        (leap,) = find_leaps(np.sort(np.where(even >= 10.0, stamp + round(by * 1e9), stamp)))
         assert abs(leap.by - by) < 0.033
         assert abs(leap.last / 1e9 - 10.0 - min(by, 0.0)) < 0.1
-    assert leaps(stamp[:: len(stamp)]) == []
+    assert find_leaps(stamp[:: len(stamp)]) == []
 
 
 @pytest.mark.parametrize(

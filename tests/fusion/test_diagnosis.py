@@ -14,8 +14,8 @@ from changes import Change, delayed, exchanged, of_sensor, scaled
 from pumafuse.arrays import FloatArray
 from pumafuse.filter.response import response
 from pumafuse.fusion.consistency import Finding, consistency
-from pumafuse.fusion.faults import not_following, sensor_faults
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.faults import check_sensors, find_not_following
+from pumafuse.fusion.segments import build_segment
 from pumafuse.fusion.summary import summarise
 from pumafuse.logs.clock import clock_faults
 from tuning_runs import scenario, with_sensors
@@ -160,7 +160,7 @@ def test_another_clock_is_found_in_both_directions(log: str, sensor: str, second
     assert number_before(" s ", note) == pytest.approx(abs(seconds), abs=0.03)
     latency = float(note.split("latency_ms = ")[1].split()[0]) / 1e3
     config = with_sensors(logged(log)[1], sensor, latency=latency)
-    assert not_following(build(run, config), config) == []
+    assert find_not_following(build_segment(run, config), config) == []
 
 
 def test_a_clock_that_all_sensors_contradict_is_the_commands() -> None:
@@ -222,7 +222,7 @@ def test_a_zero_that_differs_is_told_with_the_key(log: str, sensor: str, far: fl
     assert f"bias_sd_{screen.unit} = {{ {axis} = " in note and f"[start] offset_sd_{screen.unit} = {{" in note
     width = float(note.split(f"bias_sd_{screen.unit} = {{ {axis} = ")[1].split(" }")[0]) / screen.scale
     config = with_sensors(config, sensor, bias_sd={axis: width})
-    assert sensor_faults(build(moved, config), config) == []
+    assert check_sensors(build_segment(moved, config), config) == []
 
 
 def test_a_zero_that_all_sensors_contradict_is_the_commands() -> None:
@@ -266,8 +266,8 @@ def test_a_misspelt_sensor_is_named_with_the_other_name() -> None:
 
 
 def alarms(run: pf.Run, config: pf.FusionConfig) -> list[str]:
-    segment = build(run, config)
-    faults = sensor_faults(segment, config)
+    segment = build_segment(run, config)
+    faults = check_sensors(segment, config)
     return [*clock_faults(run, config.arm.update_period, run.sensors), *(fault.sentence for fault in faults)]
 
 
@@ -278,7 +278,7 @@ def test_a_good_log_gives_no_alarm(log: str) -> None:
     assert notes(run, log) == []
     middle = float(np.ptp(run.command.stamp)) / 2e9
     for part in (run.between(0.0, middle), run.between(middle), run.between(middle, middle + 5.0)):
-        assert sensor_faults(build(part, config), config) == []
+        assert check_sensors(build_segment(part, config), config) == []
 
 
 @pytest.mark.long

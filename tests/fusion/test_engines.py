@@ -17,7 +17,7 @@ import pumafuse as pf
 from fusion.test_oracle import LAG, MS, Case, cases, every, replace_
 from fusion_oracle import AxisOracle, nanoseconds
 from pumafuse.fusion.engine import Filtered, filter_segment
-from pumafuse.fusion.segments import build, output_times
+from pumafuse.fusion.segments import build_segment, output_times
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import AxisModel
 
@@ -26,7 +26,7 @@ FIELDS = ("position", "velocity", "offset", "disturbance")
 
 def both(run: Run, config: pf.FusionConfig, rate: float | None = None) -> tuple[Filtered, Filtered]:
     """What the compiled and the filterpy engine make of a run."""
-    segment = build(run, config)
+    segment = build_segment(run, config)
     times = output_times(segment, config, rate)
     compiled = filter_segment(segment, config, times, "filtered")
     return compiled, filter_segment(segment, config, times, "filtered", "filterpy")

@@ -17,8 +17,8 @@ from fusion.test_innovations import near, numbers
 from fusion.test_oracle import MODES, MS, PAPER, Case, Seen, T, one, replace_, sensor
 from pumafuse.filter.core import FINEST
 from pumafuse.filter.outcome import Outcome
-from pumafuse.fusion.engine import innovations, linearised
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.engine import innovation_derivatives, innovations
+from pumafuse.fusion.segments import build_segment
 from pumafuse.logs.run import Run
 from pumafuse.model.plants import Plant
 
@@ -87,9 +87,11 @@ def check(run: Run, config: pf.FusionConfig, rate: float | None = None) -> dict[
         again = parts(pf.fuse(run, config, rate=rate, **MODES[mode]))
         for name, value in known.items():
             assert value.tobytes() == again[name].tobytes(), (mode, name)
-    segment = build(run, config)
+    segment = build_segment(run, config)
     outcome, each = innovations(segment, config).outcome, [near(config, path) for path in numbers(config, "radial")]
-    assert all(np.isfinite(derivatives).all() for derivatives in linearised(segment, config, outcome, each)[1:])
+    assert all(
+        np.isfinite(derivatives).all() for derivatives in innovation_derivatives(segment, config, outcome, each)[1:]
+    )
     return found
 
 

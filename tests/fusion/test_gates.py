@@ -17,7 +17,7 @@ from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.engine import filter_segment
 from pumafuse.fusion.estimates import AxisEstimate, Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.segments import build_segment
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import ArmModel, AxisModel
 from pumafuse.model.plants import FirstOrder
@@ -211,12 +211,14 @@ def test_any_log_is_decided_as_by_the_reference(log: tuple[list[Row], dict[str, 
     rows, sensors = log
     times = np.linspace(0.0, max(row.valid for row in rows), 5)[1:].astype(np.int64)
     run, config = recorded(rows, sensors)
-    segment = build(run, config)
+    segment = build_segment(run, config)
     agree(*(filter_segment(segment, config, times, "filtered", engine) for engine in ("compiled", "filterpy")))
     live = filter_segment(segment, config, times, "as-live")
     for n, time in enumerate(times.tolist()):
         arrived = [row for row in rows if row.valid + round(sensors[row.sensor].latency * 1e9) <= time]
-        then = filter_segment(build(*recorded(arrived, sensors)), config, times[n : n + 1], "filtered", "filterpy")
+        then = filter_segment(
+            build_segment(*recorded(arrived, sensors)), config, times[n : n + 1], "filtered", "filterpy"
+        )
         agree_on_axes({axis: at(one, n) for axis, one in live.axes.items()}, then.axes)
 
 

@@ -13,9 +13,9 @@ from pumafuse.arrays import FloatArray
 from pumafuse.filter.events import Results
 from pumafuse.filter.outcome import ABSENT, Outcome
 from pumafuse.fusion.config import FusionConfig, Process
-from pumafuse.fusion.engine import innovations, linearised
+from pumafuse.fusion.engine import innovation_derivatives, innovations
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.segments import build_segment
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import Plant
@@ -32,7 +32,7 @@ def gated(config: FusionConfig, gate: float = GATE) -> FusionConfig:
 
 def check(run: Run, config: FusionConfig) -> Results:
     """Gates decide as in a fusion; with the outcomes given, everything is as it was."""
-    segment = build(run, config)
+    segment = build_segment(run, config)
     found, est = innovations(segment, config), fuse(run, config)
     order = np.argsort(segment.events(config)[1])
     given = segment.measurement_rows.codes[order] != ABSENT
@@ -79,7 +79,7 @@ def test_given_outcomes_are_repeated_whatever_the_gates_would_say() -> None:
     run, config = contradicting()
     outcome = check(run, config).outcome
     assert set(np.unique(outcome)) == {Outcome.FUSED, Outcome.REJECTED, Outcome.REACQUIRED}
-    segment, other = build(run, config), louder(config)
+    segment, other = build_segment(run, config), louder(config)
     assert (innovations(segment, other).outcome != outcome).any()
     repeated = innovations(segment, other, outcome)
     assert (repeated.outcome == outcome).all()
@@ -161,10 +161,10 @@ def test_derivatives_are_those_of_the_joint_gaussian(
     noise = changed(NOISE, disturbance_sd=2e-3, disturbance_time=0.2, disturbance_kind=kind)
     arm = {"radial": AxisModel(plant=plant, gain=PAPER, gain_recovery=recovery, delay=0.0412)}
     run, config = Case(arm, times=np.arange(8) * 28 * MS, process=noise, seen=PARTS).made()
-    segment, paths = build(run, config), numbers(config, "radial")
+    segment, paths = build_segment(run, config), numbers(config, "radial")
     order = np.argsort(segment.events(config)[1])
     outcome = np.zeros_like(segment.measurement_rows.codes)
-    _, d_nu, d_s = linearised(segment, config, outcome, [near(config, path) for path in paths])
+    _, d_nu, d_s = innovation_derivatives(segment, config, outcome, [near(config, path) for path in paths])
     assert len(paths) > 20
     for path, by_nu, by_s in zip(paths, d_nu[:, order, 0], d_s[:, order, 0], strict=True):
         low, high, width = beside(config, path)
@@ -180,7 +180,7 @@ def test_derivatives_are_those_of_innovations_whose_outcomes_stay() -> None:
     innovations are the same.
     """
     run, config = contradicting()
-    segment, outcome = build(run, config), check(run, config).outcome
+    segment, outcome = build_segment(run, config), check(run, config).outcome
     noise = changed(NOISE, disturbance_sd=2e-3, disturbance_time=0.2)
     axes = {axis: changed(one, gain=PAPER, gain_recovery=0.08, delay=0.05) for axis, one in config.arm.axes.items()}
     sensors = {
@@ -189,20 +189,22 @@ def test_derivatives_are_those_of_innovations_whose_outcomes_stay() -> None:
     }
     config = changed(config, arm=changed(config.arm, axes=axes), process=dict.fromkeys(axes, noise), sensors=sensors)
     paths = list(dict.fromkeys(path for axis in axes for path in numbers(config, axis)))
-    found, d_nu, d_s = linearised(segment, config, outcome, [near(config, path) for path in paths])
+    found, d_nu, d_s = innovation_derivatives(segment, config, outcome, [near(config, path) for path in paths])
     for path, by_nu, by_s in zip(paths, d_nu, d_s, strict=True):
         low, high, width = beside(config, path)
         down, up = (innovations(segment, one, outcome) for one in (low, high))
         alike(by_nu, (up.innovation - down.innovation) / width, path)
         alike(by_s, (up.innovation_sd**2 - down.innovation_sd**2) / width, path)
-        _, alone_nu, alone_s = linearised(segment, config, outcome, [near(config, path)])
+        _, alone_nu, alone_s = innovation_derivatives(segment, config, outcome, [near(config, path)])
         np.testing.assert_array_equal(alone_nu[0], by_nu)
         np.testing.assert_array_equal(alone_s[0], by_s)
     for count in (6, 7, 10, 11):
-        _, some_nu, some_s = linearised(segment, config, outcome, [near(config, path) for path in paths[:count]])
+        _, some_nu, some_s = innovation_derivatives(
+            segment, config, outcome, [near(config, path) for path in paths[:count]]
+        )
         np.testing.assert_array_equal(some_nu, d_nu[:count])
         np.testing.assert_array_equal(some_s, d_s[:count])
-    plain, *none = linearised(segment, config, outcome, [])
+    plain, *none = innovation_derivatives(segment, config, outcome, [])
     assert [len(one) for one in none] == [0, 0]
     for one in (found, innovations(segment, config, outcome)):
         np.testing.assert_array_equal(one.innovation, plain.innovation)

@@ -19,7 +19,7 @@ from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.engine import model_of
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.segments import build
+from pumafuse.fusion.segments import build_segment
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, Plant, SecondOrder
@@ -382,7 +382,7 @@ def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -
 def core_of(case: Case) -> tuple[Filter, Model, Events]:
     """The filter of a case at rest, its model, and its events."""
     run, config = case.made()
-    segment = build(run, config)
+    segment = build_segment(run, config)
     model = model_of(segment, config)
     return Filter(model, segment.origin), model, segment.events(config)[0]
 

@@ -17,7 +17,7 @@ from pumafuse.errors import RunError
 from pumafuse.filter.events import COMMAND
 from pumafuse.filter.outcome import ABSENT, Outcome
 from pumafuse.fusion.config import FusionConfig, Sensor
-from pumafuse.fusion.segments import Segment, build, output_times
+from pumafuse.fusion.segments import Segment, build_segment, output_times
 from pumafuse.logs.run import Clock, Run
 from pumafuse.model.arm import ArmModel, AxisModel
 from pumafuse.model.plants import FirstOrder
@@ -70,7 +70,7 @@ def commanded(
 ) -> list[tuple[int, float]]:
     """The commands that act on the radial axis, (stamp, u)."""
     run = Run.from_arrays(np.array(stamp, dtype=np.int64), {"radial": value}, clock=clock, start=start)
-    segment = build(run, config())
+    segment = build_segment(run, config())
     times, values = segment.commands_of("radial")
     assert times.tolist() == segment.commands.tolist()
     return list(zip(times.tolist(), values.round(12).tolist(), strict=True))
@@ -115,7 +115,7 @@ def order_by_hand(run: Run, config: FusionConfig) -> list[tuple[int, int, int, i
 def test_events_come_in_the_total_order(case: tuple[Run, FusionConfig]) -> None:
     """By time, commands first, then sensors as in fusion.toml, stamp, place in the file."""
     run, conf = case
-    segment = build(run, conf)
+    segment = build_segment(run, conf)
     events, place = segment.events(conf)
     wanted = order_by_hand(run, conf)
     got = list(zip(events.time.tolist(), events.source.tolist(), events.stamp.tolist(), strict=True))
@@ -159,7 +159,7 @@ def reasons(run: Run, conf: FusionConfig, name: str, row: int, axis: str) -> set
 def test_a_measurement_is_left_out_only_for_a_reason_it_has(case: tuple[Run, FusionConfig]) -> None:
     """What goes to the filter has no defect; every other component gets the name of one that it has."""
     run, conf = case
-    segment = build(run, conf)
+    segment = build_segment(run, conf)
     events, _ = segment.events(conf)
     for at, (_, source, _, row) in enumerate(order_by_hand(run, conf)):
         for number, axis in enumerate(run.axes):
@@ -200,7 +200,7 @@ def test_every_defect_is_noted_once() -> None:
         "b: sd_mm has no entry for radial, which is not used: unknown",
     ]
     known = {"a": Sensor(sd=1e-4), "b": Sensor(sd={"vertical": 1e-4}), "silent": Sensor(sd=1e-4)}
-    notes = build(replace(run, notes=("torn line",)), config(**known)).notes
+    notes = build_segment(replace(run, notes=("torn line",)), config(**known)).notes
     assert len(notes) == len(wanted)
     for sentence in wanted:
         assert sum(note.startswith(sentence) for note in notes) == 1, (sentence, notes)
@@ -213,7 +213,7 @@ def test_an_axis_has_its_own_commands_and_start() -> None:
     """Each axis has its commands and its start level, the first command by default."""
     stamp = [ORIGIN, ORIGIN + TICK, ORIGIN + 2 * TICK]
     values = {"vertical": [nan, 0.2, 0.3], "radial": [0.5, nan, 0.7]}
-    segment = build(Run.from_arrays(stamp, values, start={"radial": 0.4}), config())
+    segment = build_segment(Run.from_arrays(stamp, values, start={"radial": 0.4}), config())
     assert segment.axes == ("vertical", "radial")
     assert segment.start == {"radial": 0.4, "vertical": 0.2}
     assert [part.tolist() for part in segment.commands_of("radial")] == [[stamp[0], stamp[2]], [0.5, 0.7]]
@@ -226,7 +226,7 @@ def test_a_command_is_an_event_for_each_distinct_delay() -> None:
     """Axes with one delay are moved by one event, others by events of their own, in the order of acting."""
     arm = msgspec.structs.replace(ARM, axes={**ARM.axes, "tangential": ARM.axes["radial"]})
     run = Run.from_arrays([ORIGIN], {axis: [0.5] for axis in ("tangential", "radial", "vertical")})
-    segment = build(run, FusionConfig(arm=arm))
+    segment = build_segment(run, FusionConfig(arm=arm))
     events, place = segment.events(FusionConfig(arm=arm))
     assert not len(place)
     assert events.time.tolist() == [ORIGIN + 10 * MS, ORIGIN + DELAY]
@@ -265,7 +265,7 @@ def test_commands_are_those_of_a_walk_through_the_rows(rows: list[tuple[int, flo
     wanted = commands_by_hand(rows)
     assert commanded(stamp, value) == wanted
     run = Run.from_arrays(np.array(stamp), {"radial": value})
-    assert build(run, config()).origin == wanted[0][0]
+    assert build_segment(run, config()).origin == wanted[0][0]
 
 
 def test_a_regular_clock_puts_commands_on_even_ticks() -> None:
@@ -287,7 +287,7 @@ def test_a_regular_clock_moves_the_origin_and_not_the_measurements() -> None:
     stamp = ORIGIN + np.arange(101) * TICK
     stamp[0] -= 2 * MS
     run = Run.from_arrays(stamp, {"radial": np.arange(101.0)}, {"a": measurements((4, 1.0), (5, 2.0))}, clock="regular")
-    segment = build(run, config(a=A))
+    segment = build_segment(run, config(a=A))
     assert segment.origin == ORIGIN
     assert outcomes(segment) == ["before_start", "fused"]
 
@@ -296,7 +296,7 @@ def test_commands_that_are_no_positions_are_refused() -> None:
     """An axis with nothing but sentinels has no start level."""
     run = Run.from_arrays([ORIGIN, ORIGIN + TICK], {"radial": [0.5, 0.5], "vertical": [1e7, 3.4e38]}, clock="regular")
     with pytest.raises(RunError, match="'vertical'"):
-        build(run, config())
+        build_segment(run, config())
 
 
 # ---- output times
@@ -312,7 +312,7 @@ def test_commands_that_are_no_positions_are_refused() -> None:
 )
 def test_the_end_is_the_last_event_of_the_filter(rows: list[tuple[float, float]], end: int, stamped: int) -> None:
     """The grid of estimates ends with the last command or the last measurement that can be fused; live by its stamp."""
-    segment = build(recorded({"a": measurements(*rows)}), config(a=A))
+    segment = build_segment(recorded({"a": measurements(*rows)}), config(a=A))
     for as_live, last in ((False, end), (True, stamped)):
         assert segment.end(config(a=A), as_live) == ORIGIN + last
         assert output_times(segment, config(a=A), 1000.0, as_live)[-1] == ORIGIN + last
@@ -323,7 +323,7 @@ def test_the_end_is_the_last_event_of_the_filter(rows: list[tuple[float, float]]
 def test_an_even_grid_has_every_point_up_to_the_end(rate: int, last: int, more: int) -> None:
     """Estimates at k / rate from the first command on, as long as the run lasts, to the nearest ns."""
     end = ORIGIN + math.ceil(Fraction(last * 10**9, rate)) + more
-    segment = replace(build(recorded(), config()), commands=np.array([ORIGIN, end]))
+    segment = replace(build_segment(recorded(), config()), commands=np.array([ORIGIN, end]))
     wanted = [ORIGIN + round(Fraction(k * 10**9, rate)) for k in range(last + 1)]
     got = output_times(segment, config(), float(rate))
     assert len(got) == len(wanted)
@@ -340,7 +340,7 @@ class ForgottenAtOnce(dict[Any, Any]):
 def test_threads_may_ask_for_the_events_of_other_delays() -> None:
     """A search in threads does; the order that is kept for the next one is then another thread's."""
     given = config(tracker=Sensor(sd=1e-3))
-    segment = build(recorded({"tracker": measurements((1.0, 0.5), (2.0, 0.5))}), given)
+    segment = build_segment(recorded({"tracker": measurements((1.0, 0.5), (2.0, 0.5))}), given)
     expected, _ = segment.events(given)
     object.__setattr__(segment, "_latest", ForgottenAtOnce())
     found, _ = segment.events(given)

@@ -12,7 +12,7 @@ import pytest
 import pumafuse as pf
 from fusion_oracle import Response, commands
 from pumafuse.fusion.skill import PredictionError, Skill, skill
-from pumafuse.fusion.summary import beaten
+from pumafuse.fusion.summary import beaten_notes
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 PERIOD, SD = 0.028, 0.5e-3
@@ -193,7 +193,7 @@ def test_a_simpler_way_that_predicts_better_is_said() -> None:
         arm = pf.ArmModel(name="slow", update_period=0.02, delay=delay, axes={"x": plant})
         sensor = pf.Sensor(sd=1e-4, gate=0.0)
         process = {"x": pf.Process(input_noise=1e-5, drift=1e-4)}
-        return beaten(
+        return beaten_notes(
             pf.summarise(pf.fuse(run, pf.FusionConfig(arm=arm, process=process, sensors={"rule": sensor}))).axes
         )
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
 from pumafuse.fusion.config import Placement
-from pumafuse.fusion.placing import with_tool
+from pumafuse.fusion.placing import add_tool
 from pumafuse.live.wire import LineDecoder
 from pumafuse.logs.clock import without_strays
 from pumafuse.logs.manifest import chain_of
@@ -90,7 +90,7 @@ def run_of(folder: Path, seconds: float = 5.0, stray: int | None = None) -> pf.R
 
 
 def known(run: pf.Run) -> pf.FusionConfig:
-    return with_tool(pf.FusionConfig(arm=ARM, sensors=SENSORS), run)
+    return add_tool(pf.FusionConfig(arm=ARM, sensors=SENSORS), run)
 
 
 @pytest.fixture(scope="module")

@@ -54,7 +54,7 @@ def streamed(path: Path) -> list[Event]:
         message = STORE.deserialize_cdr(record.payload, record.channel.type)
         for reader in readers:
             if reader.entry.topic == record.channel.topic:
-                assert reader.lacks(message) == []
+                assert reader.missing_fields(message) == []
                 found += reader.events(message, record.time)
         found += readers[0].due(record.time)
     return [*found, *readers[0].due(2**62)]

@@ -84,8 +84,8 @@ class TestUdpListener:
         self.send([b"1"] * 60_000)
         came = len(until(self.source, lambda _: self.source.get() == []))
         self.source.stop()
-        assert self.source._lost() > 0
-        assert self.source._backlog.received + self.source._lost() == 60_000 > came
+        assert self.source._count_lost() > 0
+        assert self.source._backlog.received + self.source._count_lost() == 60_000 > came
         assert any("lost" in text for text in self.notices)
 
     def test_only_allowed_senders_are_accepted(self) -> None:

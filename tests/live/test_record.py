@@ -88,7 +88,7 @@ def record_says_what_live_said(
     recorded, kept = Recorded(folder, config, start), Kept()
     stream = Stream(recorded.live, lambda _: None, lambda _: None, rate, [kept])
     for event in arrivals:
-        stream.take([event])
+        stream.add([event])
         recorded.tick()
     stream.end()
     offline = pf.fuse(recorded.close(), config, mode="as-live", rate=rate)

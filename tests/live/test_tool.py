@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
 from pumafuse.fusion.config import Placement
-from pumafuse.fusion.placing import with_tool
+from pumafuse.fusion.placing import add_tool
 from pumafuse.live.wire import BadLine, Event, LineDecoder
 from pumafuse.logs.frames import Rotated
 from streams import (
@@ -92,7 +92,7 @@ def run_of(config: pf.FusionConfig = CONFIG, seconds: float = 4.1, noisy: bool =
 
 
 RUN, NOISY = run_of(), run_of(noisy=True)
-KNOWN = with_tool(CONFIG, RUN)
+KNOWN = add_tool(CONFIG, RUN)
 
 
 # The same arm, its log in another frame: x, y, z are turned into its axes once they are the tool's.

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from pumafuse.fusion.config import Placement
 from pumafuse.registration.findings import Finding, Reading
 from pumafuse.registration.motion import Motion
-from pumafuse.registration.register import Registered, Registration, registered, without_gaps
+from pumafuse.registration.register import Registered, Registration, drop_gaps, register_sensor
 from setups import Setup, answer
 
 DATA = Path(__file__).parent / "data"
@@ -38,7 +38,7 @@ def test_a_set_up_is_found(orientation: bool) -> None:
     """
     for seed in (0, 51) if orientation else (1, 5037):
         setup = Setup(seed, orientation=orientation, seconds=20.0)
-        found = registered(*([one] for one in setup.run()))
+        found = register_sensor(*([one] for one in setup.run()))
         assert found.findings == ()
         assert degrees(found.frame, setup.frame) < 0.05
         np.testing.assert_allclose(found.frame.at, setup.at, atol=3e-3)
@@ -60,7 +60,7 @@ def test_intervals_hold(orientation: bool) -> None:
     inside: dict[str, list[bool]] = {}
     for seed in range(0 if orientation else 80, 80 if orientation else 160):
         setup = Setup(seed, orientation=orientation, seconds=20.0)
-        found = registered(*([one] for one in setup.run()))
+        found = register_sensor(*([one] for one in setup.run()))
         assert abs(found.position.lag.value - setup.lags[0]) < 3e-4
         numbers = {
             "at": (setup.at, found.frame.at_ci95),
@@ -89,7 +89,7 @@ def test_intervals_hold_where_an_arm_errs_with_the_pose() -> None:
     hold, agree = list[np.ndarray](), list[np.ndarray]()
     for seed in range(25):
         setup = Setup(seed, wrong=1.0, seconds=20.0)
-        pair = [registered(*([one] for one in setup.run())) for _ in range(2)]
+        pair = [register_sensor(*([one] for one in setup.run())) for _ in range(2)]
         numbers, halves = zip(*(placed(one) for one in pair), strict=True)
         for found, half in zip(numbers, halves, strict=True):
             true = [*setup.at, *same_branch(setup.frame.as_rotvec(), found[3:6]), *setup.marker]
@@ -113,8 +113,8 @@ def test_several_runs_are_registered_together() -> None:
     setup = Setup(5, seconds=12.0)
     runs = [setup.run(), setup.run()]
     later = [one._replace(time=one.time + 1000.0) for one in runs[1]]
-    both = registered([runs[0][0], later[0]], [runs[0][1], later[1]])
-    alone = registered(*([one] for one in runs[0]))
+    both = register_sensor([runs[0][0], later[0]], [runs[0][1], later[1]])
+    alone = register_sensor(*([one] for one in runs[0]))
     assert both.frame is not None and alone.frame is not None
     assert degrees(both.frame, setup.frame) < 0.02
     widths = [np.mean(np.diff(one.frame.at_ci95)) for one in (both, alone) if one.frame is not None]
@@ -131,7 +131,7 @@ def test_the_base_may_stand_anywhere() -> None:
     elsewhere = Motion(
         command.time, turn.apply(command.position) + move, (turn * Rotation.from_quat(command.quaternion)).as_quat()
     )
-    here, there = registered([command], [sensor]), registered([elsewhere], [sensor])
+    here, there = register_sensor([command], [sensor]), register_sensor([elsewhere], [sensor])
     np.testing.assert_allclose(there.frame.at, turn.apply(here.frame.at) + move, atol=1e-9)
     assert degrees(there.frame, turn * Rotation.from_rotvec(here.frame.rotation)) < 1e-7
     np.testing.assert_allclose(there.marker.at, here.marker.at, atol=1e-9)
@@ -161,7 +161,7 @@ def test_still_poses_are_those_of_a_closed_form() -> None:
     table = np.vstack([np.hstack([np.eye(3), -a]) for a in tools[rest].as_matrix()])
     closed = np.linalg.lstsq(table, (points[rest] - where[rest] @ frame.T).ravel(), rcond=None)[0]
     command = Motion(told, places, Rotation.from_rotvec(angles).as_quat())
-    found = registered([command], [Motion(time, where, seen.as_quat())])
+    found = register_sensor([command], [Motion(time, where, seen.as_quat())])
     assert degrees(found.frame, Rotation.from_matrix(frame)) < 1e-3
     np.testing.assert_allclose([*found.frame.at, *found.marker.at], closed, atol=2e-5)
 
@@ -170,7 +170,7 @@ def made(finding: Finding, seed: int, **of: object) -> Registration:
     """The registration of a set-up that is to have a finding."""
     setup = Setup(seed, **of)  # type: ignore[arg-type]
     command, sensor = setup.run()
-    return registered([command], [CHANGES.get(finding, lambda one: one)(sensor)])
+    return register_sensor([command], [CHANGES.get(finding, lambda one: one)(sensor)])
 
 
 def axes(seed: int) -> np.ndarray:
@@ -211,7 +211,7 @@ def test_a_sensor_that_does_not_move_with_the_tool_is_named(kind: str) -> None:
         if kind == "stands":
             other = sensor._replace(position=np.random.default_rng(seed).normal(0.0, 3e-4, sensor.position.shape))
             other = other._replace(quaternion=None)
-        found = registered([command], [other])
+        found = register_sensor([command], [other])
         assert [one.finding for one in found.findings] == [Finding.UNRELATED]
         assert found.frame is None
 
@@ -226,7 +226,7 @@ def test_a_unit_is_named(unit: str | None) -> None:
     for seed in range(2):
         setup = Setup(seed, seconds=20.0)
         command, sensor = setup.run()
-        found = registered([command], [sensor._replace(position=sensor.position / SCALES[unit])])
+        found = register_sensor([command], [sensor._replace(position=sensor.position / SCALES[unit])])
         assert [(one.finding, one.unit) for one in found.findings] == [(Finding.SCALE, unit)]
         assert found.findings[0].size == pytest.approx(SCALES[unit], rel=0.01)
         assert found.frame is not None
@@ -237,7 +237,7 @@ def test_a_unit_is_named(unit: str | None) -> None:
 def test_commands_in_another_unit_are_named() -> None:
     """In m and read as mm they hardly move: what no frame explains then is said with the unit."""
     command, sensor = Setup(1, seconds=15.0).run()
-    found = registered([command._replace(position=command.position / 1e3)], [sensor])
+    found = register_sensor([command._replace(position=command.position / 1e3)], [sensor])
     assert [one.finding for one in found.findings] == [Finding.SCALE, Finding.UNEXPLAINED]
     assert found.findings[0].unit == "in mm, read as m"
 
@@ -257,9 +257,9 @@ def test_angles_in_another_unit_are_named(told: Callable[[np.ndarray, float], np
     factor = np.radians(1.0) if unit == "rad read as deg" else np.degrees(1.0)
     command, sensor = Setup(1, seconds=20.0).run()
     wrong = command._replace(quaternion=told(command.quaternion, factor))
-    assert f"the commanded {unit}?" in registered([wrong], [sensor]).findings[-1].sentence("camera")
+    assert f"the commanded {unit}?" in register_sensor([wrong], [sensor]).findings[-1].sentence("camera")
     wrong = sensor._replace(quaternion=told(sensor.quaternion, factor))
-    assert f"are its angles {unit}" in registered([command], [wrong]).findings[-1].sentence("camera")
+    assert f"are its angles {unit}" in register_sensor([command], [wrong]).findings[-1].sentence("camera")
 
 
 READINGS = {
@@ -277,7 +277,7 @@ def test_a_wrong_reading_of_orientations_is_named(source: str, reading: Reading)
     motions = dict(zip(("command", "sensor"), setup.run(), strict=True))
     wrong = motions[source]
     motions[source] = wrong._replace(quaternion=READINGS[reading](wrong.quaternion))
-    found = registered([motions["command"]], [motions["sensor"]])
+    found = register_sensor([motions["command"]], [motions["sensor"]])
     assert [(one.finding, one.source, one.reading) for one in found.findings] == [(Finding.READING, source, reading)]
     assert found.frame is not None
     assert degrees(found.frame, setup.frame) < 0.1
@@ -301,7 +301,7 @@ def test_a_tool_that_turns_in_place_is_registered(share: float, orientation: boo
     """
     for seed in range(3):
         setup = Setup(seed, seconds=20.0, directions=share * np.eye(3), orientation=orientation, shared=share < 0.1)
-        found = registered(*([one] for one in setup.run()))
+        found = register_sensor(*([one] for one in setup.run()))
         assert found.frame is not None and found.marker is not None and found.position is not None, seed
         assert Finding.SCALE not in [one.finding for one in found.findings]
         assert degrees(found.frame, setup.frame) < 0.05
@@ -319,7 +319,7 @@ def test_a_sensor_along_the_axes_of_the_base_is_named(orientation: bool) -> None
         setup.marker = np.zeros(3)
         middle = np.array([0.5, -0.2, 0.4])  # of what it sees, about which the sensor is turned: that stays in place
         setup.at = middle - setup.frame.apply(middle) + [move, 0.0, 0.0]
-        found = registered(*([one] for one in setup.run()))
+        found = register_sensor(*([one] for one in setup.run()))
         assert (Finding.ALONG_BASE in [one.finding for one in found.findings]) is (turn == move == 0.0)
 
 
@@ -330,7 +330,7 @@ def test_a_marker_that_is_known_stays() -> None:
     command, sensor = setup.run()
     place = Placement(at=tuple(setup.marker.tolist()))
     for fix in (True, False):
-        found = registered([command], [sensor], marker=place, fix_marker=fix)
+        found = register_sensor([command], [sensor], marker=place, fix_marker=fix)
         assert found.marker.at == place.at
         np.testing.assert_allclose(found.frame.at, setup.at, atol=3e-3)
 
@@ -341,7 +341,7 @@ def test_along_the_one_axis_of_a_tool_the_frame_makes_up_for_the_marker() -> Non
     Nor are the marker's numbers, which lies along an axis of its own that is askew; its turn is.
     """
     setup = Setup(3, seconds=20.0, axes=np.array([[0.0, 0.0, 1.0]]))
-    found = registered(*([one] for one in setup.run()))
+    found = register_sensor(*([one] for one in setup.run()))
     assert [one.finding for one in found.findings] == [Finding.ONE_AXIS]
     assert np.isfinite([*found.frame.at_ci95, *found.marker.at_ci95]).all(axis=1).tolist() == [True, True] + 4 * [False]
     np.testing.assert_allclose(found.frame.at[:2], setup.at[:2], atol=1e-3)
@@ -362,7 +362,7 @@ def test_a_tracker_in_a_frame_of_its_own() -> None:
     seen = columns(DATA / "tracker.csv", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
     times = [columns(DATA / name, "time_s")[:, 0] for name in ("robot.csv", "tracker.csv")]
     motions = [Motion(time, one[:, :3], one[:, 3:]) for time, one in zip(times, (told, seen), strict=True)]
-    found = registered([motions[0]], [motions[1]])
+    found = register_sensor([motions[0]], [motions[1]])
     assert [one.finding for one in found.findings] == [Finding.ATTITUDE, Finding.ONE_AXIS]
     assert "turned by 12.0°" in found.findings[0].sentence("tracker")
     turned = Rotation.from_rotvec(found.frame.rotation).inv().as_euler("ZXY", degrees=True)
@@ -395,14 +395,14 @@ def rests_and_moves(period: float, late: float) -> tuple[Motion, Motion]:
 @pytest.mark.long
 def test_rests_do_not_decide_the_lag() -> None:
     """Of a motion that mostly rests the lag holds to 2 ms; a sensor as early as samples of a path allow is named."""
-    late = registered(*([one] for one in rests_and_moves(0.02, 0.06)))
+    late = register_sensor(*([one] for one in rests_and_moves(0.02, 0.06)))
     assert late.position.lag.value == pytest.approx(0.05, abs=2e-3)  # commands that are held are half a period late
     assert late.findings == ()
-    early = registered(*([one] for one in rests_and_moves(0.02, 0.0)))
+    early = register_sensor(*([one] for one in rests_and_moves(0.02, 0.0)))
     assert early.position.lag.value == pytest.approx(-0.01, abs=2e-3)
     (found,) = early.findings
     assert found.finding is Finding.AHEAD and "interpolation_ms" in found.sentence("sensor")
-    finely = registered(*([one] for one in rests_and_moves(0.002, 0.0)))
+    finely = register_sensor(*([one] for one in rests_and_moves(0.002, 0.0)))
     assert finely.position.lag.value == pytest.approx(-0.001, abs=2e-3)
 
 
@@ -411,6 +411,6 @@ def test_what_is_seen_in_a_gap_of_the_commands_is_left_out() -> None:
     given = np.concatenate([np.arange(0.0, 1.01, 0.02), np.arange(3.0, 4.01, 0.02)])
     time = np.arange(0.0, 4.0, 1.0 / 64.0)  # exact in binary
     seen = Motion(time, np.zeros((len(time), 3)))
-    kept = without_gaps(given, seen, settling=0.5).time
+    kept = drop_gaps(given, seen, settling=0.5).time
     np.testing.assert_array_equal(kept, time[(time <= 1.02) | (time >= 3.5)])
-    np.testing.assert_array_equal(without_gaps(given[:51], seen.only(time <= 1.0), 0.5).time, time[time <= 1.0])
+    np.testing.assert_array_equal(drop_gaps(given[:51], seen.only(time <= 1.0), 0.5).time, time[time <= 1.0])

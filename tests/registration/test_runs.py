@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import pumafuse as pf
 from executable import pumafuse, refused
 from pumafuse.registration.motion import Motion
-from pumafuse.registration.register import registered as registration
+from pumafuse.registration.register import register_sensor as registration
 from pumafuse.registration.runs import RegisteredSensor, Registrations
 from setups import Setup
 

@@ -26,7 +26,7 @@ def test_products_and_turned_vectors_are_those_of_scipy(first: np.ndarray, secon
     p, q = rotations.of_vectors(first), rotations.of_vectors(second)
     same(rotations.product(p, q), a * b)
     same(rotations.inverse(p), a.inv())
-    np.testing.assert_allclose(rotations.turned(p, second), a.apply(second), atol=1e-12)
+    np.testing.assert_allclose(rotations.rotate(p, second), a.apply(second), atol=1e-12)
     np.testing.assert_allclose(rotations.matrix(first[0]), a[0].as_matrix(), atol=1e-12)
     np.testing.assert_allclose(rotations.angle_between(p, q), (a * b.inv()).magnitude(), atol=1e-7)
 

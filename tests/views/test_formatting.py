@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pumafuse.views.formatting import between
+from pumafuse.views.formatting import format_range
 
 
 @pytest.mark.parametrize(
@@ -17,4 +17,4 @@ from pumafuse.views.formatting import between
     ],
 )
 def test_an_interval_has_two_digits_of_its_width(value: float, interval: tuple[float, float] | None, said: str) -> None:
-    assert between(value, interval, 1e3) == said
+    assert format_range(value, interval, 1e3) == said

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 import pumafuse as pf
 import turning
-from pumafuse.fusion.placing import with_tool
+from pumafuse.fusion.placing import add_tool
 from pumafuse.live.stream import Stream
 from pumafuse.live.wire import Event
 from pumafuse.views import colours, live_viewer
@@ -188,7 +188,7 @@ def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(tmp_path: Path) -> N
 
     Measurements lie at frame · z − R · marker with R of the same row; one that was rejected is red.
     """
-    config = with_tool(pf.FusionConfig.load(turning.configured(tmp_path)), turning.recorded())
+    config = add_tool(pf.FusionConfig.load(turning.configured(tmp_path)), turning.recorded())
     camera = msgspec.structs.replace(config.sensors["camera"], gate=8.0)
     config = msgspec.structs.replace(config, sensors={"camera": camera})
     given = turning.sources()
@@ -204,7 +204,7 @@ def test_a_tool_that_turns_is_drawn_as_of_a_recorded_result(tmp_path: Path) -> N
     path, seen = tmp_path / "arrived.rrd", "/path/measured/camera"
     with recording(path):
         until(lambda: view.tick(live.health) or any("drawing into" in line for line in notices))
-        Stream(live, lines.extend, notices.append, watchers=[view]).take(sorted(events, key=lambda event: event.t))
+        Stream(live, lines.extend, notices.append, watchers=[view]).add(sorted(events, key=lambda event: event.t))
         until(lambda: view.tick(live.health) or columns(path, seen))
         view.close()
 

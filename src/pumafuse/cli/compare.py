@@ -83,7 +83,7 @@ def run(paths: Sequence[Path], reference: Path | None, json: bool, tum: Path | N
     if draw:
         _draw(compared, why)
     if json:
-        say_json([{**_reported(result), "take": result.name == best} for result in compared])
+        say_json([{**_to_json(result), "take": result.name == best} for result in compared])
         return
     scored = [(result.name, result.result.summary, result.scores) for result in compared if result.scores]
     every = [(result.name, result.result.summary) for result in compared]
@@ -125,12 +125,12 @@ def verdict(compared: Sequence[Compared]) -> tuple[str | None, str]:
         return None, ""
     if len({(summary.from_s, summary.to_s) for summary in every}) > 1:
         return None, "nothing is chosen: the results are of different parts of the run"
-    by_error = _shared(
+    by_error = _shared_means(
         [{axis: math.log(score.rmse) for axis, score in each.scores.items() if score.rmse > 0.0} for each in compared]
     )
     if by_error is not None:
         return _least(compared, by_error, "its error against the reference (RMSE, mean over the axes) is")
-    if all(_measured(result.result) == _measured(compared[0].result) for result in compared):
+    if all(_count_measured(result.result) == _count_measured(compared[0].result) for result in compared):
         likelihood = [sum(axis.log_likelihood for axis in summary.axes.values()) for summary in every]
         order = sorted(range(len(compared)), key=lambda number: -likelihood[number])
         best, second = (compared[number].name for number in order[:2])
@@ -142,7 +142,7 @@ def verdict(compared: Sequence[Compared]) -> tuple[str | None, str]:
             return None, f"no result is ahead: the log-likelihoods of {best} and {second} differ by {ahead:.1f} only"
         why = "the log-likelihood of the same measurements, each before it is used, is"
         return best, f"take {best}: {why} {ahead:.1f} higher than that of {second}"
-    predictions = _shared([_predictions(result.result) for result in compared])
+    predictions = _shared_means([_predictions(result.result) for result in compared])
     if predictions is None:
         return None, "nothing to choose by: the results have no reference, and no sensor in common"
     return _least(compared, predictions, "its error of predicting the next measurement (RMS, mean over the sensors) is")
@@ -157,13 +157,13 @@ def _least(compared: Sequence[Compared], logs: Sequence[float], what: str) -> tu
     return best, f"take {best}: {what} {less:.0%} smaller than that of {second}"
 
 
-def _shared(each: Sequence[Mapping[str, float]]) -> list[float] | None:
+def _shared_means(each: Sequence[Mapping[str, float]]) -> list[float] | None:
     """The means over the keys that all have; None without any."""
     keys = set(each[0]).intersection(*each[1:])
     return [sum(by_key[key] for key in keys) / len(keys) for by_key in each] if keys else None
 
 
-def _measured(result: Result) -> dict[tuple[str, str], tuple[int, float | None]]:
+def _count_measured(result: Result) -> dict[tuple[str, str], tuple[int, float | None]]:
     """By axis and sensor how many components were fused or rejected, and by which gate."""
     gates = {name: sensor.gate for name, sensor in result.config.sensors.items()}
     return {
@@ -222,7 +222,7 @@ def _write_trajectories(compared: Sequence[Compared], output: Path) -> None:
                 write_tum(track, *of, f"{result.name}: the reference", new / f"{name}.reference.tum")
 
 
-def _reported(compared: Compared) -> dict[str, Any]:
+def _to_json(compared: Compared) -> dict[str, Any]:
     """A result as JSON, in the units of its axes."""
     summary, of = compared.result.summary, compared.result.summary.axes
 

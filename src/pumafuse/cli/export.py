@@ -8,7 +8,7 @@ from ..errors import ConfigError, warn
 from ..folders import check_replaceable, write_file
 from ..fusion.config import FusionConfig
 from ..live.estimator import LiveEstimator
-from ..live.export import MARK, header, identifier, left_out
+from ..live.export import MARK, header, identifier, omissions
 from .screen import say
 
 
@@ -31,6 +31,6 @@ def run(config: Path, output: Path, force: bool) -> None:
         say(f"it is in the arm's axes: turning x, y, z into {axes}, as [frame] says, is left to the controller")
     if configured.tool is not None or any(sensor.is_placed for sensor in configured.sensors.values()):
         say(
-            f"it is in the base's axes: {left_out(configured)} left to the controller, which gives {axes} of the tool"
+            f"it is in the base's axes: {omissions(configured)} left to the controller, which gives {axes} of the tool"
             " point"
         )

@@ -31,7 +31,7 @@ from ..tuning.tune import tune
 from ..units import MS, SCREEN
 from . import init
 from .fuse import draw, show
-from .register import taken
+from .register import latency_note
 from .screen import say
 from .tune import WORSE, end, fitting, show_lags
 
@@ -73,7 +73,7 @@ def run(
     while True:
         texts, here = drafts(surveyed, arm, begins, output), Path()
         recorded = described(drafts(surveyed, arm, begins, here)["run.toml"], here).between(*part)
-        registered = init.registered(surveyed, recorded) if surveyed.own_frames else None
+        registered = init.register_sensors(surveyed, recorded) if surveyed.own_frames else None
         begun = registered or FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
         begun.sensor_names(sensors)  # before anything is fitted
         try:
@@ -81,7 +81,7 @@ def run(
                 fitted = tune(recorded, begun, fit=_FITTED, intervals=_FITTED_ARM, progress=progress)
             break
         except LostError as error:
-            if (others := _without(surveyed, error)) is None:
+            if (others := _drop_lost(surveyed, error)) is None:
                 advice = _its_run_toml(surveyed, log) if "run.toml" in str(error) else ""
                 raise RunError(f"{error}{advice}") from None
             surveyed = others
@@ -95,11 +95,11 @@ def run(
     show(summary)
     strays = _off_the_path(surveyed, summary)
     slow = otherwise_than_at_first(surveyed, fitted.details.lags, fitted.config.arm)
-    for line in [*strays, *slow, *_told_by_one(summary)]:
+    for line in [*strays, *slow, *_lone_sensor_notes(summary)]:
         say(line)
     if registered is None:  # which says it beside what it found
         for name in (name for name, sensor in fitted.config.sensors.items() if sensor.latency == 0.0):
-            say(taken(name, 0.0))
+            say(latency_note(name, 0.0))
     folder = shlex.quote(str(output))
     another = "pumafuse fuse ANOTHER_LOG"
     if surveyed.roles is not None:  # it is read by what `init` finds in it, as this one was
@@ -117,7 +117,7 @@ def _its_run_toml(survey: Survey, log: Path) -> str:
     return f" (`pumafuse init {shlex.quote(str(log))}` writes one)" if survey.roles else ""
 
 
-def _without(survey: Survey, lost: LostError) -> Survey | None:
+def _drop_lost(survey: Survey, lost: LostError) -> Survey | None:
     """What was found, without axes on which a sensor follows nothing; None if nothing else follows."""
     bad = {(name, axis) for name in lost.fault.sensors for axis in lost.fault.axes}
     measured = {name: sensor.values for name, sensor in survey.run.sensors.items()}
@@ -186,7 +186,7 @@ def _speed(command: Source, axis: str) -> float:
     return max(way * 1e9 / max(int(np.ptp(command.stamp)), 1), 1e-12)
 
 
-def _told_by_one(summary: Summary) -> list[str]:
+def _lone_sensor_notes(summary: Summary) -> list[str]:
     """A sentence on each sensor that is alone on axes where its noise is told from the arm's by being white alone."""
     by_reason = dict[str, list[str]]()
     for axis, part in summary.axes.items():

@@ -14,7 +14,7 @@ from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates, Mode
 from ..fusion.offline import Engine, fuse
-from ..fusion.summary import Summary, beaten
+from ..fusion.summary import Summary, beaten_notes
 from ..logs.manifest import stamps_of
 from ..logs.run import Run
 from ..pieces.fusing import fuse_to
@@ -22,7 +22,7 @@ from ..pieces.reading import needs_whole, rows_of
 from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
 from .screen import say
-from .tables import left_out, orientation_table, outcome_table, print_tables, runs_table, score_table, skill_table
+from .tables import left_out_words, orientation_table, outcome_table, print_tables, runs_table, score_table, skill_table
 
 SHORT = 5_000_000  # rows of a run, each half a kB in memory; a longer one goes through piece by piece
 MOST_IN_MEMORY = 30_000_000  # rows of one that cannot
@@ -53,7 +53,7 @@ def run(
     making = results.Making(configured, sensors, rate, mode, engine, part, extras)
     job = partial(_fuse, making, force)
     if len(runs) == 1:
-        summary = making.made(output, runs[0]) if resume else None
+        summary = making.read_summary(output, runs[0]) if resume else None
         where = "written to" if summary is None else "there already:"
         if summary is None:
             with progress_bar(str(runs[0])) as progress:
@@ -63,7 +63,9 @@ def run(
         return
     places = dict(zip(map(str, runs), folders_of(runs, output), strict=True))
     done_before = {
-        path: summary for path, folder in places.items() if resume and (summary := making.made(folder, Path(path)))
+        path: summary
+        for path, folder in places.items()
+        if resume and (summary := making.read_summary(folder, Path(path)))
     }
     jobs = {path: partial(job, Path(path), folder) for path, folder in places.items() if path not in done_before}
     done, failed = run_jobs("fusing", jobs, places.values())
@@ -127,7 +129,7 @@ def _fuse(
     results.check_fused(est.counts, est.config)
 
     def more(new: Path) -> None:
-        results.note_log(new, stamps)
+        results.write_stamps(new, stamps)
         draw(new, est, recorded, how.extras)
 
     return results.write(est, folder, force, more)
@@ -158,14 +160,14 @@ def show(summary: Summary) -> None:
     part = "" if summary.from_s is None else f" from {summary.from_s:g} s on"
     made = f"{summary.estimates} estimates over {summary.duration_s:.1f} s{part}, {summary.mode}"
     say(f"{printable(summary.run)}: {made}, arm {printable(summary.arm)}")
-    if without := left_out(summary):
+    if without := left_out_words(summary):
         say(f"left out: {without}")
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
     print_tables(outcome_table(summary, kind) for kind in KINDS)
     print_tables(skill_table([("", summary)], kind) for kind in KINDS)
     print_tables(score_table([(summary.run, summary, scores)], kind) for kind in KINDS)
     print_tables([orientation_table([(summary.run, summary.orientation)])])
-    for line in beaten(summary.axes):
+    for line in beaten_notes(summary.axes):
         say(line)
 
 

@@ -44,7 +44,7 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     if surveyed.own_frames:
         recorded = described(drafts(surveyed, arm, sensors, Path())["run.toml"], Path())
         try:
-            config = registered(surveyed, recorded)
+            config = register_sensors(surveyed, recorded)
         except RunError as error:  # what it was read by is there to be mended
             write_file(folder / MANIFEST, texts[MANIFEST], replace=force)
             again = f"what was read is in {folder / MANIFEST}: mend it, then `pumafuse init {folder} --force`"
@@ -62,7 +62,7 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     say(f"  pumafuse fuse {quoted} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
 
 
-def registered(survey: Survey, recorded: Run) -> FusionConfig | None:
+def register_sensors(survey: Survey, recorded: Run) -> FusionConfig | None:
     """The configuration with the sensors registered that stand in frames of their own, which is printed."""
     from ..registration.runs import register  # scipy takes its time, and most logs need none of it
     from . import register as shown

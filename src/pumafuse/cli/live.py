@@ -22,7 +22,7 @@ from rich.text import Text
 from ..errors import ConfigError, RunError, warn
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
-from ..fusion.placing import with_tool
+from ..fusion.placing import add_tool
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, OF_A_RUN, POSES, Address
 from ..live.estimator import LiveEstimator
@@ -30,7 +30,7 @@ from ..live.network import Remote, Several, UdpSender
 from ..live.record import Recorder
 from ..live.ros2 import Ros2Estimates, Ros2Source
 from ..live.rtde import RtdeSource
-from ..live.sources import QUIET, replayed, standard_input
+from ..live.sources import QUIET, replay, standard_input
 from ..live.stream import Stream, Watcher
 from ..live.wire import Event
 from ..logs import manifest
@@ -84,7 +84,7 @@ def run(
     if recorded is not None:
         warn(f"run '{recorded.name}': {note}" for note in recorded.notes)
         start = dict(recorded.start)
-        configured = with_tool(msgspec.structs.replace(configured, frame=recorded.frame or configured.frame), recorded)
+        configured = add_tool(msgspec.structs.replace(configured, frame=recorded.frame or configured.frame), recorded)
     files = {source: manifest.file_of(Path(source.path)) for source in sources if source.kind in OF_A_RUN}
     listed = {address: manifest.load(file) for address, file in files.items()}
     for address, described_run in listed.items():
@@ -99,9 +99,7 @@ def run(
 
     with contextlib.ExitStack() as stack:
         remotes = [
-            _opened(
-                source, listed.get(source), configured, stack, notify, listen=listen, allow=allow, ros_args=ros_args
-            )
+            _open(source, listed.get(source), configured, stack, notify, listen=listen, allow=allow, ros_args=ros_args)
             for source in sources
             if source.kind in (*NETWORK, *OF_A_RUN, POSES)
         ]
@@ -138,8 +136,8 @@ def run(
             if left := _listen(remote, feeder, signals):
                 notify(f"{left} events had come and are left out: the end was asked for")
         else:
-            for items in standard_input() if recorded is None else replayed(recorded, configured, first_source.speed):
-                feeder.take(items)
+            for items in standard_input() if recorded is None else replay(recorded, configured, first_source.speed):
+                feeder.add(items)
                 if signals:
                     break
         stream.end()
@@ -149,7 +147,7 @@ def run(
         print_tables([_sensor_table(live, feeder.now)], "stderr")
 
 
-def _opened(
+def _open(
     address: Address,
     listed: manifest.Manifest | None,
     config: FusionConfig,
@@ -199,14 +197,14 @@ def _listen(remote: Remote, feeder: _Feeder, signals: list[int]) -> int:
     remote.start()
     try:
         while not signals:
-            feeder.take(remote.get())
+            feeder.add(remote.get())
     finally:
         left = remote.stop()
     until = time.monotonic() + _LAST
     for begin in range(0, len(left), _AT_ONCE):
         if time.monotonic() > until:
             return len(left) - begin
-        feeder.take(left[begin : begin + _AT_ONCE])
+        feeder.add(left[begin : begin + _AT_ONCE])
     return 0
 
 
@@ -225,10 +223,10 @@ class _Feeder:
     moved: float = field(default_factory=time.monotonic)
     drawn: float = field(default_factory=time.monotonic)
 
-    def take(self, items: Sequence[bytes | Event]) -> None:
+    def add(self, items: Sequence[bytes | Event]) -> None:
         """Feed some items, or none: where the stream's time stands still it goes on by the wall clock's."""
         now = time.monotonic()
-        self.stream.take(items)
+        self.stream.add(items)
         sure = self.stream.live.sure
         if sure != self.sure:
             self.sure, self.now, self.moved = sure, None, now

@@ -408,11 +408,11 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what its buffer holds would fail once more at exit
         sys.exit(1)
     except Exception as error:
-        say(f"pumafuse: {_unexpected(error)}", err=True)
+        say(f"pumafuse: {_unexpected_message(error)}", err=True)
         sys.exit(70)
 
 
-def _unexpected(error: Exception) -> str:
+def _unexpected_message(error: Exception) -> str:
     """What to say of an exception that nobody foresaw: one line that tells what was being read, and where it happened.
 
     That is the innermost file or folder that a function was called with.

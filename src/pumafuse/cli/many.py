@@ -39,7 +39,7 @@ def progress_bar(what: str, total: float = 1.0) -> Generator[Callable[[float], N
 
 
 @contextmanager
-def _ctrl_c_blocked() -> Generator[None]:
+def _block_ctrl_c() -> Generator[None]:
     """Processes that are started here block Ctrl-C, which would end them with a traceback each.
 
     They end with this process, which handles afterwards any Ctrl-C that came meanwhile.
@@ -67,10 +67,10 @@ def run_jobs(
     results: dict[str, R] = {}
     failed: dict[str, str] = {}
     parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
-    work = (delayed(_guarded)(name, job) for name, job in jobs.items())
+    work = (delayed(_guard)(name, job) for name, job in jobs.items())
     outcomes: Generator[tuple[str, R | None, str | None]] | None = None
     try:
-        with _ctrl_c_blocked():
+        with _block_ctrl_c():
             outcomes = cast(Generator[tuple[str, R | None, str | None]], parallel(work))
         with progress_bar(what, len(jobs)) as move:
             for name, result, problem in outcomes:
@@ -110,7 +110,7 @@ def report_failures(failed: Mapping[str, str], count: int, where: Path) -> None:
         raise PumafuseError(f"{len(failed)} of {count} runs failed (see above){kept}")
 
 
-def _guarded(name: str, job: Callable[[], R]) -> tuple[str, R | None, str | None]:
+def _guard(name: str, job: Callable[[], R]) -> tuple[str, R | None, str | None]:
     """A job's name and its result, or its error in one line: one bad run must not stop the others."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PumafuseWarning)  # they are in the notes of each run's summary

@@ -85,10 +85,10 @@ def _show(name: str, registered: RegisteredSensor) -> None:
         rows.append(["latency_ms", f"{registered.latency * MS:.2f}", _limits(registered.latency_ci95, MS, ".2f")])
     print_tables([table(["number", "found", "95 % interval"], rows)])
     if registered.latency is not None and registered.latency_ci95 == (registered.latency, registered.latency):
-        say(taken(name, registered.latency))
+        say(latency_note(name, registered.latency))
 
 
-def taken(name: str, latency: float) -> str:
+def latency_note(name: str, latency: float) -> str:
     """What to say of a latency [s] that nothing in a run tells."""
     return (
         f"the latency of {name} is taken to be {latency * MS:.4g} ms, not found: error bars do not count how far off"

@@ -18,7 +18,7 @@ from ..errors import printable
 from ..fusion.score import Z95, OrientationScore
 from ..fusion.segments import NOT_SELECTED
 from ..fusion.skill import PredictionError
-from ..fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, pooled, weighted_mean
+from ..fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, pool, weighted_mean
 from ..units import DEG, SCREEN, Kind
 
 # By heading: an attribute, its format, and what it is multiplied by; None: what positions are on the screen.
@@ -143,7 +143,7 @@ def outcome_table(summary: Summary, kind: Kind) -> Table:
     return table(["axis", "sensor", *words, *of_positions, "verdict"], rows)
 
 
-def left_out(summary: Summary) -> str:
+def left_out_words(summary: Summary) -> str:
     """In words how many rows of which source the filter was not given, and why; empty where it was given all."""
     sources = [("commands", summary.commands), *summary.rows.items()]
     return "; ".join(
@@ -235,24 +235,22 @@ def runs_table(results: Mapping[str, Summary], kind: Kind) -> Table:
     }
     rows: list[list[str]] = []
     if len(results) <= _FEW_RUNS:
-        rows += [
-            [name, axis, *_pooled([result], axis, kind)] for name, result in results.items() for axis in axes[name]
-        ]
+        rows += [[name, axis, *_pool([result], axis, kind)] for name, result in results.items() for axis in axes[name]]
     for axis in dict.fromkeys(axis for names in axes.values() for axis in names):
         having = [result for name, result in results.items() if axis in axes[name]]
-        rows.append([f"all {len(having)}", axis, *_pooled(having, axis, kind)])
+        rows.append([f"all {len(having)}", axis, *_pool(having, axis, kind)])
     unit = SCREEN[kind].unit
     scores = (f"RMSE, {unit}", f"worst, {unit}", "95 % coverage", "NEES")
     return table(["result", "axis", *scores, "NIS", "prediction,\nof best other", "fused", "rejected", "notes"], rows)
 
 
-def _pooled(summaries: Sequence[Summary], axis: str, kind: Kind) -> list[str]:
+def _pool(summaries: Sequence[Summary], axis: str, kind: Kind) -> list[str]:
     """Cells of one axis over several runs; each estimate and each component counts once."""
     parts = [summary.axes[axis] for summary in summaries]
     scores = [part.score for part in parts if part.score is not None]
     sensors = [sensor for part in parts for sensor in part.sensors.values()]
     fused, rejected = ([sensor.outcomes.get(word, 0) for sensor in sensors] for word in ("fused", "rejected"))
-    score = pooled(scores, [score.rows for score in scores])
+    score = pool(scores, [score.rows for score in scores])
     skills = [sensor.skill for sensor in sensors if sensor.skill is not None]
     return [
         position(score and score.rmse, kind),

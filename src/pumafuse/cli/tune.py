@@ -104,19 +104,19 @@ def fitting() -> Generator[Progress]:
 def show_lags(summary: TuningSummary, arm: ArmModel) -> None:
     """Print the lags, and play, fastest speeds and sags where there are any."""
     shown = ("lag of ", *(f".{bend}" for bend in (*BENDS, "sag")))
-    rows = [row[:-1] for row in formatting.fitted(summary) if any(part in row[0] for part in shown)]
+    rows = [row[:-1] for row in formatting.fitted_rows(summary) if any(part in row[0] for part in shown)]
     print_tables([table(_HEADINGS, rows)])
     say("\n".join(formatting.lag(arm)))
 
 
 def _show(summary: TuningSummary, arm: ArmModel) -> None:
     """Print the summary on stdout."""
-    parameters = table([*_HEADINGS, ""], formatting.fitted(summary))
+    parameters = table([*_HEADINGS, ""], formatting.fitted_rows(summary))
     parameters.columns[0].no_wrap = True
     print_tables([parameters])
     if summary.lags:
         say("\n".join(formatting.lag(arm)))
-    lines = [*formatting.chosen(summary.orders), *summary.not_identifiable]
+    lines = [*formatting.chosen_orders(summary.orders), *summary.not_identifiable]
     pairs = sorted(summary.correlations, key=lambda pair: -abs(pair.correlation))
     lines += [formatting.together(pair) for pair in pairs[:_PAIRS]]
     if len(pairs) > _PAIRS:
@@ -133,7 +133,7 @@ def _show(summary: TuningSummary, arm: ArmModel) -> None:
     print_tables([table(["fitted on", "measurements", "log-likelihood before", "after"], likelihood)])
     validation = [
         [check.run, check.axis, *of_sensor[:1], check.rmse, check.coverage, *of_sensor[1:]]
-        for check in map(formatting.validated, summary.validation or ())
+        for check in map(formatting.validation_rows, summary.validation or ())
         for of_sensor in zip(check.sensors, check.nis, check.correlation, strict=True)
     ]
     headings = ["validated on", "axis", "sensor", "RMSE", "coverage", "NIS", "correlation at lag 1"]

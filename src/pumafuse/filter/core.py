@@ -100,7 +100,7 @@ _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double
 }
 
 
-def _loaded() -> ctypes.CDLL:
+def _load() -> ctypes.CDLL:
     """The library, of this version."""
     again = "install pumafuse again (in a checkout: make .venv/.ready)"
     try:
@@ -117,7 +117,7 @@ def _loaded() -> ctypes.CDLL:
     return library
 
 
-library = _loaded()
+library = _load()
 
 
 def at(array: np.ndarray) -> int:
@@ -126,7 +126,7 @@ def at(array: np.ndarray) -> int:
     return array.ctypes.data
 
 
-def checked(result: Any) -> Any:
+def check(result: Any) -> Any:
     """What a call returned; an error if it failed."""
     if result is None or result < 0:
         raise PumafuseError(f"the filter stops: {library.pf_error().decode()}")
@@ -157,7 +157,7 @@ class Handle:
     _free: Any
 
     def __init__(self, core: int | None) -> None:
-        self._core: int | None = checked(core)
+        self._core: int | None = check(core)
 
     def __del__(self) -> None:
         if (core := getattr(self, "_core", None)) is not None:
@@ -199,7 +199,7 @@ class Filter(Handle):
         outputs, (table, rows) = np.zeros((len(Output), self._axes, len(times))), _tables(events, results)
         ends, when = span or (0, len(events.time)), None if asked is None else at(asked)
         wanted = len(times), at(times), when, at(outputs)
-        checked(library.pf_filter_run(self._core, _MODES.index(mode), table, *ends, rows, *wanted))
+        check(library.pf_filter_run(self._core, _MODES.index(mode), table, *ends, rows, *wanted))
         return outputs
 
     def bias(self, sensor: int, axis: int) -> tuple[float, float] | None:
@@ -222,7 +222,7 @@ def linearise(
     d_nu, d_s = np.zeros((2, len(tangents), *events.codes.shape))
     models = struct_of(model), (_Model * len(tangents))(*map(struct_of, tangents))
     tables = *_tables(events, results), at(d_nu), at(d_s)
-    checked(library.pf_linearise(*map(ctypes.byref, models), len(tangents), origin, *tables))
+    check(library.pf_linearise(*map(ctypes.byref, models), len(tangents), origin, *tables))
     return d_nu, d_s
 
 
@@ -233,7 +233,7 @@ def classify(model: Model, events: Events, origin: int, too_late: BoolArray) -> 
     """
     codes = np.empty_like(events.codes)
     structs = ctypes.byref(struct_of(model)), ctypes.byref(_events_of(events))
-    checked(library.pf_classify(*structs, origin, at(too_late), at(codes)))
+    check(library.pf_classify(*structs, origin, at(too_late), at(codes)))
     return codes
 
 

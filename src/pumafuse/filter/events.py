@@ -87,7 +87,7 @@ class Results(NamedTuple):
         return Results._make(part.take(chosen, axis=0) for part in self)
 
 
-def joined(parts: Sequence[Events]) -> Events:
+def concatenate(parts: Sequence[Events]) -> Events:
     """The events of several tables, one after the other."""
     if any(len(part.spread) for part in parts):
         parts = [part if len(part.spread) else part._replace(spread=np.ones_like(part.value)) for part in parts]

@@ -49,7 +49,7 @@ class Innovation(NamedTuple):
     R: float
 
 
-def discretized(A: FloatArray, L: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
+def discretize(A: FloatArray, L: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:
     """F and Q of ẋ = A x + L w over ``dt`` [s]: over a time so short that e^(−A dt) does not grow, which is doubled."""
     doublings = math.ceil(math.log2(max(1.0, dt * np.abs(np.linalg.eigvals(A)).max())))
     F, Q = van_loan_discretization(A, L, dt / 2**doublings)
@@ -158,7 +158,7 @@ class Axis:
         """F and Q over an interval in which no command is given or acts."""
         F, Q, L = self.unit.copy(), np.zeros_like(self.unit), self.L * np.exp(0.5 * self.unrest * self.of_arm)
         for part in self.parts:
-            F[part, part], Q[part, part] = discretized(self.A[part, part], L[part, part], ns / 1e9)
+            F[part, part], Q[part, part] = discretize(self.A[part, part], L[part, part], ns / 1e9)
         Q[self.e :, :] = Q[:, self.e :] = 0.0  # it is, but for rounding
         return F, Q
 
@@ -171,24 +171,24 @@ class Axis:
                 self.bent.move(float(self.path[self.u]), float(self.path[self.e]), (time - self.time) / 1e9)
             self.path, self.by, self.time = F @ self.path, self.by @ F.T, time
 
-    def give(self, time: int, command: float, acts: int) -> None:
+    def add_command(self, time: int, command: float, acts: int) -> None:
         """A command [m], which acts at ``acts`` [ns], goes to the end of the register."""
         self.predict(time)
         self.in_flight = [*self.in_flight, acts]
-        self.enter(self.unit, command - float(self.axis["start"]), self.unit[self.u + len(self.in_flight)])
+        self.apply(self.unit, command - float(self.axis["start"]), self.unit[self.u + len(self.in_flight)])
 
-    def enter(self, F: FloatArray, u: float, B: FloatArray) -> None:
+    def apply(self, F: FloatArray, u: float, B: FloatArray) -> None:
         """A command enters what is known of the state, and what is known by commands alone."""
         self.kf.predict(F=F, u=u, B=B)
         self.path = F @ self.path + B * u
 
-    def act(self, time: int) -> None:
+    def command(self, time: int) -> None:
         """The first command in flight acts: the gain error jumps, and the register moves on."""
         self.predict(time)
         self.in_flight = self.in_flight[1:]
         step = float(self.kf.x[self.u + 1] - self.kf.x[self.u])
         gain = self.axis["slope"] * abs(step) / self.period + self.axis["intercept"]
-        self.enter(self.shift, float(gain - 1.0) * step, self.unit[self.e])
+        self.apply(self.shift, float(gain - 1.0) * step, self.unit[self.e])
         self.set_noise(maneuver=abs(step - self.step) / self.period)
         self.step = step
 
@@ -201,12 +201,12 @@ class Axis:
         nu = math.remainder(z - level - H @ x, view["turn"] or math.inf)
         return Innovation(self.time, nu, H @ P @ H + R, R)
 
-    def fuse(self, s: int, innovation: Innovation, reacquires: bool) -> float:
+    def update(self, s: int, innovation: Innovation, reacquires: bool) -> float:
         """Fuse a measurement; where it re-acquires, the offset may have moved by ν before. Returns √S."""
         if reacquires:
             self.kf.P[OFFSET, OFFSET] += (innovation.nu / self.sensors[s]["scale"]) ** 2
         self.kf.update(self.H[s] @ self.kf.x + innovation.nu, R=innovation.R, H=self.H[s : s + 1])
-        missed = self.sensors[s]["scale"] * self.moved_by() - self.by @ self.H[s]  # how ν changes
+        missed = self.sensors[s]["scale"] * self.by_doubt() - self.by @ self.H[s]  # how ν changes
         self.by = self.by + np.outer(missed, self.kf.K)
         self.kf.P = 0.5 * (self.kf.P + self.kf.P.T)  # or rounding leads away from symmetry, over a million steps
         self.gate.fuse(s, innovation.time, reacquires)
@@ -220,7 +220,7 @@ class Axis:
         score = min((1.0 - R / S) * (nu**2 / S - 1.0), MOST)
         self.unrest = max(self.unrest + self.axis["adaptation"] * score, 0.0)
 
-    def moved_by(self) -> FloatArray:
+    def by_doubt(self) -> FloatArray:
         """How the position by commands alone changes with its lag [m/s] and with its size [m], (2,)."""
         position, speed = self.bend()
         return np.array((-(self.speed @ self.path + speed), self.h @ self.path + position))
@@ -232,7 +232,7 @@ class Axis:
         goal = float(self.path[self.u] + self.path[self.e])
         return self.bent.motion(goal) - (self.h @ self.path, self.speed @ self.path)
 
-    def agrees(self, s: int, now: Innovation) -> bool | None:
+    def agreement(self, s: int, now: Innovation) -> bool | None:
         """Whether a rejected measurement agrees with the one before; None where that is less than T ago."""
         before, sensor = self.gate.rejected.get(s), self.sensors[s]
         if before is None:
@@ -252,18 +252,18 @@ class Axis:
         """What is known at ``time`` [ns], by ``Output``; the velocity is the mean over the coming period."""
         self.predict(time)
         h, T, x, P, until = self.h, self.period, self.kf.x, self.kf.P, time + round(self.period * 1e9)
-        left = self.moved_by() - self.by @ h  # how what is not known of the position changes
+        left = self.by_doubt() - self.by @ h  # how what is not known of the position changes
         later = copy(self)
         later.kf, later.bent = copy(self.kf), copy(self.bent)
         later.kf.P = np.zeros_like(P)  # which becomes what noise adds until then
         while later.in_flight and later.in_flight[0] <= until:
-            later.act(later.in_flight[0])
+            later.command(later.in_flight[0])
         later.predict(until)
         moves = self.variance_of_motion(self.over(until - time)[0], later.kf.P)
         bend, bends = self.bend()[0], (later.bend() - self.bend())[0]
         mean = np.array((h @ x + bend, (h @ (later.kf.x - x) + bends) / T, x[OFFSET], x[DISTURBANCE]))
         variance = np.array((h @ P @ h, moves / T**2, P[OFFSET, OFFSET], P[DISTURBANCE, DISTURBANCE]))
-        moves_by = (later.moved_by() - later.by @ h - left) / T
+        moves_by = (later.by_doubt() - later.by @ h - left) / T
         doubts = np.stack((left, moves_by, self.by[:, OFFSET], self.by[:, DISTURBANCE]))
         variance += doubts**2 @ self.doubts**2
         sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)), FINEST / np.array((1.0, T, 1.0, 1.0)))
@@ -334,19 +334,19 @@ class Filter:
                 agenda += [(time, MEASURED, row, part) for part in parts]
         for done, (time, what, n, axes) in enumerate(sorted(agenda)):
             if what == MEASURED:
-                self.measure(n, axes, results)
+                self.measurement(n, axes, results)
             for a in axes:
                 if what == GIVEN:
-                    self.axes[a].give(time, events.value[n, a], acts=int(events.time[n]))
+                    self.axes[a].add_command(time, events.value[n, a], acts=int(events.time[n]))
                 elif what == ACTS:
-                    self.axes[a].act(time)
+                    self.axes[a].command(time)
                 elif what == ASKED:
                     outputs[:, a, n] = self.axes[a].estimate(time)
             if progress is not None and done % 1000 == 0:
                 progress(done / len(agenda))
         return outputs
 
-    def measure(self, row: int, axes: list[int], results: Results) -> None:
+    def measurement(self, row: int, axes: list[int], results: Results) -> None:
         """Axes of a measurement, which pass the gate together or not at all."""
         events, s, time = self.events, int(self.events.source[row]), int(self.events.time[row])
         gate, innovations = self.sensors[s]["gate"], dict[int, Innovation]()
@@ -357,14 +357,14 @@ class Filter:
             results.innovation[row, a], results.innovation_sd[row, a] = innovations[a].nu, math.sqrt(innovations[a].S)
             results.noise_scale[row, a] = math.exp(self.axes[a].unrest)
         beyond = [a for a in axes if gate > 0.0 and abs(innovations[a].nu) > gate * math.sqrt(innovations[a].S)]
-        agree = [self.axes[a].agrees(s, innovations[a]) for a in beyond]
+        agree = [self.axes[a].agreement(s, innovations[a]) for a in beyond]
         against = max((self.axes[a].gate.contradicted(s, time) for a in beyond), default=NOBODY)
         if all(agree) and against != NOBODY:
             results.contradicts[row] = against
         for a in axes:
             if all(agree) and against == NOBODY:
                 results.outcome[row, a] = Outcome.REACQUIRED if a in beyond else Outcome.FUSED
-                results.innovation_sd[row, a] = self.axes[a].fuse(s, innovations[a], reacquires=a in beyond)
+                results.innovation_sd[row, a] = self.axes[a].update(s, innovations[a], reacquires=a in beyond)
             else:
                 results.outcome[row, a] = Outcome.REJECTED
                 self.axes[a].gate.reject(s, innovations[a], too_soon=None in agree)

@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import ALWAYS, FloatArray, TimeArray
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
-from .core import AXIS, MOTION, Record, at, checked, library
+from .core import AXIS, MOTION, Record, at, check, library
 
 
 def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Record:
@@ -40,7 +40,7 @@ def response(
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
     record = record_of(axis, period, delay, start)
     commands, asked = (len(told_at), at(told_at), at(command)), (len(time), at(time), at(position))
-    checked(library.pf_response(1, at(record), *commands, *asked))
+    check(library.pf_response(1, at(record), *commands, *asked))
     return position
 
 

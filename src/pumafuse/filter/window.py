@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from ..arrays import NEVER, FloatArray, IndexArray, TimeArray
-from .core import Handle, Model, Output, at, checked, fates, library, struct_of
+from .core import Handle, Model, Output, at, check, fates, library, struct_of
 from .events import Results
 
 MOST_ROWS = 65_536  # places for events
@@ -70,13 +70,13 @@ class Window(Handle):
         return None if origin == NEVER else origin
 
     def add(self, stamp: int, source: int, bits: int, oldest: int) -> bool:
-        """Take in an event whose axes are ``bits`` as bits; no event stamped before ``oldest`` will ever come [ns].
+        """Add an event whose axes are ``bits`` as bits; no event stamped before ``oldest`` will ever come [ns].
 
         Returns:
             False if to make room the window had to let go of its time.
         """
         taken = library.pf_live_add(self._core, stamp, source, bits, oldest)
-        return taken > 0 if taken >= 0 else checked(taken)
+        return taken > 0 if taken >= 0 else check(taken)
 
     def estimate(self, time: int, after: int = NEVER) -> list[tuple[list[float], int] | None]:
         """Every axis at an instant [ns] by all measurements valid until then; nothing changes.

@@ -179,7 +179,7 @@ def together(parts: Iterable[Evidence]) -> Evidence:
 def suspects(evidence: Evidence) -> tuple[Suspect, ...]:
     """The cause that explains the innovations best, and those that explain them about as well; best first."""
     best: dict[tuple[Cause, str], Suspect] = {}
-    for weighed in _weighed(evidence):
+    for weighed in _weigh(evidence):
         key = _ALIKE.get(weighed.cause, weighed.cause), weighed.sensor
         if key not in best or weighed.gain > best[key].gain:
             best[key] = weighed
@@ -210,7 +210,7 @@ def _least_of_correlated(evidence: Evidence, first: Suspect) -> float:
     return 0.0 if max(weights, key=lambda weight: weight.gain).colour > _COLOURED else first.gain - _CLEAR
 
 
-def _weighed(evidence: Evidence) -> Iterator[Suspect]:
+def _weigh(evidence: Evidence) -> Iterator[Suspect]:
     sizes: dict[tuple[Cause, str], list[tuple[float, float]]] = {}
     for (cause, sensor, which), weight in evidence.items():
         if cause in (Cause.NOISE, Cause.PROCESS, Cause.JITTER):
@@ -286,7 +286,7 @@ class _Part:
     command: FloatArray  # these [m or rad], (k,)
 
     @cached_property
-    def led(self) -> FloatArray:
+    def response(self) -> FloatArray:
         """Where all commands lead the axis at ``time`` [m or rad], (m,)."""
         return self.position(self.config.arm.axes[self.axis], self.time)
 
@@ -304,7 +304,7 @@ class _Part:
 
     def position(self, model: AxisModel, time: TimeArray) -> FloatArray:
         """Where all commands lead an axis like this, (n,)."""
-        return self.segment.start[self.axis] + self.segment.led(self.config.arm, self.axis, time, model)
+        return self.segment.start[self.axis] + self.segment.response(self.config.arm, self.axis, time, model)
 
 
 def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -> _Part:
@@ -335,7 +335,7 @@ def _of_part(part: _Part) -> Evidence:
     spread = np.repeat(part.measured.spread[:, None], moved.shape[1], axis=1)
     spread[:, 1 + len(other) - len(jitters) : 1 + len(other)] *= np.column_stack(list(jitters.values()))
     models = [base, *(model for _, model in other), *(base for _ in shapes)]
-    nu, sd, sensor = _filtered(part, models, moved, spread)
+    nu, sd, sensor = _filter(part, models, moved, spread)
     normalised = nu / sd
     density = -np.log(sd) - 0.5 * normalised**2
     gains = (density - density[:, :1]).sum(axis=0)
@@ -361,7 +361,7 @@ def _model(part: _Part) -> Model:
     return filter_model(part.config, [part.axis], names, {part.axis: part.start}, [biased])
 
 
-def _filtered(
+def _filter(
     part: _Part, models: Sequence[Model], moved: FloatArray, spread: FloatArray
 ) -> tuple[FloatArray, FloatArray, IndexArray]:
     """Innovations and their sd by k models (n, k), and whose they are, (n,).
@@ -374,7 +374,7 @@ def _filtered(
     led = part.start + response(
         arm.axes[axis], arm.update_period, delay, part.told_at, part.command, part.start, part.time
     )  # by the commands that the filter is given; those before are taken off
-    value = (measured.value - part.scale * (part.led - led))[:, None] + moved
+    value = (measured.value - part.scale * (part.response - led))[:, None] + moved
     instants = np.concatenate([acts, part.time])
     order = np.argsort(instants, kind="stable")  # commands first
     instants = instants[order]
@@ -434,10 +434,10 @@ def _sensors(part: _Part, base: Model) -> Iterator[tuple[Tried, Model]]:
         gaps = np.diff(measured.time[measured.sensor == number])
         interval = median(gaps) if len(gaps) else 0.0
         for factor in _FACTORS:
-            yield Tried(Cause.NOISE, name, factor), _seen(base, number, sd=factor * sd)
+            yield Tried(Cause.NOISE, name, factor), _change_view(base, number, sd=factor * sd)
         for which, ((drifting, white), lasting) in enumerate(product(_CORRELATED, _TIMES) if interval > 0.0 else ()):
             noise = {"sd": white * sd, "bias_drift_sd": drifting * sd, "bias_time": lasting * interval}
-            yield Tried(Cause.CORRELATED, name, which), _seen(base, number, **noise)
+            yield Tried(Cause.CORRELATED, name, which), _change_view(base, number, **noise)
 
 
 def _jitters(part: _Part, base: Model) -> Iterator[tuple[Tried, FloatArray]]:
@@ -449,7 +449,7 @@ def _jitters(part: _Part, base: Model) -> Iterator[tuple[Tried, FloatArray]]:
             yield Tried(Cause.JITTER, part.measured.sensors[number], latency_sd), np.hypot(1.0, latency_sd * noise)
 
 
-def _seen(base: Model, sensor: int, **numbers: float) -> Model:
+def _change_view(base: Model, sensor: int, **numbers: float) -> Model:
     view = base.view.copy()
     for name, value in numbers.items():
         view[name][sensor, 0] = value
@@ -461,7 +461,7 @@ def _seen(base: Model, sensor: int, **numbers: float) -> Model:
 
 def _shapes(part: _Part) -> Iterator[tuple[Tried, FloatArray]]:
     """What a cause of unit size adds to the measurements [m or rad], (m,)."""
-    arm, time, led, scale, measured = part.config.arm, part.time, part.led, part.scale, part.measured
+    arm, time, led, scale, measured = part.config.arm, part.time, part.response, part.scale, part.measured
     model, used = arm.axes[part.axis], part.sensors
     lags = dict[float, FloatArray]()
     for ns in (round(periods * arm.update_period * 1e9) for periods in _WHOLE_LAGS):
@@ -481,10 +481,10 @@ def _shapes(part: _Part) -> Iterator[tuple[Tried, FloatArray]]:
         yield Tried(Cause.POSITION, only, 1), scale * middle**2 / np.ptp(led)
     least = min(sd for sensor in part.config.sensors.values() if (sd := sensor.sd_of(part.axis)))
     for half_play in (times * least for times in _PLAYS):
-        yield Tried(Cause.PLAY, which=2.0 * half_play), scale * (_with_play(led, half_play) - led)
+        yield Tried(Cause.PLAY, which=2.0 * half_play), scale * (_apply_play(led, half_play) - led)
     for share in _LIMITS if model.max_speed is None else ():
         farthest = share * float(np.abs(lags[0.0]).max()) * np.diff(time, prepend=time[0]) / 1e9
-        yield Tried(Cause.LIMIT, which=share), scale * (_limited(led, farthest) - led)
+        yield Tried(Cause.LIMIT, which=share), scale * (_limit_speed(led, farthest) - led)
     for factor in (each for times in _FASTER for each in (times, 1.0 / times) if model.max_speed is not None):
         faster = msgspec.structs.replace(model, max_speed=factor * (model.max_speed or 0.0))
         yield (Tried(Cause.FASTEST, which=factor - 1.0), scale * (part.position(faster, time) - led) / (factor - 1.0))
@@ -506,13 +506,13 @@ def _slower(model: AxisModel, factor: float) -> AxisModel:
     return msgspec.structs.replace(model, plant=slower)
 
 
-def _with_play(drive: FloatArray, half: float) -> FloatArray:
+def _apply_play(drive: FloatArray, half: float) -> FloatArray:
     """Where a tool is that its drive takes along at either end of its play, (m,)."""
     pushed = accumulate(drive.tolist(), lambda tool, at: min(max(tool, at - half), at + half))
     return np.fromiter(pushed, dtype=np.float64)
 
 
-def _limited(drive: FloatArray, farthest: FloatArray) -> FloatArray:
+def _limit_speed(drive: FloatArray, farthest: FloatArray) -> FloatArray:
     """Where an axis is that follows, but in each interval no farther than that, (m,)."""
     moves = zip(drive[1:].tolist(), farthest[1:].tolist(), strict=True)
     driven = accumulate(moves, lambda now, move: min(max(move[0], now - move[1]), now + move[1]), initial=drive[0])

@@ -81,12 +81,14 @@ class _Side(NamedTuple):
         return math.sqrt(_PARTS - 1) * float(np.std(each))
 
 
-def clock_steps(segment: Segment, arm: ArmModel, valid: TimeArray, positions: Mapping[str, Rows]) -> list[ClockStep]:
+def find_clock_steps(
+    segment: Segment, arm: ArmModel, valid: TimeArray, positions: Mapping[str, Rows]
+) -> list[ClockStep]:
     """Where the clock of a sensor was set, in the order of time.
 
     Its rows are ``valid`` at these instants, also those that measure nothing, ascending [ns], (n,).
     """
-    steps, every, edges = list[ClockStep](), leaps(valid), list[int]()
+    steps, every, edges = list[ClockStep](), find_leaps(valid), list[int]()
     while every:
         likely = [step for leap in every if (step := _clock_step(segment, arm, positions, leap, edges))]
         if likely:  # near a clock that was set, an outage looks like another one until rows beyond are left out
@@ -96,7 +98,7 @@ def clock_steps(segment: Segment, arm: ArmModel, valid: TimeArray, positions: Ma
     return sorted(steps, key=lambda step: step.leap.first)
 
 
-def leaps(stamp: TimeArray) -> list[Leap]:
+def find_leaps(stamp: TimeArray) -> list[Leap]:
     """Where ascending stamps leap [ns], (n,); the longest first."""
     interval = np.diff(stamp)
     if len(interval) < _FEW or (usual := median(interval)) <= 0.0:
@@ -133,7 +135,7 @@ def _clock_step(
         return None
     left = lateness(*earlier), lateness(*later)  # log of the share of motion that is left at each shift, (2m + 1,)
     before, after = (best_shift(unexplained, earlier.grid) for unexplained in left)
-    if not all(map(_follows, left)):
+    if not all(map(_is_following, left)):
         return None
     if _gain(left[0], before, after) < _BETTER or _gain(left[1], after, before) < _BETTER:
         return None
@@ -157,11 +159,11 @@ def _side(segment: Segment, arm: ArmModel, positions: Mapping[str, Rows], begin:
     if last - first < _SHORTEST_NS:
         return None
     grid = Grid.around(first, (last - first) / 1e9, _BIN, round(_REACH / _BIN))
-    led = {axis: segment.led(arm, axis, grid.time) for axis in rows}
+    led = {axis: segment.response(arm, axis, grid.time) for axis in rows}
     return _Side({axis: grid.mean(*row) for axis, row in rows.items()}, led, grid)
 
 
-def _follows(unexplained: FloatArray) -> bool:
+def _is_following(unexplained: FloatArray) -> bool:
     """Whether a sensor follows at the best shift and beside it: where little is commanded there may be no valley."""
     lag = int(np.argmin(unexplained))
     return float(np.pad(unexplained, 1)[lag : lag + 3].max()) < _FOLLOWS

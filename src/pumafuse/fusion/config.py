@@ -297,8 +297,8 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         tree["process"] = {
             axis: toml.builtins(process, self.arm.axes[axis].kind) for axis, process in self.process.items()
         }
-        tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
-        tree["sensors"] = {name: with_kinds(table, self.arm, _PER_AXIS) for name, table in tree["sensors"].items()}
+        tree["start"] = rename_to_kinds(tree["start"], self.arm, ["offset_sd_mm"])
+        tree["sensors"] = {name: rename_to_kinds(table, self.arm, _PER_AXIS) for name, table in tree["sensors"].items()}
         for sensor in tree["sensors"].values():
             if not sensor["turn_deg"]:
                 del sensor["turn_deg"]
@@ -320,9 +320,9 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 def _config(tree: Mapping[str, Any], arm: ArmModel, where: str) -> FusionConfig:
     """The configuration of parsed tables (SI numbers)."""
-    tree = with_names_of_lengths({**tree, "arm": arm}, arm, where)
+    tree = rename_to_lengths({**tree, "arm": arm}, arm, where)
     if isinstance(tree.get("process"), dict):
-        tree["process"] = with_defaults(tree["process"], arm)
+        tree["process"] = fill_defaults(tree["process"], arm)
     for name, table in cast(dict[str, Any], tree.get("sensors", {})).items():
         if isinstance(table, dict) and "sd_mm" not in table:
             sd = " or ".join(f"'sensors.{name}.{of_kind('sd_mm', of)}'" for of in arm.kinds)
@@ -353,7 +353,7 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
     return ArmModel.load(beside)
 
 
-def with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
+def rename_to_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
     """The tables of a ``fusion.toml`` (SI numbers) with the key names for lengths, where those of angles are."""
     lengths = dict(tree)
     if isinstance(lengths.get("process"), dict):
@@ -449,12 +449,12 @@ def _accepted(kind: type[msgspec.Struct], arm: ArmModel, per_axis: Sequence[str]
     return [name for key in keys for name in ([of_kind(key, of) for of in arm.kinds] if key in per_axis else [key])]
 
 
-def with_defaults(process: Mapping[str, Mapping[str, Any]], arm: ArmModel) -> dict[str, dict[str, Any]]:
+def fill_defaults(process: Mapping[str, Mapping[str, Any]], arm: ArmModel) -> dict[str, dict[str, Any]]:
     """The tables of axes, with the key names for lengths, with what they leave out."""
     return {axis: {**toml.builtins(PROCESS[arm.axes[axis].kind]), **table} for axis, table in process.items()}
 
 
-def with_kinds(table: Mapping[str, Any], arm: ArmModel, per_axis: Sequence[str]) -> dict[str, Any]:
+def rename_to_kinds(table: Mapping[str, Any], arm: ArmModel, per_axis: Sequence[str]) -> dict[str, Any]:
     """The inverse of :func:`of_all_axes`: a table of lengths with a key for each kind of the arm's axes."""
     with_kinds: dict[str, Any] = {}
     for key, value in table.items():

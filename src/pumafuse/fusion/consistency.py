@@ -193,6 +193,6 @@ def _is_told_by_one(est: Estimates, sensor: str, axis: str) -> bool:
     strays, time = est[axis].position.copy(), est.origin + nanoseconds(est.time)
     for number in np.unique(est.segment).tolist():
         rows = est.segment == number
-        strays[rows] -= est.segments[number].led(est.config.arm, axis, time[rows])
+        strays[rows] -= est.segments[number].response(est.config.arm, axis, time[rows])
         strays[rows] -= strays[rows].mean()
     return float(np.std(strays)) > _STRAYS * float(np.median(est[axis].position_sd))

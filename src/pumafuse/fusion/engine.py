@@ -42,19 +42,19 @@ def filter_segment(
 ) -> Filtered:
     """Filter or smooth one segment; ``times`` of the estimates ascend, int64 ns, none before the origin.
 
-    As live they know what had come until they are ``asked`` for, see :meth:`.Segment.asked`.
+    As live they know what had come until they are ``asked`` for, see :meth:`.Segment.asking_times`.
     """
     events = segment.events_once(config)
-    model, results = model_of(segment, config), _undecided(events)
+    model, results = model_of(segment, config), _allocate_results(events)
     if engine == "filterpy":
         from ..filter import reference
 
         plants = [config.arm.axes[axis].plant for axis in segment.axes]
         slow_core = reference.Filter(plants, model, segment.origin, events)
         outputs = slow_core.run(results, times, progress)
-        return _filtered(segment, outputs, events, results, slow_core.bias)
+        return _build_filtered(segment, outputs, events, results, slow_core.bias)
     core = Filter(model, segment.origin)
-    return _filtered(segment, core.run(events, results, times, mode, asked=asked), events, results, core.bias)
+    return _build_filtered(segment, core.run(events, results, times, mode, asked=asked), events, results, core.bias)
 
 
 def filter_piece(
@@ -66,10 +66,10 @@ def filter_piece(
     """
     events = segment.events_once(config)
     begin, end = np.searchsorted(events.time, span, side="right").tolist()
-    results = _undecided(events)
+    results = _allocate_results(events)
     outputs = core.run(events, results, times, span=(begin, end))
     rows = np.r_[: np.searchsorted(events.time, NO_STAMP, side="right"), begin:end]
-    return _filtered(segment, outputs, events.rows(rows), results.rows(rows), core.bias)
+    return _build_filtered(segment, outputs, events.rows(rows), results.rows(rows), core.bias)
 
 
 def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | None = None) -> Results:
@@ -78,15 +78,15 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     With outcomes of an earlier fusion, (m, A), these are repeated whatever the gates would say.
     """
     events, index = segment.events(config)
-    results = _undecided(events)
+    results = _allocate_results(events)
     if outcome is not None:
         results.outcome[index] = outcome
-    core = Filter(_certain(model_of(segment, config)), segment.origin)
+    core = Filter(_drop_doubts(model_of(segment, config)), segment.origin)
     core.run(events, results, _NO_TIMES, "filtered" if outcome is None else "repeated")
     return results.rows(index)
 
 
-def linearised(
+def innovation_derivatives(
     segment: Segment,
     config: FusionConfig,
     outcome: CodeArray,
@@ -98,9 +98,9 @@ def linearised(
     model are linear in it.
     """
     events, index = segment.events(config)
-    results = _undecided(events)
+    results = _allocate_results(events)
     results.outcome[index] = outcome
-    model, *others = (_certain(model_of(segment, each)) for each in (config, *(other for other, _ in beside)))
+    model, *others = (_drop_doubts(model_of(segment, each)) for each in (config, *(other for other, _ in beside)))
     slopes = [_slopes(*parts, widths=[width for _, width in beside]) for parts in zip(model, *others, strict=True)]
     tangents = [Model(*parts) for parts in zip(*slopes, strict=True)]
     d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
@@ -119,7 +119,7 @@ def model_of(segment: Segment, config: FusionConfig) -> Model:
     return filter_model(config, segment.axes, segment.sensors, segment.start, biased_sensors(segment, config))
 
 
-def _certain(model: Model) -> Model:
+def _drop_doubts(model: Model) -> Model:
     """The same without error bars of lag and gain, which depend on the numbers that are fitted and change no ν."""
     model.axis["lag_sd"] = model.axis["gain_sd"] = 0.0
     return model
@@ -140,14 +140,14 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
     ]
 
 
-def _undecided(events: Events) -> Results:
+def _allocate_results(events: Events) -> Results:
     """Room for what becomes of events: until a filter decides what was known of them."""
     results = Results.room(*events.codes.shape)
     results.outcome[:] = events.codes
     return results
 
 
-def _filtered(
+def _build_filtered(
     segment: Segment,
     outputs: FloatArray,
     events: Events,

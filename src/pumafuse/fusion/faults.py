@@ -24,7 +24,7 @@ from ..model.arm import CANONICAL_AXES
 from ..space.rotations import nearest
 from ..units import DEG, GUESSED, MM, OF_KIND, Kind, mistaken, wraps
 from .causes import Cause
-from .clock_steps import ClockStep, clock_steps
+from .clock_steps import ClockStep, find_clock_steps
 from .config import FusionConfig
 from .consistency import Finding
 from .segments import Segment
@@ -79,13 +79,13 @@ class Fault:
         return self.cause == other.cause and alike and not set(self.axes).isdisjoint(other.axes)
 
 
-def sensor_faults(segment: Segment, config: FusionConfig) -> list[Fault]:
+def check_sensors(segment: Segment, config: FusionConfig) -> list[Fault]:
     """Each fault of a configured sensor, or of the commands, with which there may be estimates.
 
     Raises:
         RunError: Estimates would be wrong by construction.
     """
-    faults = faults_of(segment, config)
+    faults = find_faults(segment, config)
     if refused := [fault.sentence for fault in faults if fault.refused]:
         raise RunError(refused[0])
     return faults
@@ -102,30 +102,35 @@ def by_axis(faults: Iterable[Fault]) -> dict[tuple[str, str], str]:
     }
 
 
-def faults_of(segment: Segment, config: FusionConfig, origin: int | None = None) -> list[Fault]:
+def find_faults(segment: Segment, config: FusionConfig, origin: int | None = None) -> list[Fault]:
     """What is wrong with angles within a turn, and with sensors that do not follow or are off by a constant.
 
     Times are told since ``origin`` [ns], or the segment's.
     """
     positions = _positions(segment, config)
     trackings = _trackings(segment, config, positions)
-    clocks = _clocks_set(segment, config, positions, segment.origin if origin is None else origin)
+    clocks = _find_set_clocks(segment, config, positions, segment.origin if origin is None else origin)
     named = {name for clock in clocks for name in clock.sensors}
     faults = [
         fault
-        for fault in _not_following(segment, config, positions, trackings)
+        for fault in _find_not_following(segment, config, positions, trackings)
         if fault.cause not in _OF_CLOCKS or named.isdisjoint(fault.sensors)
     ]
     faults = [*clocks, *faults]
     named = {name for fault in faults for name in fault.sensors}
     quiet = {name: tracking for name, tracking in trackings.items() if name not in named}
-    return [*within_a_turn(segment, config), *faults, *_moving_alone(config, quiet), *_off(segment, config, quiet)]
+    return [
+        *find_turns(segment, config),
+        *faults,
+        *_find_moving_alone(config, quiet),
+        *_find_offsets(segment, config, quiet),
+    ]
 
 
-def not_following(segment: Segment, config: FusionConfig) -> list[Fault]:
+def find_not_following(segment: Segment, config: FusionConfig) -> list[Fault]:
     """What is wrong with sensors whose measurements are not where the commands lead: unit, axis, sign or clock."""
     positions = _positions(segment, config)
-    return _not_following(segment, config, positions, _trackings(segment, config, positions))
+    return _find_not_following(segment, config, positions, _trackings(segment, config, positions))
 
 
 def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
@@ -146,7 +151,7 @@ def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
     return [
         f"the run begins in motion ({speeds[most] * screen.scale:.3g} {screen.unit}/s on {most}), the model at rest:"
         f" estimates are wrong by up to {off[most] * screen.scale:.2g} {screen.unit} at first; record from rest, or use"
-        f" --from {max(settled(config, axis) for axis in speeds):.2g} or later"
+        f" --from {max(settling_time(config, axis) for axis in speeds):.2g} or later"
     ]
 
 
@@ -167,7 +172,7 @@ _Positions: TypeAlias = Mapping[str, Mapping[str, Rows]]  # when valid, and with
 _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
 
 
-def within_a_turn(segment: Segment, config: FusionConfig) -> list[Fault]:
+def find_turns(segment: Segment, config: FusionConfig) -> list[Fault]:
     """A fault for each angle of the commands or of a sensor that begins anew after each turn."""
     faults, angles = list[Fault](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
     positions: _Positions = _positions(segment, config) if angles else {}
@@ -221,14 +226,14 @@ def _trackings(segment: Segment, config: FusionConfig, positions: _Positions) ->
     return trackings
 
 
-def _led_at(segment: Segment, config: FusionConfig, axis: str, valid: TimeArray) -> tuple[FloatArray, FloatArray]:
+def _response_at(segment: Segment, config: FusionConfig, axis: str, valid: TimeArray) -> tuple[FloatArray, FloatArray]:
     """Where the commands lead an axis at some instants, and where they had led shortly before."""
-    early = segment.led(config.arm, axis, valid - round(SMALL_SHIFT * 1e9))
-    return segment.led(config.arm, axis, valid), early
+    early = segment.response(config.arm, axis, valid - round(SMALL_SHIFT * 1e9))
+    return segment.response(config.arm, axis, valid), early
 
 
 def _tracking(segment: Segment, config: FusionConfig, name: str, axis: str, rows: Rows) -> Tracking:
-    (valid, position), (led, before) = rows, _led_at(segment, config, axis, rows[0])
+    (valid, position), (led, before) = rows, _response_at(segment, config, axis, rows[0])
     sensor, process = config.sensors[name], config.process[axis]
     of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_drift_sd_of(axis)) / abs(sensor.scale)
     noise = math.hypot(of_sensor, process.disturbance_sd)
@@ -239,7 +244,7 @@ def _tracking(segment: Segment, config: FusionConfig, name: str, axis: str, rows
     return Tracking((valid - valid[0]) / 1e9, measured, led, before, noise, zero_sd, process.drift)
 
 
-def _off(segment: Segment, config: FusionConfig, trackings: _Trackings) -> list[Fault]:
+def _find_offsets(segment: Segment, config: FusionConfig, trackings: _Trackings) -> list[Fault]:
     """A fault for each sensor that is off by a constant; of all sensors of an axis one, on the commands."""
     off = {
         name: {axis: tracking.zero for axis, tracking in of_sensor.items() if tracking.zero}
@@ -254,14 +259,14 @@ def _off(segment: Segment, config: FusionConfig, trackings: _Trackings) -> list[
             if len(alike) < len(measuring) or len(alike) == 1:
                 alone[axis] = zero
             elif name == alike[0]:
-                faults.append(Fault(tuple(alike), (axis,), "zero", zero, _zero_of_commands(config, axis, zero, alike)))
+                faults.append(Fault(tuple(alike), (axis,), "zero", zero, _common_zero_words(config, axis, zero, alike)))
         if scaled := [axis for axis in alone if _is_scaled(trackings[name][axis], segment.start[axis])]:
             scale = median(np.array([trackings[name][axis].slope for axis in scaled]))
-            faults.append(Fault((name,), tuple(scaled), "unit", scale, _scaled(config, name, scaled, scale)))
+            faults.append(Fault((name,), tuple(scaled), "unit", scale, _scale_words(config, name, scaled, scale)))
         if unscaled := {axis: zero for axis, zero in alone.items() if axis not in scaled}:
             largest = max(unscaled.values(), key=abs)
             faults.append(
-                Fault((name,), tuple(unscaled), "zero", largest, _zero(config, name, unscaled, trackings[name]))
+                Fault((name,), tuple(unscaled), "zero", largest, _zero_words(config, name, unscaled, trackings[name]))
             )
     return faults
 
@@ -272,7 +277,7 @@ def _is_scaled(tracking: Tracking, start: float) -> bool:
     return abs(more) > _ALIKE_SIZE / 2.0 and math.isclose(tracking.zero, more * start, rel_tol=_ALIKE_SIZE)
 
 
-def _scaled(config: FusionConfig, name: str, axes: Sequence[str], factor: float) -> str:
+def _scale_words(config: FusionConfig, name: str, axes: Sequence[str], factor: float) -> str:
     scale = _digits(config.sensors[name].scale * factor, 3)
     return (
         f"sensor '{name}' measures {_digits(factor, 3)} times the position of {', '.join(axes)}: is the unit of its"
@@ -280,7 +285,7 @@ def _scaled(config: FusionConfig, name: str, axes: Sequence[str], factor: float)
     )
 
 
-def _zero_of_commands(config: FusionConfig, axis: str, zero: float, sensors: Sequence[str]) -> str:
+def _common_zero_words(config: FusionConfig, axis: str, zero: float, sensors: Sequence[str]) -> str:
     names, width = ", ".join(f"'{sensor}'" for sensor in sensors), _width(config, "offset_sd", {axis: zero})
     return (
         f"sensors {names} are {_length(config, axis, zero)} from where the commands lead {axis}, all the time: is the"
@@ -288,7 +293,7 @@ def _zero_of_commands(config: FusionConfig, axis: str, zero: float, sensors: Seq
     )
 
 
-def _zero(config: FusionConfig, name: str, zeros: Mapping[str, float], trackings: Mapping[str, Tracking]) -> str:
+def _zero_words(config: FusionConfig, name: str, zeros: Mapping[str, float], trackings: Mapping[str, Tracking]) -> str:
     offsets = ", ".join(
         f"{_length(config, axis, zero)} on {axis} (noise and priors:"
         f" {_length(config, axis, trackings[axis].zero_sd, '.2g')})"
@@ -317,7 +322,7 @@ def _width(config: FusionConfig, key: str, zeros: Mapping[str, float]) -> str:
     return ", ".join(f"{key} = {{ {', '.join(widths)} }}" for key, widths in by_kind.items())
 
 
-def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
+def _find_moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
     """A fault for each sensor that moves while the commands of its axis rest."""
     return [
         Fault(
@@ -337,20 +342,20 @@ def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[Fault]:
 # ---- a clock that was set in mid-run ---------------------------------------------------------------------------------
 
 
-def _clocks_set(segment: Segment, config: FusionConfig, positions: _Positions, origin: int) -> list[Fault]:
+def _find_set_clocks(segment: Segment, config: FusionConfig, positions: _Positions, origin: int) -> list[Fault]:
     """A fault for each time that the clock of a sensor was set; ``origin`` [ns] is time 0."""
     clocks_set, rows = list[Fault](), segment.rows_by_sensor()
     for name, position in positions.items():
         latency = round(config.sensors[name].latency * 1e9)
-        for step in clock_steps(segment, config.arm, rows[name].stamp - latency, position):
+        for step in find_clock_steps(segment, config.arm, rows[name].stamp - latency, position):
             at = step.leap.first + latency
             clocks_set.append(
-                Fault((name,), tuple(position), "set", step.by, _set(name, step, (at - origin) / 1e9), at=at)
+                Fault((name,), tuple(position), "set", step.by, _clock_words(name, step, (at - origin) / 1e9), at=at)
             )
     return clocks_set
 
 
-def _set(name: str, step: ClockStep, at: float) -> str:
+def _clock_words(name: str, step: ClockStep, at: float) -> str:
     """What shows that a clock was set, and what to do; rows that are stamped as they arrive leap with their latency."""
     leap, later, slower, more = (
         ("leap ahead", "later", "slower", "more") if step.by > 0.0 else ("step back", "earlier", "faster", "less")
@@ -366,8 +371,10 @@ def _set(name: str, step: ClockStep, at: float) -> str:
 # ---- a sensor that does not follow ----------------------------------------------------------------------------------
 
 
-def _not_following(segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings) -> list[Fault]:
-    faults = _turned_frames(segment, config, positions, trackings)
+def _find_not_following(
+    segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings
+) -> list[Fault]:
+    faults = _find_turned_frames(segment, config, positions, trackings)
     turned = {name for fault in faults for name in fault.sensors}
     for name, of_sensor in trackings.items():
         if name in turned:
@@ -375,13 +382,15 @@ def _not_following(segment: Segment, config: FusionConfig, positions: _Positions
         if odd := [axis for axis, tracking in of_sensor.items() if not tracking.follows]:
             grid = _busiest(segment, config.arm.update_period)
             causes = _matches(segment, config, {axis: positions[name][axis] for axis in of_sensor}, grid)
-            faults += _faults(config, name, of_sensor, {axis: causes[axis] for axis in odd}, grid.margin * grid.step)
-    return _of_commands(faults, trackings)
+            faults += _find_faults(
+                config, name, of_sensor, {axis: causes[axis] for axis in odd}, grid.margin * grid.step
+            )
+    return _merge_faults(faults, trackings)
 
 
 def _matches(segment: Segment, config: FusionConfig, positions: Mapping[str, Rows], grid: Grid) -> dict[str, Match]:
     """What explains the motion that a sensor measures on each axis, without single outliers."""
-    led = {axis: segment.led(config.arm, axis, grid.time) for axis in segment.axes}
+    led = {axis: segment.response(config.arm, axis, grid.time) for axis in segment.axes}
     measured: dict[str, FloatArray] = {}
     for axis, (valid, position) in positions.items():
         alike = without_spikes(position)
@@ -403,7 +412,7 @@ def _busiest(segment: Segment, period: float) -> Grid:
     return Grid.over(begin, min(begin + length, last), period)
 
 
-def _faults(
+def _find_faults(
     config: FusionConfig, name: str, trackings: Mapping[str, Tracking], causes: Mapping[str, Match], searched: float
 ) -> list[Fault]:
     """The faults of one sensor, from what explains its motion on the axes that it does not follow.
@@ -420,25 +429,27 @@ def _faults(
     clear = {axis: cause for axis, cause in causes.items() if _is_clear(axis, cause, trackings[axis])}
     if late := [axis for axis, cause in clear.items() if cause.shift != 0.0]:
         best = max(late, key=lambda axis: clear[axis].correlation)
-        fault(list(trackings), "clock", clear[best].shift, _late(config, name, best, trackings[best], clear[best]))
+        fault(
+            list(trackings), "clock", clear[best].shift, _late_words(config, name, best, trackings[best], clear[best])
+        )
     if exchanged := [axis for axis, cause in clear.items() if cause.axis != axis]:
         others = [clear[axis].axis for axis in exchanged if clear[axis].axis in trackings]
         both = list(dict.fromkeys([*exchanged, *others]))
-        fault(both, "columns", 1.0, _exchanged({axis: (trackings[axis], clear[axis]) for axis in exchanged}))
+        fault(both, "columns", 1.0, _exchange_words({axis: (trackings[axis], clear[axis]) for axis in exchanged}))
     on_axis = {axis: cause for axis, cause in clear.items() if cause.axis == axis}
     if turned := [axis for axis, cause in on_axis.items() if cause.slope < 0.0]:
-        fault(turned, "sign", -1.0, _turned(config, name, turned, on_axis, len(trackings)))
+        fault(turned, "sign", -1.0, _sign_words(config, name, turned, on_axis, len(trackings)))
     for axis, match in on_axis.items():
         size = abs(match.slope)
         if not 1.0 / GAIN < size < GAIN:
-            refused, words = _unit(config.arm.axes[axis].kind, size)
+            refused, words = _unit_words(config.arm.axes[axis].kind, size)
             times, correlation = _digits(size, 3), f"{match.correlation:+.3f}"
             moves = f"moves {times} times as far as the commands of {axis} (correlation {correlation}): {words}"
             fault([axis], "unit", size, moves, refused)
     faulty = {axis for fault in faults for axis in fault.axes}
     odd = {axis: trackings[axis] for axis in causes if axis not in faulty and abs(causes[axis].correlation) < _LOST}
     if lost := {axis: cause for axis, cause in odd.items() if cause.lacks_motion}:
-        fault(list(lost), "nothing", 1.0, _nothing(lost, searched))
+        fault(list(lost), "nothing", 1.0, _nothing_words(lost, searched))
     return faults
 
 
@@ -450,7 +461,7 @@ def _is_clear(axis: str, cause: Match, tracking: Tracking) -> bool:
     return cause.is_steady and abs(cause.correlation) >= least
 
 
-def _late(config: FusionConfig, name: str, axis: str, tracking: Tracking, cause: Match) -> str:
+def _late_words(config: FusionConfig, name: str, axis: str, tracking: Tracking, cause: Match) -> str:
     side, latency = ("late" if cause.shift > 0.0 else "early"), config.sensors[name].latency + cause.shift
     return (
         f"is {abs(cause.shift):.2f} s {side}: it follows the commands of {axis} with a correlation of"
@@ -459,7 +470,7 @@ def _late(config: FusionConfig, name: str, axis: str, tracking: Tracking, cause:
     )
 
 
-def _exchanged(matches: Mapping[str, tuple[Tracking, Match]]) -> str:
+def _exchange_words(matches: Mapping[str, tuple[Tracking, Match]]) -> str:
     follows = [
         f"on {axis} the commands of {cause.axis} (correlation {cause.correlation:+.3f}, with those of {axis}"
         f" {tracking.correlation:+.2f})"
@@ -468,7 +479,9 @@ def _exchanged(matches: Mapping[str, tuple[Tracking, Match]]) -> str:
     return f"follows {' and '.join(follows)}: are its columns exchanged in run.toml?"
 
 
-def _turned(config: FusionConfig, name: str, axes: Sequence[str], causes: Mapping[str, Match], measured: int) -> str:
+def _sign_words(
+    config: FusionConfig, name: str, axes: Sequence[str], causes: Mapping[str, Match], measured: int
+) -> str:
     correlation = min(causes[axis].correlation for axis in axes)
     scale = f" scale = {-config.sensors[name].scale:g} turns it;" if len(axes) == measured else ""
     return (
@@ -477,7 +490,7 @@ def _turned(config: FusionConfig, name: str, axes: Sequence[str], causes: Mappin
     )
 
 
-def _unit(kind: Kind, factor: float) -> tuple[bool, str]:
+def _unit_words(kind: Kind, factor: float) -> tuple[bool, str]:
     """Whether a factor is one between units that columns may have, and a question about its cause."""
     pairs = mistaken(factor, OF_KIND[kind])
     if not pairs:
@@ -492,7 +505,7 @@ def _digits(number: float, count: int) -> str:
     return f"{float(f'{number:.{count}g}'):g}"
 
 
-def _nothing(trackings: Mapping[str, Tracking], searched: float) -> str:
+def _nothing_words(trackings: Mapping[str, Tracking], searched: float) -> str:
     rests = "rests and " if all(tracking.rests for tracking in trackings.values()) else ""
     axes = ", ".join(
         f"{axis} (correlation {tracking.correlation:+.2f} with the model)" for axis, tracking in trackings.items()
@@ -503,7 +516,7 @@ def _nothing(trackings: Mapping[str, Tracking], searched: float) -> str:
     )
 
 
-def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
+def _merge_faults(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
     """The faults; one that all of several sensors of its axes have is reported once, as one of the commands."""
     of_commands: list[Fault] = []
     for fault in faults:
@@ -522,12 +535,14 @@ def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
 # ---- a sensor that is turned against its axes ------------------------------------------------------------------------
 
 
-def _turned_frames(segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings) -> list[Fault]:
+def _find_turned_frames(
+    segment: Segment, config: FusionConfig, positions: _Positions, trackings: _Trackings
+) -> list[Fault]:
     """The faults of sensors that see the commanded motion turned, by 3° or more."""
     faults = list[Fault]()
     for name, of_sensor in trackings.items():
         axes = [axis for axis in (CARTESIAN if "x" in of_sensor else CANONICAL_AXES) if axis in of_sensor]
-        if len(axes) < 2 or (turned := _turned_frame(segment, config, positions[name], axes)) is None:
+        if len(axes) < 2 or (turned := _find_turned_frame(segment, config, positions[name], axes)) is None:
             continue
         angle, along, back = turned
         lengths = f"{_digits(back * MM, 2)} mm instead of {_digits(along * MM, 2)} mm"
@@ -540,7 +555,7 @@ def _turned_frames(segment: Segment, config: FusionConfig, positions: _Positions
     return faults
 
 
-def _turned_frame(
+def _find_turned_frame(
     segment: Segment, config: FusionConfig, positions: Mapping[str, Rows], axes: Sequence[str]
 ) -> tuple[float, float, float] | None:
     """By how much a sensor is turned [rad], and how far its moves are from the response's as it is and turned back [m].
@@ -558,7 +573,7 @@ def _turned_frame(
     valid, value = valid[alike], value[alike]
     if len(valid) < _FEW:
         return None
-    ends = [_led_at(segment, config, axis, valid) for axis in axes]
+    ends = [_response_at(segment, config, axis, valid) for axis in axes]
     led, before = (np.column_stack(part) for part in zip(*ends, strict=True))
     over = round(_MOVE / max(float(np.median(np.diff(valid))), 1.0))
     if not 1 <= over < len(valid) // _PARTS:
@@ -626,7 +641,7 @@ def _first_speed(segment: Segment, axis: str) -> float:
     return float(command[-1] - command[0]) / (int(told_at[-1] - told_at[0]) / 1e9)
 
 
-def settled(config: FusionConfig, axis: str) -> float:
+def settling_time(config: FusionConfig, axis: str) -> float:
     """How long the model of an axis remembers where it began [s]."""
     return config.arm.delay_of(axis) + _SETTLED * config.arm.axes[axis].plant.lag
 
@@ -640,7 +655,7 @@ def _evidence(
     constant of each sensor. Score over information is the share, 1/√information its standard deviation.
     """
     model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
-    until, score, information = settled(config, axis), 0.0, 0.0
+    until, score, information = settling_time(config, axis), 0.0, 0.0
     (told_at, command), start = segment.commands_of(axis), segment.start[axis]
     before = np.arange(-min(int(until / period) + 1, _MOST), 0.0)
     earlier = np.concatenate([told_at[0] + np.rint(before * (period * 1e9)).astype(np.int64), told_at])

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..arrays import NO_STAMP, TimeArray
 from ..errors import warn
-from ..filter.events import COMMAND
+from ..filter.events import COMMAND, Events
 from ..filter.outcome import ABSENT, Outcome
 from ..logs.clock import clock_faults, segments
 from ..logs.frames import Cylindrical, Placed
@@ -22,11 +22,11 @@ from ..units import Kind, seconds
 from .config import FusionConfig
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
-from .faults import Fault, by_axis, latency_questions, sensor_faults, starts_in_motion
+from .faults import Fault, by_axis, check_sensors, latency_questions, starts_in_motion
 from .overruns import overrun_notes, overruns
 from .placing import in_base
 from .score import late_rows, reference_track
-from .segments import NO_STAMP_WORD, Segment, added, best_of, build, nonzero, on_any_axis, output_times
+from .segments import NO_STAMP_WORD, Segment, best_of, build_segment, nonzero, on_any_axis, output_times, sum_counts
 from .verdicts import sensor_problems
 
 S = TypeVar("S", bound=np.generic)
@@ -88,19 +88,20 @@ def fuse(
     for part in logged:
         measuring = [name for name in config.sensor_names(selected) if name in part.sensors]
         clocks += clock_faults(part, config.arm.update_period, measuring)
-        segment = build(part, config, selected)
-        faults += sensor_faults(segment, config)
+        segment = build_segment(part, config, selected)
+        faults += check_sensors(segment, config)
         moving += starts_in_motion(segment, config)
         times = output_times(segment, config, rate, mode == "as-live")
         share = None if progress is None else partial(_share, progress, len(parts), len(logged))
-        asked = segment.asked(times, rate is not None)
+        asked = segment.asking_times(times, rate is not None)
         filtered = filter_segment(segment, config, times, mode, engine, share, asked)
-        parts.append(Part(part, segment.without_measurements(), times, filtered))  # the result has them
+        segment = replace(segment, measurement_rows=Events.empty(len(segment.axes)))  # the result has them
+        parts.append(Part(part, segment, times, filtered))
         del segment
     est = estimates_of(run, in_place, placed, config, parts, mode, engine)
-    notes = [*clocks, *(fault.sentence for fault in faults), *found_by(est, parts), *moving]
+    notes = [*clocks, *(fault.sentence for fault in faults), *row_notes(est, parts), *moving]
     notes += latency_questions(config, parts[0].segment.sensors)
-    notes += [*jumps, *_uncovered(est), *config.arm.validity.excess(est.speed, est.radius)]
+    notes += [*jumps, *_reference_notes(est), *config.arm.validity.excess(est.speed, est.radius)]
     notes += overrun_notes([overruns(part.segment, config.arm) for part in parts], config.arm, est.origin)
     parts.clear()  # their tables are as large as what est has of them
     est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=selected, faults=by_axis(faults))
@@ -108,7 +109,7 @@ def fuse(
     return est
 
 
-def judged(run: Run, segment: Segment, config: FusionConfig) -> Estimates:
+def judge(run: Run, segment: Segment, config: FusionConfig) -> Estimates:
     """What became of the measurements of a run in the arm's axes, which is one ``segment``; no estimate, no note."""
     times = np.empty(0, dtype=np.int64)
     part = Part(run, segment, times, filter_segment(segment, config, times, "filtered"))
@@ -132,13 +133,13 @@ def estimates_of(
     rows = [_row_counts(segment, part) for segment, part in zip(cut, filtered, strict=True)]
     axes = {
         axis: AxisEstimate(
-            *(_joined(getattr(part.axes[axis], field) for part in filtered) for field in AxisEstimate.FIELDS)
+            *(_concatenate(getattr(part.axes[axis], field) for part in filtered) for field in AxisEstimate.FIELDS)
         )
         for axis in cut[0].axes
     }
     return Estimates(
         run=run.name,
-        time=seconds(_joined(times), origin),
+        time=seconds(_concatenate(times), origin),
         axes=axes,
         cartesian=placed and placed.in_log({axis: estimate.position for axis, estimate in axes.items()}),
         measurements=_measurements(cut, filtered),
@@ -152,9 +153,9 @@ def estimates_of(
         config=config,
         speed=_highest_speeds(cut, config.arm),
         radius=_highest_radius(in_place, placed),
-        command_counts=_without_strays([part.command_counts for part in cut], run.command, in_place.command),
+        command_counts=_recount_strays([part.command_counts for part in cut], run.command, in_place.command),
         counts={
-            name: _without_strays([part[name] for part in rows], source, in_place.sensors[name])
+            name: _recount_strays([part[name] for part in rows], source, in_place.sensors[name])
             for name, source in run.sensors.items()
         },
         notes=(),
@@ -164,7 +165,7 @@ def estimates_of(
     )
 
 
-def found_by(est: Estimates, parts: Sequence[Part]) -> list[str]:
+def row_notes(est: Estimates, parts: Sequence[Part]) -> list[str]:
     """A sentence on each thing that is wrong with rows, and on sensors that contradict each other."""
     sentences = [note for part in parts for note in part.segment.notes]
     sentences += [
@@ -183,7 +184,7 @@ def _share(progress: Callable[[float], None], number: int, count: int, done: flo
     progress((number + done) / count)
 
 
-def _joined(parts: Iterable[npt.NDArray[S]]) -> npt.NDArray[S]:
+def _concatenate(parts: Iterable[npt.NDArray[S]]) -> npt.NDArray[S]:
     """Arrays of segments, one after the other."""
     arrays = list(parts)
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
@@ -198,7 +199,7 @@ def _references(parts: Sequence[Part], origin: int) -> list[Source]:
     ]
 
 
-def _uncovered(est: Estimates) -> list[str]:
+def _reference_notes(est: Estimates) -> list[str]:
     """A sentence if the reference has no row at the time of any estimate."""
     if est.reference is None:
         return []
@@ -262,9 +263,9 @@ def _row_counts(segment: Segment, filtered: Filtered) -> dict[str, dict[str, int
     return counts_of
 
 
-def _without_strays(parts: Sequence[Mapping[str, int]], logged: Source, mended: Source) -> dict[str, int]:
+def _recount_strays(parts: Sequence[Mapping[str, int]], logged: Source, mended: Source) -> dict[str, int]:
     """The sum of the segments' counts of a source, stray stamps apart from none."""
-    total = added(parts)
+    total = sum_counts(parts)
     unstamped, word = total.get(NO_STAMP_WORD, 0), Outcome.STRAY.word
     stray = min(int(np.count_nonzero(logged.stamp != mended.stamp)), unstamped)
     return nonzero(total | {NO_STAMP_WORD: unstamped - stray, word: total.get(word, 0) + stray})
@@ -284,4 +285,4 @@ def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measu
         spread = events.spread if len(events.spread) else np.ones_like(events.value)
         numbers = events.value, spread, results.innovation, results.innovation_sd, results.noise_scale, results.outcome
         columns.append((time, stamp, sensor, axis, segment, *(part.take(rows) for part in numbers)))
-    return Measurements(*map(_joined, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)
+    return Measurements(*map(_concatenate, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import ALWAYS, NEVER
 from ..model.arm import EXCEEDED, ArmModel, commanded_speed
-from .segments import WHOLE, Segment, owned
+from .segments import WHOLE, Segment, owned_rows
 
 
 class Overrun(NamedTuple):
@@ -30,7 +30,7 @@ def overruns(segment: Segment, arm: ArmModel, span: tuple[int, int] = WHOLE) -> 
             stamp, value = segment.commands_of(axis)
             speed, rows = (
                 commanded_speed(np.diff(value, prepend=segment.start[axis]), arm.update_period),
-                owned(stamp, span),
+                owned_rows(stamp, span),
             )
             stamp, speed = stamp[rows], speed[rows]
             beyond = stamp[speed > limit * EXCEEDED]

@@ -37,7 +37,7 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
     none. A piece of a run is not ``whole``: it does not begin with the first command.
     """
     run = without_strays(run).delayed(config.arm)
-    config = with_tool(config, run)
+    config = add_tool(config, run)
     tool = config.tool.reference if config.tool else None
     of_tool = {
         name: _of_tool(name, source, run, config, whole=whole)
@@ -46,17 +46,17 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
     }
     in_axes_of_arm, placed = in_axes(replace(run, sensors={**run.sensors, **of_tool}), config.frame, tool)
     if in_axes_of_arm.tool is not None and not set(TURNING) & set(config.arm.axes):
-        in_axes_of_arm = in_axes_of_arm.each(_still)
+        in_axes_of_arm = in_axes_of_arm.each(_drop_turning)
     return in_axes_of_arm, placed, config
 
 
-def with_tool(config: FusionConfig, run: Run) -> FusionConfig:
+def add_tool(config: FusionConfig, run: Run) -> FusionConfig:
     """The configuration with the robot of a run, and the reference orientation of its commands where it has none."""
     tool, robot = reference_orientation(run) if config.tool is None else None, run.robot or config.robot
     return msgspec.structs.replace(config, tool=config.tool if tool is None else Tool(reference=tool), robot=robot)
 
 
-def _still(_: str, source: Source) -> Source:
+def _drop_turning(_: str, source: Source) -> Source:
     return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
@@ -76,17 +76,17 @@ class Placing:
         self._sd = {axis: sd for axis in CARTESIAN if (sd := sensor.sd_of(axis))}
 
     @_QUIET
-    def seen(self, measured: FloatArray) -> FloatArray:
+    def to_base(self, measured: FloatArray) -> FloatArray:
         """What it sees, along the base's axes [m], of x, y and z [m] in its own frame, (n, 3); NaN where it is lost."""
-        return np.where(lost(measured)[:, None], np.nan, self._at + rotations.turned(self._turn, measured))
+        return np.where(lost(measured)[:, None], np.nan, self._at + rotations.rotate(self._turn, measured))
 
-    def oriented(self, measured: FloatArray) -> FloatArray:
+    def orientation(self, measured: FloatArray) -> FloatArray:
         """The tool's orientation of what it measures, as quaternions, (n, 4) → (n, 4)."""
         return rotations.product(rotations.product(self._turn, measured), self._back)
 
     def lever(self, tool: FloatArray) -> FloatArray:
         """From the tool point to what it sees [m], by the tool's orientation, (n, 4) → (n, 3)."""
-        return rotations.turned(tool, self._marker)
+        return rotations.rotate(tool, self._marker)
 
     def spread(self, lever: FloatArray) -> dict[str, FloatArray]:
         """How much larger the noise of the tool point is than that of what it sees, as its orientation is noisy, too.
@@ -105,10 +105,10 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
     placing, spread = Placing(config.sensors[name], config.arm), dict(source.spread)
     told = source.orientation if placing.is_oriented else None
     measured = np.column_stack([source.values[axis] for axis in CARTESIAN])
-    point = placing.seen(measured)
-    oriented = None if told is None else np.where(lost(measured)[:, None], np.nan, placing.oriented(told))
+    point = placing.to_base(measured)
+    oriented = None if told is None else np.where(lost(measured)[:, None], np.nan, placing.orientation(told))
     if oriented is not None and whole and _can_be_commanded(run, config):
-        _check_turned(name, source, oriented, run)
+        _check_orientation(name, source, oriented, run)
     if placing.has_marker:
         lever = np.full(point.shape, np.nan) if oriented is None else placing.lever(oriented)
         spread |= placing.spread(lever)
@@ -119,13 +119,13 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
                 " of a whole run tell; so long a run is fused piece by piece: cut it into shorter ones"
             )
         if oriented is None or (untold.any() and _can_be_commanded(run, config)):
-            lever[untold] = placing.lever(_commanded(name, source.stamp[untold], run, config))
+            lever[untold] = placing.lever(_commanded_orientation(name, source.stamp[untold], run, config))
         point = point - lever
     values = dict(source.values) | dict(zip(CARTESIAN, point.T.copy(), strict=True))
     return replace(source, values=values, orientation=oriented, spread=spread)
 
 
-def _check_turned(name: str, source: Source, oriented: FloatArray, run: Run) -> None:
+def _check_orientation(name: str, source: Source, oriented: FloatArray, run: Run) -> None:
     """Whether a sensor tells the tool to be turned about as it is commanded to be."""
     assert run.command.orientation is not None
     told_at, commanded = known_rows(run.command.stamp, run.command.orientation)
@@ -147,7 +147,7 @@ def _can_be_commanded(run: Run, config: FusionConfig) -> bool:
     return run.command.orientation is not None and config.tool is not None and set(TURNING) <= set(config.arm.axes)
 
 
-def _commanded(name: str, stamp: TimeArray, run: Run, config: FusionConfig) -> FloatArray:
+def _commanded_orientation(name: str, stamp: TimeArray, run: Run, config: FusionConfig) -> FloatArray:
     """Where the commands have turned the tool by the instants of a sensor's measurements, as quaternions, (rows, 4)."""
     commanded, arm, where = run.command.orientation, config.arm, f"sensors.{name}.marker"
     if commanded is None or config.tool is None or np.isnan(commanded).all():

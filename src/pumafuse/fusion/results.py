@@ -107,7 +107,7 @@ class Making:
         """The sensors that are asked for, in the order of the configuration."""
         return None if self.sensors is None else self.config.sensor_names(self.sensors)
 
-    def made(self, folder: Path, log: Path) -> Summary | None:
+    def read_summary(self, folder: Path, log: Path) -> Summary | None:
         """The summary of a result that is there and was made so from the log as it is; None where nothing is."""
         if not folder.is_dir() or not any(folder.iterdir()):
             return None
@@ -132,8 +132,8 @@ class Making:
         return summary
 
 
-def note_log(folder: Path, stamps: Mapping[str, tuple[int, int]]) -> None:
-    """Note in a result folder of which files it was made, for :meth:`Making.made`; ``stamps`` are of before."""
+def write_stamps(folder: Path, stamps: Mapping[str, tuple[int, int]]) -> None:
+    """Write of which files a result was made, for :meth:`Making.read_summary`; ``stamps`` are of before."""
     (folder / _LOG).write_bytes(msgspec.json.format(msgspec.json.encode(stamps)) + b"\n")
 
 
@@ -186,7 +186,7 @@ def read(folder: Path) -> Result:
         for axis, part in summary.axes.items()
     }
     time, segment = _time_and_segment(table)
-    _check_read(folder / ESTIMATES, time, segment, axes)
+    _check_unchanged(folder / ESTIMATES, time, segment, axes)
     path = folder / REFERENCE
     reference = _own_reference(tables.read(path), config) if path.exists() else None
     return Result(summary, config, time, segment, axes, _cartesian(table), reference)
@@ -200,7 +200,7 @@ def _summary(folder: Path) -> Summary:
         raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY}: {why})") from None
 
 
-def _check_read(path: Path, time: FloatArray, segment: IntArray, axes: Mapping[str, AxisEstimate]) -> None:
+def _check_unchanged(path: Path, time: FloatArray, segment: IntArray, axes: Mapping[str, AxisEstimate]) -> None:
     """Refuse estimates that were changed: a comparison would take them for what they are not."""
     if not len(time) or not axes:
         raise FolderError(f"{path}: no estimates")

@@ -183,12 +183,12 @@ def score_orientation(
     )
 
 
-def interpolated(time: FloatArray, segment: IntArray | IndexArray, reference: ReferenceTrack, axis: str) -> FloatArray:
+def interpolate(time: FloatArray, segment: IntArray | IndexArray, reference: ReferenceTrack, axis: str) -> FloatArray:
     """The reference [m] at ``time``, linear between its rows; NaN outside it and in gaps, (n,).
 
     A gap is an interval longer than twice the reference's median interval and longer than 50 ms.
     """
-    return _interpolated(time, segment, reference, axis)[0]
+    return _interpolate(time, segment, reference, axis)[0]
 
 
 def _score(error: FloatArray, variance: FloatArray) -> Score | None:
@@ -214,14 +214,14 @@ def _score(error: FloatArray, variance: FloatArray) -> Score | None:
 def _true(time: FloatArray, segment: IntArray, reference: ReferenceTrack, axis: str) -> tuple[FloatArray, FloatArray]:
     """The reference [m] at ``time``, and the variance of its own noise and of its interpolation [m²], (n,)."""
     sd = np.interp(time, reference.time, reference.sd[axis]) if len(reference.time) else np.zeros(len(time))
-    track, off = _interpolated(time, segment, reference, axis)
+    track, off = _interpolate(time, segment, reference, axis)
     return track, sd**2 + off**2
 
 
-def _interpolated(
+def _interpolate(
     time: FloatArray, segment: IntArray | IndexArray, reference: ReferenceTrack, axis: str
 ) -> tuple[FloatArray, FloatArray]:
-    """The reference [m] at ``time`` as :func:`interpolated` has it, and how far off that may be [m], (n,)."""
+    """The reference [m] at ``time`` as :func:`interpolate` has it, and how far off that may be [m], (n,)."""
     track, off = np.full(len(time), np.nan), np.zeros(len(time))
     for number in set(segment.tolist()):
         here = segment == number

@@ -19,7 +19,7 @@ import numpy as np
 from ..arrays import ALWAYS, NEVER, NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..filter.core import Model, classify
-from ..filter.events import COMMAND, Events, joined
+from ..filter.events import COMMAND, Events, concatenate
 from ..filter.outcome import ABSENT, Outcome
 from ..filter.response import response
 from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind, in_order
@@ -92,7 +92,7 @@ class Segment:
         times = (*self._delay(config).tolist(), *self._latency(config).tolist())
         cached = self._latest.get(times)  # a search asks for many configurations of the same times
         if cached is None:
-            events, order = self._ordered(config)
+            events, order = self._order(config)
             index = np.empty(len(order), dtype=np.int64)
             index[order] = np.arange(len(order))
             cached = self._latest[times] = events, index[len(order) - len(self.measurement_rows.time) :]
@@ -102,9 +102,9 @@ class Segment:
 
     def events_once(self, config: FusionConfig) -> Events:
         """The events in their order where nobody will ask again: nothing of them is kept here."""
-        return self._ordered(config)[0]
+        return self._order(config)[0]
 
-    def _ordered(self, config: FusionConfig) -> tuple[Events, IntArray]:
+    def _order(self, config: FusionConfig) -> tuple[Events, IntArray]:
         """Events in their order, and that: of commands one for each group of axes that share a delay."""
         delay, rows, measured = self._delay(config), self.command_rows, self.measurement_rows
         parts, shift = list[Events](), list[IntArray]()
@@ -112,7 +112,7 @@ class Segment:
             codes = np.where(delay == group, rows.codes, np.uint8(ABSENT))
             parts.append(rows._replace(codes=codes).where(on_any_axis(codes, Outcome.FUSED)))
             shift.append(np.full(len(parts[-1].time), group))
-        unordered = joined([*parts, measured])
+        unordered = concatenate([*parts, measured])
         time = unordered.stamp + np.concatenate([*shift, -self._latency(config)[measured.source]])
         time[unordered.stamp == NO_STAMP] = NO_STAMP
         order = np.argsort(time, kind="stable")  # each source is in its order: commands, then the sensors'
@@ -128,7 +128,7 @@ class Segment:
         chosen = np.flatnonzero(rows.codes[:, number] == _FUSED)
         return rows.stamp.take(chosen), rows.value[:, number].take(chosen)
 
-    def led(self, arm: ArmModel, axis: str, time: TimeArray, model: AxisModel | None = None) -> FloatArray:
+    def response(self, arm: ArmModel, axis: str, time: TimeArray, model: AxisModel | None = None) -> FloatArray:
         """Where the commands lead an axis [m or rad], beyond its start, at ``time`` [int64 ns], (n,).
 
         Args:
@@ -142,12 +142,12 @@ class Segment:
 
     def rows_by_sensor(self) -> dict[str, Events]:
         """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
-        rows = self.measurement_rows._replace(value=self.unwrapped())  # one sensor after the other
+        rows = self.measurement_rows._replace(value=self.unwrap())  # one sensor after the other
         begin = np.searchsorted(rows.source, np.arange(len(self.sensors) + 1)).tolist()
         by_sensor = {name: rows.rows(slice(*ends)) for name, ends in zip(self.sensors, pairwise(begin), strict=True)}
         return {name: part for name, part in by_sensor.items() if len(part.time)}
 
-    def unwrapped(self) -> FloatArray:
+    def unwrap(self) -> FloatArray:
         """Values of ``measurement_rows`` without the jumps of a sensor that measures within a turn, (rows, A)."""
         rows = self.measurement_rows
         if not self.turn.any():
@@ -158,7 +158,7 @@ class Segment:
             value[rows_of_sensor, axis] = np.unwrap(value[rows_of_sensor, axis], period=float(self.turn[sensor, axis]))
         return value
 
-    def of_axis(self, axis: str, rows: IntArray) -> Segment:
+    def select_axis(self, axis: str, rows: IntArray) -> Segment:
         """The segment with one axis alone, and some of its measurements' ``rows``."""
         column = [self.axes.index(axis)]
         commands = np.flatnonzero(self.command_rows.codes[:, column[0]] == _FUSED)
@@ -169,10 +169,6 @@ class Segment:
             measurement_rows=self.measurement_rows.rows(rows).columns(column),
             turn=self.turn[:, column],
         )
-
-    def without_measurements(self) -> Segment:
-        """The segment with its commands alone: of a long run its measurements take as much memory as their results."""
-        return replace(self, measurement_rows=Events.empty(len(self.axes)))
 
     def highest_speed(self, axis: str, period: float) -> float:
         """Highest commanded speed on an axis [m/s or rad/s]."""
@@ -189,14 +185,14 @@ class Segment:
         time = time[on_any_axis(rows.codes, Outcome.FUSED)]
         return int(time[time <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
-    def asked(self, times: TimeArray, on_grid: bool) -> TimeArray | None:
+    def asking_times(self, times: TimeArray, on_grid: bool) -> TimeArray | None:
         """When a stream gives the estimates at ``times``, by the clock of arrivals [int ns], (n,); None without one.
 
         It does as each command comes, or ``on_grid`` just before the first event that is stamped later.
         """
         if not len(self.command_rows.arrival) + len(self.measurement_rows.arrival):
             return None
-        rows = joined([self.command_rows, self.measurement_rows])
+        rows = concatenate([self.command_rows, self.measurement_rows])
         if not on_grid:
             return rows.arrival.take(np.searchsorted(self.command_rows.stamp, times, side="right") - 1)
         order = np.argsort(rows.stamp)
@@ -209,7 +205,7 @@ class Segment:
         return np.rint(np.array(latency) * 1e9).astype(np.int64)
 
 
-def build(
+def build_segment(
     run: Run,
     config: FusionConfig,
     sensors: Iterable[str] | None = None,
@@ -229,16 +225,16 @@ def build(
     policy = _policy(config, run.axes, used)
     rows = _command_rows(run, policy, notes)
     unstamped = len(run.command.stamp) - len(rows.stamp)
-    command_counts = _command_counts(rows.rows(owned(rows.stamp, span)), unstamped)
+    command_counts = _command_counts(rows.rows(owned_rows(rows.stamp, span)), unstamped)
     rows = _on_ticks(run, config, rows, notes)
     used_rows = on_any_axis(rows.codes, Outcome.FUSED)
     origin = begun.origin if begun else int(rows.stamp[used_rows][0])
     ends = run.ends(origin)
     within = rows.stamp <= ends[1]
-    outside = int(np.count_nonzero((used_rows & ~within)[owned(rows.stamp, span)]))
+    outside = int(np.count_nonzero((used_rows & ~within)[owned_rows(rows.stamp, span)]))
     command_counts = nonzero(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
     commands, rows = rows.stamp[used_rows & within], rows.where(within)
-    notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
+    notes += _unmatched_notes([name for name in chosen if name not in run.sensors], strangers)
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
     late = [axis for axis, codes in zip(run.axes, rows.codes.T, strict=True) if _FUSED not in codes]
     if late and not begun:
@@ -248,9 +244,9 @@ def build(
     parts = [
         _measurement_rows(run, config, number, used, policy, rows, origin, span, notes) for number in range(len(used))
     ]
-    measured = joined([Events.empty(len(run.axes)), *(part for part, _ in parts)])
+    measured = concatenate([Events.empty(len(run.axes)), *(part for part, _ in parts)])
     counts = {
-        name: {NOT_SELECTED: len(sensor.stamp[owned(sensor.stamp, span)])} for name, sensor in run.sensors.items()
+        name: {NOT_SELECTED: len(sensor.stamp[owned_rows(sensor.stamp, span)])} for name, sensor in run.sensors.items()
     }
     counts |= {name: held for name, (_, held) in zip(used, parts, strict=True)}
     if run.interval and span == WHOLE and not (measured.codes == _FUSED).any():
@@ -305,7 +301,7 @@ def _grid(origin: int, first: int, last: int, rate: float) -> TimeArray:
     return grid[(grid >= first) & (grid <= last)]
 
 
-def as_commanded(run: Run, config: FusionConfig) -> Source:
+def believed_commands(run: Run, config: FusionConfig) -> Source:
     """The rows of a run's commands as they are believed: as logged, or where the run says so on the grid of T."""
     if run.clock == "stamps":
         return run.command
@@ -343,7 +339,7 @@ def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -
     return filter_model(config, axes, sensors, dict.fromkeys(axes, 0.0))
 
 
-def _unmatched(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:
+def _unmatched_notes(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:
     """A sentence on each configured sensor that the run does not have: one of another name may be the same."""
     unmatched: list[str] = []
     for name in silent:
@@ -362,7 +358,7 @@ def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
     note_rows(notes, label, missing, "no stamp: not used")
     note_rows(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
     order = in_order(source.stamp, int(np.count_nonzero(missing)))
-    rows = _table(source, run.axes, order, COMMAND)
+    rows = _build_table(source, run.axes, order, COMMAND)
     if len(rows.arrival):  # what is sent again is there from the first time on
         again = (np.diff(rows.stamp) == 0) & (np.diff(np.nan_to_num(rows.value), axis=0) == 0.0).all(axis=1)
         first = np.maximum.accumulate(np.where(np.append(False, again), 0, np.arange(len(rows.stamp))))
@@ -393,7 +389,7 @@ def _command_counts(rows: Events, unstamped: int) -> dict[str, int]:
     }
 
 
-def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+def sum_counts(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """The sums of several counts."""
     return dict(sum(map(Counter[str], counts), Counter[str]()))
 
@@ -433,14 +429,14 @@ def _measurement_rows(
     lag, missing = np.where(used, behind(source.stamp), 0), used & (source.stamp == NO_STAMP)
     order = in_order(source.stamp)
     latency = 0 if sensor is None else round(sensor.latency * 1e9)
-    rows = _table(source, run.axes, order, number, latency)
+    rows = _build_table(source, run.axes, order, number, latency)
     rows = rows._replace(codes=classify(policy, rows, origin, lag[order] > TOLERATED_STEP_BACK_NS))
     rows.codes[~used[order]] = ABSENT
     if sensor is not None:
-        notes += _hold(rows, commands, config, name, label, run.axes, origin)
+        notes += _mark_held(rows, commands, config, name, label, run.axes, origin)
     kept = rows.where(used[order])
-    stamps = source.stamp[owned(_valid(source.stamp, latency), span)]
-    counts = _measurement_counts(kept.rows(owned(kept.time, span)), stamps)
+    stamps = source.stamp[owned_rows(_valid(source.stamp, latency), span)]
+    counts = _measurement_counts(kept.rows(owned_rows(kept.time, span)), stamps)
     note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
     if sensor is None:
         note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
@@ -461,7 +457,7 @@ def _measurement_rows(
     return kept, counts
 
 
-def _hold(
+def _mark_held(
     rows: Events, commands: Events, config: FusionConfig, name: str, label: str, axes: Sequence[str], origin: int
 ) -> list[str]:
     """Mark what one sensor says again and again as held; a sentence on each axis where it does."""
@@ -499,7 +495,9 @@ def _measurement_counts(kept: Events, stamp: TimeArray) -> dict[str, int]:
     return nonzero({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(stamp) - unstamped - len(best)})
 
 
-def _table(source: Source, axes: tuple[str, ...], order: IntArray | slice, number: int, latency: int = 0) -> Events:
+def _build_table(
+    source: Source, axes: tuple[str, ...], order: IntArray | slice, number: int, latency: int = 0
+) -> Events:
     """Rows of a source in an order, everything that it gives for the filter to decide on."""
     stamp = source.stamp[order].copy()
     shape = len(stamp), len(axes)
@@ -528,7 +526,7 @@ def on_any_axis(codes: CodeArray, kind: Outcome) -> BoolArray:
     return reduce(np.logical_or, (codes == int(kind)).T)
 
 
-def owned(time: TimeArray, span: tuple[int, int]) -> IntArray | slice:
+def owned_rows(time: TimeArray, span: tuple[int, int]) -> IntArray | slice:
     """Which rows of a piece are its own: those without a stamp too, which no other piece has."""
     if span == WHOLE:
         return slice(None)

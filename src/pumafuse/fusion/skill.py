@@ -84,14 +84,14 @@ def skill(est: Estimates, measured: Measurements) -> Skill | None:
         parts = [replace(part, value=np.unwrap(part.value, period=turn)) for part in parts]
     return Skill(
         predictions=sum(len(part.value) - 1 for part in parts),
-        last_held=_summed_up(np.concatenate([np.diff(part.value) for part in parts])),
-        constant_velocity=_summed_up(_by_constant_velocity(parts)),
-        command_alone=_summed_up(np.concatenate([_by_command(est, sensor, axis, part) for part in parts])),
-        filter=_summed_up(np.concatenate([part.innovation[1:] for part in parts])),
+        last_held=_summarise(np.concatenate([np.diff(part.value) for part in parts])),
+        constant_velocity=_summarise(_by_constant_velocity(parts)),
+        command_alone=_summarise(np.concatenate([_by_command(est, sensor, axis, part) for part in parts])),
+        filter=_summarise(np.concatenate([part.innovation[1:] for part in parts])),
     )
 
 
-def _summed_up(error: FloatArray) -> PredictionError:
+def _summarise(error: FloatArray) -> PredictionError:
     return PredictionError(rms=float(np.sqrt(error @ error / len(error))), median=median(np.abs(error)))
 
 
@@ -99,7 +99,7 @@ def _by_command(est: Estimates, sensor: str, axis: str, measured: Measurements) 
     """Measurements of one segment less what the commands say of them [m or rad], without the first, (n - 1,)."""
     configured, segment = est.config.sensors[sensor], est.segments[int(measured.segment[0])]
     time = est.origin + nanoseconds(measured.time)
-    left = measured.value - configured.scale * (segment.start[axis] + segment.led(est.config.arm, axis, time))
+    left = measured.value - configured.scale * (segment.start[axis] + segment.response(est.config.arm, axis, time))
     if turn := turn_of(est.config, sensor, axis):
         left = left - turn * round(float(left[0]) / turn)
     if configured.bias_sd_of(axis) == 0.0:

@@ -270,7 +270,7 @@ def summary_of(est: Estimates, axes: dict[str, AxisSummary], orientation: Orient
     )
 
 
-def beaten(axes: Mapping[str, AxisSummary]) -> list[str]:
+def beaten_notes(axes: Mapping[str, AxisSummary]) -> list[str]:
     """A sentence on each sensor on an axis whose next measurement a simpler way predicts better than the filter."""
     sentences = list[str]()
     for axis, part in axes.items():
@@ -295,18 +295,18 @@ def weighted_mean(values: Sequence[float | None], weights: Sequence[int]) -> flo
     return sum(value * weight for value, weight in pairs) / total if total else None
 
 
-def pooled(parts: Sequence[P], weights: Sequence[int]) -> P | None:
+def pool(parts: Sequence[P], weights: Sequence[int]) -> P | None:
     """Scores of several runs, or of pieces of one, as one: counts are summed, errors weighted; None without any."""
     if not parts:
         return None
     keys = parts[0].__struct_fields__
-    return type(parts[0])(**{key: pooled_number(key, [getattr(part, key) for part in parts], weights) for key in keys})
+    return type(parts[0])(**{key: pool_number(key, [getattr(part, key) for part in parts], weights) for key in keys})
 
 
-def pooled_number(key: str, values: Sequence[Any], weights: Sequence[int]) -> Any:
+def pool_number(key: str, values: Sequence[Any], weights: Sequence[int]) -> Any:
     """A field of several scores as one: a root mean square by the squares, any other by its mean."""
     if isinstance(values[0], msgspec.Struct):
-        return pooled(values, weights)
+        return pool(values, weights)
     if isinstance(values[0], int):
         return sum(values)
     power = 2 if key in _OF_SQUARES else 1

@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import BoolArray, FloatArray
 from ..model.arm import Validity
 from ..units import MM, SCREEN, Kind, of_kind
-from .estimate import weighted
+from .estimate import fit_weighted
 from .trials import Trial
 
 _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
@@ -100,7 +100,7 @@ def numbers(cells: Sequence[str]) -> list[float] | None:
     return numbers if np.isfinite(numbers).all() else None
 
 
-def ordered(levels: set[str]) -> list[str]:
+def order_levels(levels: set[str]) -> list[str]:
     """Levels by number where they are numbers, else by name."""
     if numbers(list(levels)) is None:
         return sorted(levels)
@@ -127,7 +127,7 @@ def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Se
     dependences = list[Dependence]()
     for (coefficient, values), factor in product(coefficients.items(), factors):
         groups = list(_groups(values, factors[factor]).values())
-        by_welch, adjusted, ratio, p = welch(groups), _adjusted(values, factor, factors), None, None
+        by_welch, adjusted, ratio, p = welch(groups), _adjusted_p(values, factor, factors), None, None
         if any(np.ptp(group) > 0.0 for group in groups):
             test = f_oneway(*groups)
             ratio = float(test.statistic / f.ppf(0.95, len(groups) - 1, len(values) - len(groups)))
@@ -225,7 +225,7 @@ def validity(performance: Sequence[Performance], fastest: float, kind: Kind) -> 
 def _groups(values: FloatArray, cells: Sequence[str]) -> dict[str, FloatArray]:
     """Values by level, in the order of the levels."""
     named = np.array(cells)
-    return {level: values[named == level] for level in ordered(set(cells))}
+    return {level: values[named == level] for level in order_levels(set(cells))}
 
 
 def _replicate_sd(trials: Sequence[Trial], values: FloatArray) -> float | None:
@@ -239,10 +239,12 @@ def _replicate_sd(trials: Sequence[Trial], values: FloatArray) -> float | None:
     return float(np.sqrt(squares / freedom)) if freedom else None
 
 
-def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
+def _adjusted_p(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
     """P of one factor in a model with all of them (main effects)."""
     without = {name: cells for name, cells in factors.items() if name != factor}
-    full, reduced = (weighted(values, np.ones(len(values)), _design(values, columns)) for columns in (factors, without))
+    full, reduced = (
+        fit_weighted(values, np.ones(len(values)), _design(values, columns)) for columns in (factors, without)
+    )
     if full.freedom < 1 or full.freedom == reduced.freedom or full.squares <= 1e-24 * float(values @ values):
         return None
     return full.p_against(reduced)
@@ -252,7 +254,7 @@ def _design(values: FloatArray, factors: Mapping[str, Sequence[str]]) -> FloatAr
     """A one, and for each factor a column for each level but its first, (n, k)."""
     columns = [np.ones(len(values))]
     for cells in factors.values():
-        columns.extend(np.array(cells) == level for level in ordered(set(cells))[1:])
+        columns.extend(np.array(cells) == level for level in order_levels(set(cells))[1:])
     return np.column_stack(columns).astype(np.float64)
 
 

@@ -110,12 +110,12 @@ class Batch:
         score = np.einsum("kij,ij->ik", slopes[1:], at.residual) - coupling * gradient[:, None]
         return Equations(gradient / squares, coupling, information, score, delay_sd)
 
-    def stepped(self, at: Point, order: Order, damping: FloatArray, low: FloatArray, high: FloatArray) -> Point:
+    def step(self, at: Point, order: Order, damping: FloatArray, low: FloatArray, high: FloatArray) -> Point:
         """After a step of each group of rows, whose ``damping`` is (R / size,), between ``low`` and ``high`` (3,)."""
         size = len(at.shape) // len(damping)
         slopes, _ = self.slopes(at, order)
         equations = self.equations(at, slopes, np.repeat(damping, size))
-        information, score = _grouped(equations.information, size), _grouped(equations.score, size)
+        information, score = _sum_groups(equations.information, size), _sum_groups(equations.score, size)
         plant = _damped_step(at.shape[::size, 1:], information, score, damping)
         plant = np.clip(np.repeat(plant, size, axis=0), low[1:], high[1:])
         plant[:, 0] = np.maximum(plant[:, 0], 0.2 * at.shape[:, 1])
@@ -137,9 +137,9 @@ class Batch:
 
         for _ in range(_ITERATIONS):
             here, at = self.take(rows), Point(*(whole[rows] for whole in point))
-            new = here.stepped(at, order, damping, low, high)
-            cost = _grouped(at.cost, size)
-            decrease = cost - _grouped(new.cost, size)
+            new = here.step(at, order, damping, low, high)
+            cost = _sum_groups(at.cost, size)
+            decrease = cost - _sum_groups(new.cost, size)
             better = decrease >= 0.0
             damping = np.where(better, np.maximum(0.2 * damping, 1e-12), 8.0 * damping)
             going = np.where(better, decrease > _CONVERGED * cost, damping < _MOST_DAMPING)
@@ -171,7 +171,7 @@ def _response(time: FloatArray, shape: FloatArray) -> FloatArray:
     return unit_response(time - shape[:, :1], shape[:, 1:2], shape[:, 2:])
 
 
-def _grouped(values: FloatArray, size: int) -> FloatArray:
+def _sum_groups(values: FloatArray, size: int) -> FloatArray:
     """Sums over each ``size`` rows, (R / size, ...)."""
     return values.reshape(-1, size, *values.shape[1:]).sum(axis=1)
 

@@ -16,10 +16,10 @@ from ..arrays import FloatArray
 from ..model.arm import AxisModel, Gain
 from ..model.plants import PLANTS, FirstOrder
 from ..units import MS, SCREEN, Kind
-from .anova import ordered, outlying, speed_levels
+from .anova import order_levels, outlying, speed_levels
 from .batch import Order
-from .estimate import Estimate, common, mean, regression, robust, weighted
-from .fit import StepFit, doubt, least_p, plant_of
+from .estimate import Estimate, common, fit_weighted, mean, regression, robust
+from .fit import StepFit, doubt_words, least_p, plant_of
 from .joint import JointFit, fit_together, inverse_square
 from .paper import minimise
 from .trials import Trial
@@ -113,13 +113,13 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool, kind: Kind) ->
     usual = usual_gain(fitted)
     if usual == 0.0:
         return "the arm does not move"
-    left_out = _unseen(fitted) if paper else _outlying(fitted)
-    left_out |= {fit.trial.name: why for fit in fitted if (why := doubt(fit.first, usual)) is not None}
+    left_out = _find_unseen(fitted) if paper else _outlying(fitted)
+    left_out |= {fit.trial.name: why for fit in fitted if (why := doubt_words(fit.first, usual)) is not None}
     used = [fit for fit in fitted if fit.trial.name not in left_out]
     if len(used) < _FEWEST:
         why = "; ".join(f"trial '{name}' {reason}" for name, reason in list(left_out.items())[:3])
         return f"{len(used)} usable trials, at least {_FEWEST} are needed" + (f" ({why})" if why else "")
-    published = _published(used, kind) if paper else _fitted_together(used, kind)
+    published = _combine_as_published(used, kind) if paper else _fit_together(used, kind)
     gain, lack, words = _gain_line(published, period, kind)
     delay = common(published.delay, published.delay_sd)
     tau = np.array([fit.first.shape.q for fit in used])
@@ -163,7 +163,7 @@ def coefficients(fitted: Sequence[Fitted]) -> dict[str, tuple[FloatArray, FloatA
     return {name: (values[:, number] * unit, sds[:, number] * unit) for name, (number, unit) in scales.items()}
 
 
-def _unseen(fitted: Sequence[Fitted]) -> dict[str, str]:
+def _find_unseen(fitted: Sequence[Fitted]) -> dict[str, str]:
     """Trials whose window ends before the arm is seen to move."""
     unseen = [fit.trial.name for fit in fitted if not fit.onset < fit.trial.time[-1]]
     return dict.fromkeys(unseen, "not seen to move within the window")
@@ -180,7 +180,7 @@ def _outlying(fitted: Sequence[Fitted]) -> dict[str, str]:
     return reasons
 
 
-def _fitted_together(used: Sequence[Fitted], kind: Kind) -> Common:
+def _fit_together(used: Sequence[Fitted], kind: Kind) -> Common:
     """The common plant by least squares over all trials, and delays and gains under it."""
     trials, fits = [fit.trial for fit in used], [fit.second for fit in used]
     joints: tuple[JointFit, JointFit] = (fit_together(trials, fits, 1), fit_together(trials, fits, 2))
@@ -207,7 +207,7 @@ def _fitted_together(used: Sequence[Fitted], kind: Kind) -> Common:
     )
 
 
-def _published(used: Sequence[Fitted], kind: Kind) -> Common:
+def _combine_as_published(used: Sequence[Fitted], kind: Kind) -> Common:
     """The paper's combination: averages of what was read off and of τ; equation 10 over all trials for ω and ζ."""
     trials, n = [fit.trial for fit in used], len(used)
     count = sum(fit.first.samples for fit in used)
@@ -306,7 +306,7 @@ def _gain_line(together: Common, period: float, kind: Kind) -> tuple[Gain, float
     """K = a·speed + b with intervals, the p of its lack of fit, and what the line shows."""
     speed = np.array([trial.speed_at(period) for trial in together.trials])
     levels = speed_levels(together.trials, period, kind)
-    distinct = ordered(set(levels))
+    distinct = order_levels(set(levels))
     if len(distinct) == 1 or len(speed) < 4:
         level = common(together.gain, together.gain_sd)
         why = (
@@ -323,6 +323,6 @@ def _gain_line(together: Common, period: float, kind: Kind) -> tuple[Gain, float
     if not 2 < len(distinct) < len(speed):
         return gain, None, words
     at_levels = np.array(levels)[:, None] == np.array(distinct)
-    apart = weighted(together.gain, line.weights, at_levels.astype(np.float64))
+    apart = fit_weighted(together.gain, line.weights, at_levels.astype(np.float64))
     lack = apart.p_against(line)  # of the hypothesis that the means of all levels lie on the line
     return gain, lack, words + ("; not along a straight line" if lack < 0.05 else "")

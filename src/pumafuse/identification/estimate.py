@@ -99,7 +99,7 @@ def regression(values: FloatArray, sd: FloatArray, design: FloatArray) -> Line:
         sd = np.zeros(len(values))  # the noise does not distinguish the trials: equal weights
 
     def fitted(between: float) -> Line:
-        return weighted(values, 1.0 / (sd**2 + between**2 + least**2), design)
+        return fit_weighted(values, 1.0 / (sd**2 + between**2 + least**2), design)
 
     def excess(between: float) -> float:
         estimate = fitted(between)
@@ -109,7 +109,7 @@ def regression(values: FloatArray, sd: FloatArray, design: FloatArray) -> Line:
     return fitted(float(brentq(excess, 0.0, widest)) if excess(0.0) > 0.0 > excess(widest) else 0.0)
 
 
-def weighted(values: FloatArray, weights: FloatArray, design: FloatArray) -> Line:
+def fit_weighted(values: FloatArray, weights: FloatArray, design: FloatArray) -> Line:
     """Weighted least squares of values (n,) by a design (n, k), whose columns may depend on one another."""
     root = np.sqrt(weights)
     inverse = np.linalg.pinv(design * root[:, None])

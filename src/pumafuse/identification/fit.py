@@ -123,14 +123,14 @@ def fit_steps(trials: Sequence[Trial]) -> list[tuple[StepFit, StepFit]]:
     """
     batch = Batch.of(trials, [1.0 / abs(trial.step) for trial in trials])
     starts = np.stack([_starts(trial) for trial in trials], axis=2)
-    first = _search(batch, 1, starts[0])
-    second = _search(batch, 2, np.concatenate((first[None], starts[1])))
+    first = _fit_best(batch, 1, starts[0])
+    second = _fit_best(batch, 2, np.concatenate((first[None], starts[1])))
     return [
         (_fit(trial, start, 1), _fit(trial, two, 2)) for trial, start, two in zip(trials, first, second, strict=True)
     ]
 
 
-def doubt(fit: StepFit, usual: float) -> str | None:
+def doubt_words(fit: StepFit, usual: float) -> str | None:
     """Why a trial tells nothing of its axis, whose median gain is ``usual``; None where it does."""
     moved = fit.gain * fit.reached
     if usual == 0.0 or moved / usual < _MOVES:
@@ -142,7 +142,7 @@ def doubt(fit: StepFit, usual: float) -> str | None:
 
 def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
     """What a user should know before trusting a fit; ``usual`` is the median gain of its axis."""
-    useless = doubt(fit, usual)
+    useless = doubt_words(fit, usual)
     flags = [] if useless is None else [useless]
     if fit.reached < _SETTLED:
         flags.append(f"not settled: {fit.reached:.0%} reached")
@@ -153,7 +153,7 @@ def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
     return flags
 
 
-def _search(batch: Batch, order: Order, starts: FloatArray) -> FloatArray:
+def _fit_best(batch: Batch, order: Order, starts: FloatArray) -> FloatArray:
     """The best shape of each row (R, 3), from several starts (s, R, 3); the first of those that are alike."""
     rows = np.arange(len(batch.time))
     every, flat = batch.take(np.tile(rows, len(starts))), starts.reshape(-1, 3)
@@ -165,7 +165,7 @@ def _search(batch: Batch, order: Order, starts: FloatArray) -> FloatArray:
 
 def _starts(trial: Trial) -> FloatArray:
     """The best cells of a grid for one trial, of either order and each of another delay, (2, s, 3)."""
-    measured, span = _measured(trial), float(trial.time[-1])
+    measured, span = _to_recording(trial), float(trial.time[-1])
     spacing = span / min(int(np.count_nonzero(trial.time > 0.0)), _MOST_DELAYS)
     delays: list[float] = np.arange(0.0, 0.8 * span, spacing).tolist()
     lags: list[float] = np.geomspace(0.5 * spacing, span, _LAGS).tolist()
@@ -181,7 +181,7 @@ def _starts(trial: Trial) -> FloatArray:
     return np.array(starts)
 
 
-def _measured(trial: Trial) -> Measured:
+def _to_recording(trial: Trial) -> Measured:
     """A trial as the search for arms takes it: a recording of one command, in steps; its zero is free."""
     n, value = len(trial.time), trial.position / trial.step
     time, source = np.rint(trial.time * 1e9).astype(np.int64), np.zeros(n, dtype=np.int64)
@@ -202,10 +202,10 @@ def _fit(trial: Trial, numbers: FloatArray, order: Order) -> StepFit:
     freedom = max(len(time) - len(fitted), 1)
     covariance = np.zeros((5, 5))
     covariance[np.ix_(fitted, fitted)] = inverse(jacobian) * (rms**2 * len(time) / freedom)
-    return StepFit(order, shape, gain, zero, rms, len(time), covariance, reached(time, shape), len(fitted))
+    return StepFit(order, shape, gain, zero, rms, len(time), covariance, share_reached(time, shape), len(fitted))
 
 
-def reached(time: FloatArray, shape: Shape) -> float:
+def share_reached(time: FloatArray, shape: Shape) -> float:
     """Share of its final value that a response has reached with the last sample."""
     return float(unit_response(np.array(time[-1] - shape.delay), shape.q, shape.p))
 

@@ -202,7 +202,7 @@ def identify(
     }
     validity = anova.validity(performance, fastest, kind)
     return Identification(
-        arm=_rounded(msgspec.structs.replace(arm, validity=validity, provenance=provenance)),
+        arm=_round(msgspec.structs.replace(arm, validity=validity, provenance=provenance)),
         method="published" if paper else "fitted",
         samples=samples,
         tolerance=tolerance,
@@ -279,7 +279,7 @@ def _arm(
     return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=models), words
 
 
-def _rounded(arm: ArmModel) -> ArmModel:
+def _round(arm: ArmModel) -> ArmModel:
     """The arm in six digits of the file's units: more would suggest a precision that it has not."""
     text = json.dumps(units.from_si(msgspec.to_builtins(arm)), default=float)
     tree = json.loads(text, parse_float=lambda number: float(f"{float(number):.{_DIGITS}g}"))

@@ -125,14 +125,14 @@ def inverse_square(first: JointFit, second: JointFit) -> Estimate:
 def _influence(equations: Equations) -> tuple[FloatArray, FloatArray]:
     """Influence of each trial (n, 2) and its covariance by the noise (n, 2, 2); see :class:`JointFit`."""
     n, k = equations.score.shape
-    corrected = n * _corrected(equations.information)
+    corrected = n * _correct(equations.information)
     influence, expected = np.zeros((n, 2)), np.zeros((n, 2, 2))
     influence[:, :k] = np.einsum("ijk,ik->ij", corrected, equations.score)
     expected[:, :k, :k] = corrected @ equations.information @ corrected.swapaxes(1, 2)
     return influence, expected
 
 
-def _corrected(information: FloatArray) -> FloatArray:
+def _correct(information: FloatArray) -> FloatArray:
     """H^(−1/2) (I − h)^(−1/2) H^(−1/2) of each trial's information, h its share of H (HC2), (n, k, k)."""
     diagonal = np.einsum("nii->i", information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, np.inf))

@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..model.plants import unit_response
 from .batch import sensitivity
-from .fit import Shape, StepFit, inverse, reached
+from .fit import Shape, StepFit, inverse, share_reached
 from .trials import Trial
 
 _REST = 5  # samples of the rest level, at least
@@ -42,7 +42,7 @@ def fit_as_published(trial: Trial, fitted: StepFit) -> StepFit:
     covariance, free = np.zeros((5, 5)), slice(1, order + 1)  # what is read off has no interval of its own
     changes = [height * change[0] for change in sensitivity(trial.time[None], np.array([shape]), order)[1:]]
     covariance[free, free] = inverse(np.column_stack(changes)) * squares / max(n - order, 1)
-    end = reached(trial.time, shape)
+    end = share_reached(trial.time, shape)
     return replace(read, shape=shape, rms=float(np.sqrt(squares / n)), covariance=covariance, reached=end)
 
 

@@ -125,7 +125,7 @@ class StepTrials:
         listed, sampled = _table(Path(folder), "trials"), _table(Path(folder), "samples")
         notes = [*listed.notes, *sampled.notes]
         kind = _kind(listed, sampled)
-        step = _noted(listed.numbers(_column(listed, "step")), notes)
+        step = _read_column(listed.numbers(_column(listed, "step")), notes)
         speed, speed_column = _speed(listed, kind, notes)
         names, axes = listed.texts("trial"), listed.texts("axis")
         described = {"trial", "axis", speed_column, _column(listed, "step")}
@@ -185,21 +185,21 @@ def _table(folder: Path, stem: str) -> tables.Table:
     raise RunError(f"{folder}: no {stem}.csv (or .csv.gz, .parquet) in it")
 
 
-def _named(table: tables.Table, stem: str) -> list[str]:
+def _find_columns(table: tables.Table, stem: str) -> list[str]:
     """The columns of this name with any unit."""
     return [name for name in table.columns if name.removesuffix(ending(name) or "") == stem]
 
 
 def _column(table: tables.Table, stem: str) -> str:
     """The first column of this name with any unit."""
-    if named := _named(table, stem):
+    if named := _find_columns(table, stem):
         return named[0]
     raise RunError(f"{table.path}: no column '{stem}' with a unit in its name; it has {', '.join(table.columns)}")
 
 
 def _kind(listed: tables.Table, sampled: tables.Table) -> Kind:
     """The kind of the axes, of which all columns of steps, speeds and positions must be."""
-    columns = [*_named(listed, "step"), *_named(listed, "speed"), *_named(sampled, "position")]
+    columns = [*_find_columns(listed, "step"), *_find_columns(listed, "speed"), *_find_columns(sampled, "position")]
     length, angle = (
         next((name for name in columns if ending(name) in (*OF_KIND[kind], *SPEEDS[kind])), None) for kind in KINDS
     )
@@ -213,13 +213,13 @@ def _kind(listed: tables.Table, sampled: tables.Table) -> Kind:
 
 def _speed(listed: tables.Table, kind: Kind, notes: list[str]) -> tuple[FloatArray, str | None]:
     """The speed of each trial [m/s or rad/s], NaN where it is not recorded, and its column."""
-    column = next((name for name in _named(listed, "speed") if ending(name) in SPEEDS[kind]), None)
+    column = next((name for name in _find_columns(listed, "speed") if ending(name) in SPEEDS[kind]), None)
     if column is None:
         return np.full(listed.rows, np.nan), None
-    return si_of(_noted(listed.plain(column), notes), ending(column) or ""), column
+    return si_of(_read_column(listed.plain(column), notes), ending(column) or ""), column
 
 
-def _noted(column: tuple[Any, str | None], notes: list[str]) -> Any:
+def _read_column(column: tuple[Any, str | None], notes: list[str]) -> Any:
     """The values of a column; its note goes to ``notes``."""
     notes.extend(note for note in column[1:] if note)
     return column[0]
@@ -227,8 +227,8 @@ def _noted(column: tuple[Any, str | None], notes: list[str]) -> Any:
 
 def _samples(table: tables.Table, notes: list[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Times [s] and positions [m or rad] of each trial, in the order of the file."""
-    time = seconds(_noted(table.stamps(_column(table, "time")), notes))
-    position = _noted(table.numbers(_column(table, "position")), notes)
+    time = seconds(_read_column(table.stamps(_column(table, "time")), notes))
+    position = _read_column(table.numbers(_column(table, "position")), notes)
     rows: defaultdict[str, list[int]] = defaultdict(list)
     for row, name in enumerate(table.texts("trial")):
         rows[name].append(row)

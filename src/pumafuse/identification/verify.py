@@ -20,7 +20,7 @@ from ..errors import ConfigError, RunError
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig, Sensor
 from ..fusion.overruns import overrun_notes, overruns
-from ..fusion.segments import build
+from ..fusion.segments import build_segment
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import REFERENCE, Run
@@ -167,7 +167,7 @@ def verify(
         PumafuseError: The run has no such sensor, commands an axis that the arm has not, or nothing to compare with.
     """
     names = (sensors,) if isinstance(sensors, str) else sensors
-    chosen = _with_sources(run, None if names is None else tuple(names))
+    chosen = _select_sources(run, None if names is None else tuple(names))
     config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
     parts, jumps = segments(in_axes(chosen.delayed(arm), None)[0])
     results: list[tuple[AxisVerification, Trace]] = []
@@ -184,7 +184,7 @@ def verify(
 
 def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[AxisVerification, Trace]]:
     """Every axis and source of one segment of a run."""
-    segment, arm = build(run, config), config.arm
+    segment, arm = build_segment(run, config), config.arm
     rows, part = segment.measurement_rows, list[tuple[AxisVerification, Trace]]()
     for number, axis in enumerate(segment.axes):
         told_at, command = segment.commands_of(axis)
@@ -199,11 +199,11 @@ def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[Ax
             counts = {"used" if word == Outcome.FUSED.word else word: n for word, n in segment.counts[source].items()}
             notes = [*jumps, *segment.notes, *overrun_notes([overruns(segment, arm)], arm, segment.origin)]
             counted = {"commands": dict(segment.command_counts), "rows": counts}
-            part.append(_verified(measured, run, axis, arm, counted, [] if part else notes))
+            part.append(_verify_axis(measured, run, axis, arm, counted, [] if part else notes))
     return part
 
 
-def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
+def _select_sources(run: Run, sensors: Sequence[str] | None) -> Run:
     """The run with only the sources that it is verified against, as sensors."""
     sources = dict(run.sensors)
     if run.reference is not None:
@@ -215,7 +215,7 @@ def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
     return replace(run, sensors={name: sources[name] for name in sensors}, reference=None)
 
 
-def _verified(
+def _verify_axis(
     measured: Measured, run: Run, axis: str, arm: ArmModel, counted: Mapping[str, dict[str, int]], notes: list[str]
 ) -> tuple[AxisVerification, Trace]:
     """One axis of a run by one source, of which the rows are ``counted``."""
@@ -224,9 +224,9 @@ def _verified(
     farthest = abs(measured.recordings[0].start) + np.abs(measured.responses(configured)[0]).max()
     if not (farthest <= _FARTHEST and configured.lag <= _SLOWEST):  # also where it is not a number
         raise ConfigError(f"axis '{axis}': a start level, gain or plant of no size that an arm has")
-    measured, start_from = _started(measured, configured, axis in run.start)
+    measured, start_from = _set_start(measured, configured, axis in run.start)
     count = len(measured.recordings[0].time)
-    measured = _without_spikes(measured, configured)
+    measured = _drop_spikes(measured, configured)
     (recording,), (modelled,) = measured.recordings, measured.responses(configured)
     as_it_is, recovering = model_fit(measured, configured), model_fit(measured, configured._replace(recovery=recovery))
     best = best_in_class(measured, configured)
@@ -260,7 +260,7 @@ def _verified(
     return verification, trace
 
 
-def _started(measured: Measured, arm: Arm, is_given: bool) -> tuple[Measured, str]:
+def _set_start(measured: Measured, arm: Arm, is_given: bool) -> tuple[Measured, str]:
     """The run from its level before the first command, and where that comes from."""
     (recording,) = measured.recordings
     levels = np.unique(recording.command)
@@ -274,7 +274,7 @@ def _started(measured: Measured, arm: Arm, is_given: bool) -> tuple[Measured, st
     return best, f"chosen among the run's {len(levels)} levels by RMS"
 
 
-def _without_spikes(measured: Measured, arm: Arm) -> Measured:
+def _drop_spikes(measured: Measured, arm: Arm) -> Measured:
     """The run without measurements that jump away from their neighbours, whatever the model.
 
     A model that is wrong for a while must not be spared: only eight robust standard deviations from the running

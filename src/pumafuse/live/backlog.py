@@ -44,8 +44,8 @@ class Backlog(Generic[T]):
         """How many were shed, for the end of a sentence."""
         return f", {self.shed} shed" if self.shed else ""
 
-    def append(self, now: float, item: T) -> None:
-        """Let an item wait that has come at ``now`` [s]."""
+    def add(self, now: float, item: T) -> None:
+        """Add an item that has come at ``now`` [s]."""
         self.received += 1
         self._waiting.append((now, item))
         self._bytes += _size(item)

@@ -101,9 +101,9 @@ class Clock:
             return False
         if not self.newest - self.window <= stamp <= self.newest + LONGEST_TAIL_NS:
             return False
-        return self._agrees(stamp, source, self._commands + (source is None))
+        return self._is_agreed(stamp, source, self._commands + (source is None))
 
-    def _agrees(self, stamp: int, source: str | None, commands: int) -> bool:
+    def _is_agreed(self, stamp: int, source: str | None, commands: int) -> bool:
         return commands >= 2 or (source == self.ahead_of and stamp - self._jumped >= LEAST_NS)
 
     def start(self, stamp: int) -> None:
@@ -137,7 +137,7 @@ class Clock:
             self.low, self.high = 1, 0
         self._commands += command
         self.newest = max(self.newest, stamp)
-        if self._sure is None or self._agrees(stamp, source, self._commands):
+        if self._sure is None or self._is_agreed(stamp, source, self._commands):
             self.settle(self.newest)
         return Verdict.ACCEPTED
 
@@ -168,8 +168,8 @@ class _Source:
     at: int = ALWAYS  # the newest stamp then [ns]
     told: int = 0  # the ``since`` that was told of
 
-    def take(self, stamp: int, event: int) -> None:
-        """Take the stamp [ns] of the next row, which is the ``event``-th of all."""
+    def add(self, stamp: int, event: int) -> None:
+        """Add the stamp [ns] of the next row, which is the ``event``-th of all."""
         step, self.last, self.event = stamp - self.last, stamp, event
         if stamp > self.newest:
             if 0 < step <= _MOST * self.usual:
@@ -188,11 +188,11 @@ class _Source:
             self.in_a_row = 0
         self.in_order = 0
 
-    def went_on(self, since: int) -> bool:
+    def has_gone_on(self, since: int) -> bool:
         """Whether its last row, since an event, is its newest."""
         return self.event >= since and self.last == self.newest
 
-    def went_back(self, since: int) -> bool:
+    def has_gone_back(self, since: int) -> bool:
         """Whether its last row, since an event, is behind its newest; or before it, if it goes on behind."""
         return self.last < self.newest and (self.event >= since or self.in_a_row > 0)
 
@@ -212,11 +212,11 @@ class SetBack:
         """Begin anew by another clock."""
         self._sources, self._events = [_Source() for _ in range(self._count + 1)], 0
 
-    def take(self, source: int, stamp: int) -> bool:
-        """Take the stamp [ns] of the next event of ``COMMAND`` or a sensor; whether it is worth to ask for more."""
+    def add(self, source: int, stamp: int) -> bool:
+        """Add the stamp [ns] of the next event of ``COMMAND`` or a sensor; whether it is worth to ask for more."""
         self._events += 1
         clock, commands = self._sources[source], self._sources[-1]
-        clock.take(stamp, self._events)
+        clock.add(stamp, self._events)
         return clock.in_a_row > 0 or commands.in_a_row > 0
 
     @property
@@ -227,15 +227,15 @@ class SetBack:
     def of_all(self) -> float:
         """By how much all clocks were set back [ns], once that shows; else 0."""
         *sensors, commands = self._sources
-        went_on = any(sensor.went_on(commands.since) and commands.back > sensor.usual > 0.0 for sensor in sensors)
-        went_back = any(sensor.went_back(commands.since) for sensor in sensors)
+        went_on = any(sensor.has_gone_on(commands.since) and commands.back > sensor.usual > 0.0 for sensor in sensors)
+        went_back = any(sensor.has_gone_back(commands.since) for sensor in sensors)
         shows = commands.in_a_row >= (_COMMANDS if went_back else _ALONE) and not went_on
         return commands.back if shows else 0.0
 
     def of_sensor(self, sensor: int) -> float:
         """By how much the clock of a sensor alone was set back [ns], once, when that shows; else 0."""
         clock, commands = self._sources[sensor], self._sources[-1]
-        if clock.in_a_row < _ROWS or clock.told == clock.since or not commands.went_on(clock.since):
+        if clock.in_a_row < _ROWS or clock.told == clock.since or not commands.has_gone_on(clock.since):
             return 0.0
         clock.told = clock.since
         return clock.back if abs(clock.at - commands.at) > clock.back else 0.0

@@ -93,7 +93,7 @@ class CommandWatch:
         """Take back all that is stamped after an instant [ns]."""
         self._recent = [row for row in self._recent if row[0] <= after]
 
-    def limits(self, commands: Commands) -> None:
+    def watch_limits(self, commands: Commands) -> None:
         """Say when the latest commands leave what the arm model is valid for."""
         arm = self._arm
         if arm.validity == Validity():
@@ -108,8 +108,8 @@ class CommandWatch:
             stamp = max(stamp for stamp, _, _ in latest.values())
             self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
 
-    def intervals(self, stamp: int, values: Mapping[str, Any]) -> None:
-        """Take a fused command; say if they come at another interval than the update period, or many are missing."""
+    def watch_intervals(self, stamp: int, values: Mapping[str, Any]) -> None:
+        """Look at a fused command; say if they come at another interval than the update period, or many are missing."""
         recent = self._recent
         recent.append((stamp, values))
         if len(recent) == _FIRST and not self._knows_interval:
@@ -123,9 +123,9 @@ class CommandWatch:
         if len(recent) >= _MANY:
             self._recent = []
             if not self._senders:
-                self._look_for_missing(sorted(recent, key=lambda recent_row: recent_row[0]))
+                self._find_missing(sorted(recent, key=lambda recent_row: recent_row[0]))
 
-    def _look_for_missing(self, recent: list[tuple[int, Mapping[str, Any]]]) -> None:
+    def _find_missing(self, recent: list[tuple[int, Mapping[str, Any]]]) -> None:
         stamps = np.array([stamp for stamp, _ in recent])
         table = {axis: np.array([number(values.get(axis)) for _, values in recent]) for axis in recent[0][1]}
         steady: dict[str, FloatArray] = {axis: column for axis, column in table.items() if np.isfinite(column).all()}

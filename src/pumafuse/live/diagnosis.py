@@ -25,9 +25,9 @@ from ..fusion.chi_square import upper_quantile
 from ..fusion.config import FusionConfig, Start
 from ..fusion.consistency import Finding, consistency
 from ..fusion.estimates import Estimates
-from ..fusion.faults import Fault, faults_of, settled
-from ..fusion.offline import judged
-from ..fusion.segments import Segment, build
+from ..fusion.faults import Fault, find_faults, settling_time
+from ..fusion.offline import judge
+from ..fusion.segments import Segment, build_segment
 from ..fusion.verdicts import SHOWS, likeliest, sentence
 from ..logs.run import Run, Source
 from .rate_limit import RateLimitedLog
@@ -57,7 +57,7 @@ class Recent:
 
     def __init__(self, config: FusionConfig) -> None:
         self._config, self._axes, self._sensors = config, tuple(config.arm.axes), tuple(config.sensors)
-        self._settled = round(max(settled(config, axis) for axis in self._axes) * 1e9)
+        self._settled = round(max(settling_time(config, axis) for axis in self._axes) * 1e9)
         self._rests = _REST_NS - np.array([2, 1, 0]) * round(config.arm.update_period * 1e9)
         self.restart()
 
@@ -66,8 +66,8 @@ class Recent:
         self._rows = list[tuple[int, int, int, bytes]]()  # stamp, source, given axes as bits, values and spreads
         self._latest, self._start, self._first = [ALWAYS] * len(self._sensors), dict[str, float](), NEVER
 
-    def keep(self, stamp: int, source: int, bits: int, values: Array[c_double], spread: Array[c_double]) -> None:
-        """Keep an event: its values [m or rad], (A,), of axes that ``bits`` name, and by what their noise is scaled.
+    def add(self, stamp: int, source: int, bits: int, values: Array[c_double], spread: Array[c_double]) -> None:
+        """Add an event: its values [m or rad], (A,), of axes that ``bits`` name, and by what their noise is scaled.
 
         Of a dense sensor some are kept.
         """
@@ -126,7 +126,7 @@ class Recent:
         config = msgspec.structs.replace(self._config, start=Start(offset_sd=strayed))
         try:
             run = Run("stream", command, sensors, start=start, kinds=kinds)
-            return run, build(run, config), config
+            return run, build_segment(run, config), config
         except PumafuseError:  # of what is there nothing can be made
             return None
 
@@ -178,7 +178,7 @@ class Diagnosis:
         ]
         return (*(fault.sentence for fault in said), *large)
 
-    def look(self, window: Window, now: int) -> None:
+    def diagnose(self, window: Window, now: int) -> None:
         """Look at what has come until ``now`` [ns]."""
         port = window.port
         if now >= self.due:
@@ -188,12 +188,12 @@ class Diagnosis:
         if now >= self._faults_due:
             self._faults_due = now + _APART_NS[now >= self._since + _SPAN_NS]
             if (part := self.recent.part(now)) is not None:
-                self._look_for_faults(*part, now)
+                self._find_faults(*part, now)
         stamp, source, results = window.read(max(port.begin, self._ends[0], port.end - _MOST_ROWS), port.end)
         recent = (stamp > now - _SECOND_NS) & (stamp <= now) & (source >= 0)
         stamp, source, results = stamp[recent], source[recent], results.rows(np.flatnonzero(recent))
-        doubtful = self._look_at_reacquired(stamp, source, results)
-        fused = self._look_at_innovations(now, stamp, source, results)
+        doubtful = self._find_reacquired(stamp, source, results)
+        fused = self._find_large_innovations(now, stamp, source, results)
         doubtful.update(axis for axes in self._large.values() for axis in axes)
         for trouble in self._troubles.values():
             if trouble.is_said:  # what the gate keeps out harms nothing
@@ -204,15 +204,15 @@ class Diagnosis:
 
     # ---- faults of the log ------------------------------------------------------------------------------------------
 
-    def _look_for_faults(self, run: Run, segment: Segment, config: FusionConfig, now: int) -> None:
+    def _find_faults(self, run: Run, segment: Segment, config: FusionConfig, now: int) -> None:
         travel = {axis: float(np.ptp(segment.commands_of(axis)[1])) for axis in segment.axes}
         explained = {name for (names, *_), trouble in self._troubles.items() if trouble.is_said for name in names}
         faults = [
             fault
-            for fault in faults_of(segment, config, origin=0)
+            for fault in find_faults(segment, config, origin=0)
             if fault.cause != "nothing" or explained.isdisjoint(fault.sensors)
         ]
-        faults += self._unexpected(judged(run, segment, config), faults)
+        faults += self._unexpected_innovations(judge(run, segment, config), faults)
         for fault in faults:
             key = _key(fault)
             trouble = self._troubles.setdefault(key, _Trouble(fault))
@@ -223,14 +223,14 @@ class Diagnosis:
                 self._log.write(str(key), f"{fault.sentence} (by {now / 1e9:.3f} s)")
         keys, named = set(map(_key, faults)), {name for fault in faults for name in fault.sensors}
         for key in [key for key in self._troubles if key not in keys]:
-            self._not_found(key, travel, not named.isdisjoint(key[0]), now)
+            self._count_missed(key, travel, not named.isdisjoint(key[0]), now)
 
     def _is_set_back(self, fault: Fault) -> bool:
         """Whether stamps alone have shown, and it was said, that a clock was set back."""
         told = [self.set_back.get(name, ALWAYS) for name in fault.sensors]
         return fault.cause == "set" and fault.size < 0.0 and max(told) > fault.at - _BEFORE_NS
 
-    def _not_found(self, key: _Key, travel: Mapping[str, float], is_replaced: bool, now: int) -> None:
+    def _count_missed(self, key: _Key, travel: Mapping[str, float], is_replaced: bool, now: int) -> None:
         """Count that a fault does not show, and say so where the commands would show it, unless another one does."""
         (sensors, cause, _), trouble = key, self._troubles[key]
         moved = max((travel.get(axis, 0.0) for axis in trouble.fault.axes), default=0.0)
@@ -240,9 +240,9 @@ class Diagnosis:
         del self._troubles[key]
         if trouble.is_said and not is_replaced and cause != "set":
             shows = SHOWS[cause] if isinstance(cause, str) else "what the verdict says"
-            self._log.write(f"{key} over", f"{_named(sensors)}: {shows} shows no more at {now / 1e9:.3f} s")
+            self._log.write(f"{key} over", f"{_join_names(sensors)}: {shows} shows no more at {now / 1e9:.3f} s")
 
-    def _unexpected(self, estimates: Estimates, faults: Sequence[Fault]) -> list[Fault]:
+    def _unexpected_innovations(self, estimates: Estimates, faults: Sequence[Fault]) -> list[Fault]:
         """What `fuse` says of innovations in the span where no fault is: of each sensor the clearest, of the arm once.
 
         A cause that was said of a sensor stays, as long as there is any.
@@ -269,7 +269,7 @@ class Diagnosis:
 
     # ---- innovations ------------------------------------------------------------------------------------------------
 
-    def _look_at_innovations(
+    def _find_large_innovations(
         self, now: int, stamp: TimeArray, source: IndexArray, results: Results
     ) -> set[tuple[str, str]]:
         """Judge what became of the measurements of the last second; of which sensors and axes some were fused."""
@@ -312,7 +312,7 @@ class Diagnosis:
         sensor, axis = divmod(pair, len(self._axes))
         return self._sensors[sensor], self._axes[axis]
 
-    def _look_at_reacquired(self, stamp: TimeArray, source: IndexArray, results: Results) -> set[str]:
+    def _find_reacquired(self, stamp: TimeArray, source: IndexArray, results: Results) -> set[str]:
         """The axes on which a sensor was taken again in the last second; what is new of that is said."""
         again = results.outcome == Outcome.REACQUIRED
         for row in np.flatnonzero(again.any(axis=1)).tolist():
@@ -337,5 +337,5 @@ def _innovations(sensor: str, axes: Mapping[str, int] | Sequence[str]) -> str:
     return f"sensor '{sensor}': its innovations on {', '.join(axes)}"
 
 
-def _named(sensors: Sequence[str]) -> str:
+def _join_names(sensors: Sequence[str]) -> str:
     return f"sensor{'s' if len(sensors) > 1 else ''} {', '.join(map(repr, sensors))}" if sensors else "the commands"

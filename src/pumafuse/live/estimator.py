@@ -1,4 +1,17 @@
-"""The estimator that a program feeds event by event: :class:`LiveEstimator`."""
+"""The estimator that a program feeds event by event: :class:`LiveEstimator`.
+
+The road of an event, late or not:
+
+    command, measurement    what a program calls
+    _add                    reads its stamp and its values; a clock judges the stamp; the record gets the event
+    _screen_event           lets a command that leaps wait for the next one
+    _add_in_frame           places x, y and z, as soon as a command tells where a cylindrical frame starts
+    _add_row                of a measurement: where it sees the tool, how noisy it is, which values are no news
+    _update                 gives it to :meth:`.Window.add`, and counts what became of it
+
+That an event is late matters to ``Window::insert`` of the core alone (``core/window.hpp``): it puts the event in its
+place by time and restores the state before it, from where the filter runs on over all rows that are later.
+"""
 
 from __future__ import annotations
 
@@ -28,9 +41,9 @@ from .frame_start import FrameStart
 from .health import Counts, Health, by_word
 from .joints import Joints
 from .rate_limit import RateLimitedLog
-from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
+from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refuse, update_result
 from .screening import NEWS, CommandScreen, HoldWatch, Screened
-from .tool import NO_TOOL, NOISE, ORIENTATION, Row, axes_of, check_tool, row_noise, tool_of
+from .tool import NO_TOOL, NOISE, ORIENTATION, Row, axes_of, check_tool, parse_noise, tool_of
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
@@ -145,7 +158,7 @@ class LiveEstimator:
         self._screen, self._holds = CommandScreen(config.arm.update_period), HoldWatch(self._clock.window // 2)
         self._follows = [[latest_follow(config, name, axis) for axis in self.axes] for name in config.sensors]
         self._start = dict(start or {})
-        self._begin(Counts(len(self._sensors)))
+        self._restart(Counts(len(self._sensors)))
 
     def command(self, t: Time, /, **axes: Any) -> UpdateResult:
         """Add a command: the arm is to go to a position [m] on each of ``axes``.
@@ -155,7 +168,7 @@ class LiveEstimator:
             **axes: u [m] of each commanded axis; x, y and z with a frame; and ``orientation``, a quaternion x, y, z, w,
                 for a tool that turns. Or all joints [rad or m] of the configuration's robot.
         """
-        return self._take(t, None, axes)
+        return self._add(t, None, axes)
 
     def measurement(self, t: Time, sensor: str, /, **axes: Any) -> UpdateResult:
         """Add a measurement of where the tool was.
@@ -167,7 +180,7 @@ class LiveEstimator:
                 a sensor with a frame or a marker all are as it measures them. ``noise`` is by what that of the sensor
                 is scaled.
         """
-        return self._take(t, str(sensor), axes)
+        return self._add(t, str(sensor), axes)
 
     def estimate(self, at: Time | None = None) -> LiveEstimate:
         """Where the tool is.
@@ -178,6 +191,85 @@ class LiveEstimator:
                 sensor alone has run ahead to).
         """
         return self._estimate(at, NEVER)
+
+    def estimate_as_live(self, stamp: int) -> LiveEstimate:
+        """The estimate for an instant [ns] in the window by nothing that is stamped later, as if that had not come."""
+        return self._estimate(stamp, stamp)
+
+    def health(self, at: Time | None = None) -> Health:
+        """How each sensor does, and what became of everything so far.
+
+        Args:
+            at: Until when a sensor that is silent has been so; None: until the newest stamp.
+
+        Raises:
+            ValueError: ``at`` is no time.
+        """
+        newest = None if self._clock.newest is None else max(self._clock.now, stamp_of(at or 0))
+        counts = self._counts.snapshot(self._window)
+        sensors = {
+            name: counts.health(sensor, self._refused[sensor], newest, self._stale_ns)
+            for name, sensor in self._sensors.items()
+        }
+        commands = by_word(counts.outcomes[COMMAND] + self._refused[COMMAND])
+        rejected = (
+            f"sensor '{name}' contradicts '{other}': {_REJECTED}" for name, other in self._contradicting.items()
+        )
+        faults = (*self._diagnosis.shown, *rejected)
+        return Health(newest, self.segment + 1, commands, sensors, self._strangers, faults)
+
+    @property
+    def joints(self) -> Mapping[str, Kind]:
+        """What the joints that events may be in move by; empty without a robot."""
+        return {} if self._joints is None else self._joints.kinds
+
+    @property
+    def placed(self) -> Placed | None:
+        """The frame at its start; None without one, or before it has started."""
+        return self._frame_start.placed
+
+    @property
+    def newest(self) -> int | None:
+        """The newest stamp that is believed, int ns; None before any event."""
+        return self._clock.newest
+
+    @property
+    def sure(self) -> int | None:
+        """The newest stamp that nothing will take back, int ns: behind ``newest`` just after a jump ahead."""
+        return None if self._clock.newest is None else self._clock.sure
+
+    @property
+    def origin(self) -> int | None:
+        """The first command's stamp (of this segment), int ns; None before it."""
+        return self._window.origin
+
+    def until(self, t: Time, sensor: str | None = None) -> int | None:
+        """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
+
+        That is the event's stamp, if it is plausible or confirms a jump ahead; else the newest stamp that is confirmed.
+        """
+        try:
+            stamp = stamp_of(t)
+        except ValueError:
+            return self.sure
+        is_configured = sensor is None or sensor in self._sensors
+        right = self._clock.low <= stamp <= self._clock.high or (
+            is_configured and self._clock.ends_doubt(stamp, sensor)
+        )
+        return stamp if right else self.sure
+
+    def of_tool(self, t: Time, sensor: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What an event that was taken tells of the tool: its orientation as axes, its position along the base's axes.
+
+        Args:
+            t: Its stamp.
+            sensor: Its name; empty for a command.
+            values: As it came.
+        """
+        parsed = self._parse(sensor or None, {name: value for name, value in values.items() if name != NOISE})
+        if self._tool is None or not sensor:
+            return parsed
+        return self._tool.to_tool(sensor, stamp_of(t), parsed).values
 
     def _estimate(self, at: Time | None, after: int) -> LiveEstimate:
         """The same by nothing that is stamped after ``after`` [ns]."""
@@ -211,115 +303,20 @@ class LiveEstimator:
             orientation = self._tool.orientation([axes[axis].position for axis in TURNING if axis in axes])
         return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason, orientation, self._diagnosis.doubtful)
 
-    @property
-    def joints(self) -> Mapping[str, Kind]:
-        """What the joints that events may be in move by; empty without a robot."""
-        return {} if self._joints is None else self._joints.kinds
+    # ---- the road of an event ----------------------------------------------------------------------------------------
 
-    @property
-    def placed(self) -> Placed | None:
-        """The frame at its start; None without one, or before it has started."""
-        return self._frame_start.placed
-
-    @property
-    def newest(self) -> int | None:
-        """The newest stamp that is believed, int ns; None before any event."""
-        return self._clock.newest
-
-    @property
-    def sure(self) -> int | None:
-        """The newest stamp that nothing will take back, int ns: behind ``newest`` just after a jump ahead."""
-        return None if self._clock.newest is None else self._clock.sure
-
-    @property
-    def origin(self) -> int | None:
-        """The first command's stamp (of this segment), int ns; None before it."""
-        return self._window.origin
-
-    def estimate_as_live(self, stamp: int) -> LiveEstimate:
-        """The estimate for an instant [ns] in the window by nothing that is stamped later, as if that had not come."""
-        return self._estimate(stamp, stamp)
-
-    def until(self, t: Time, sensor: str | None = None) -> int | None:
-        """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
-
-        That is the event's stamp, if it is plausible or confirms a jump ahead; else the newest stamp that is confirmed.
-        """
-        try:
-            stamp = stamp_of(t)
-        except ValueError:
-            return self.sure
-        is_configured = sensor is None or sensor in self._sensors
-        right = self._clock.low <= stamp <= self._clock.high or (
-            is_configured and self._clock.ends_doubt(stamp, sensor)
-        )
-        return stamp if right else self.sure
-
-    def of_tool(self, t: Time, sensor: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """What an event that was taken tells of the tool: its orientation as axes, its position along the base's axes.
-
-        Args:
-            t: Its stamp.
-            sensor: Its name; empty for a command.
-            values: As it came.
-        """
-        parsed = self._parsed(sensor or None, {name: value for name, value in values.items() if name != NOISE})
-        if self._tool is None or not sensor:
-            return parsed
-        return self._tool.of_tool(sensor, stamp_of(t), parsed).values
-
-    def health(self, at: Time | None = None) -> Health:
-        """How each sensor does, and what became of everything so far.
-
-        Args:
-            at: Until when a sensor that is silent has been so; None: until the newest stamp.
-
-        Raises:
-            ValueError: ``at`` is no time.
-        """
-        newest = None if self._clock.newest is None else max(self._clock.now, stamp_of(at or 0))
-        counts = self._counts.snapshot(self._window)
-        sensors = {
-            name: counts.health(sensor, self._refused[sensor], newest, self._stale_ns)
-            for name, sensor in self._sensors.items()
-        }
-        commands = by_word(counts.outcomes[COMMAND] + self._refused[COMMAND])
-        rejected = (
-            f"sensor '{name}' contradicts '{other}': {_REJECTED}" for name, other in self._contradicting.items()
-        )
-        faults = (*self._diagnosis.shown, *rejected)
-        return Health(newest, self.segment + 1, commands, sensors, self._strangers, faults)
-
-    def _begin(self, counts: Counts) -> None:
-        """An empty window; ``counts`` go on."""
-        self._frame_start = FrameStart(self.config.frame, self.axes)
-        model = live_model(self.config, self._frame_start.start(self._start))
-        self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
-        self._tool = tool_of(self.config, self._log)
-        self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled, as is known
-        for part in (self._watch, self._screen, self._holds, self._diagnosis, self._set_back, counts):
-            part.restart()
-        # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
-        # what came is fed again then, and counted anew.
-        self._early: list[_Event] | None = [] if self._frame_start.waits else None
-        self._counts, self._before = counts, copy.deepcopy(counts)
-
-    def _oldest(self) -> int:
-        """No event stamped before is taken [ns]."""
-        return max(self._clock.sure - self._clock.window, self._window.port.floor)
-
-    def _take(self, t: Time, sensor: str | None, values: _Values) -> UpdateResult:
-        """Put an event where its stamp says, if that can be."""
+    def _add(self, t: Time, sensor: str | None, values: _Values) -> UpdateResult:
+        """Add an event where its stamp says, if that can be."""
         try:
             event = _Event(stamp_of(t), sensor, values)
-            parsed = self._parsed(sensor, values)
+            parsed = self._parse(sensor, values)
         except ValueError as error:
             return self._refuse(sensor, values, _INVALID, str(error))
         if sensor is not None and sensor not in self._sensors:
             return self._refuse(sensor, values, _UNKNOWN, f"unknown sensor; {suggestion(sensor, self._sensors)}")
         clock, stamp = self._clock, event.stamp
         if not clock.low <= stamp <= clock.high:
-            if (refusal := self._judged(event)) is not None:
+            if (refusal := self._judge(event)) is not None:
                 return refusal
         elif clock.newest is not None and stamp > clock.newest:
             clock.settle(stamp)
@@ -327,107 +324,29 @@ class LiveEstimator:
             clock.other, self._set_aside = [], []
         if self._event_log is not None:
             self._event_log.append(*event)
-        result = self._take_in_time(event, parsed)
-        if self._set_back.take(COMMAND if sensor is None else self._sensors[sensor], stamp):
+        result = self._screen_event(event, parsed)
+        if self._set_back.add(COMMAND if sensor is None else self._sensors[sensor], stamp):
             return self._watch_clocks(event, result)
         return result
 
-    def _take_in_time(self, event: _Event, parsed: _Values) -> UpdateResult:
-        """Take an event whose stamp is right, as it came and as it is used."""
-        stamp, sensor, values = event
-        if sensor is not None:
-            if stamp > self._screen.until:
-                self._settle(self._screen.believed())
-            return self._enter(stamp, sensor, parsed)
-        self._counts.outcomes[COMMAND, _STRAY] += 1  # as long as it waits for the next
-        in_joints = not self.joints.keys().isdisjoint(values)  # which are screened: a pose is of all of them
-        settled = self._settle(self._screen.take(stamp, values if in_joints else parsed))
-        waits = "leaps by many times the usual step: not used unless the next one is there, too"
-        return settled.get(stamp) or refused(values, _STRAY, waits)
-
-    def _watch_clocks(self, event: _Event, result: UpdateResult) -> UpdateResult:
-        """Say that a sensor's clock was set back within the window, and start anew where all clocks were."""
-        stamp, sensor, values = event
-        if sensor is not None and (back := self._set_back.of_sensor(self._sensors[sensor])):
-            self._diagnosis.set_back[sensor] = stamp
-            told = (
-                f"sensor '{sensor}': its stamps step back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s and go on there:"
-                " was its clock set? If it was right before, its measurements are stamped too early by that now"
-            )
-            self._log.write(f"{sensor} set back", told)
-        if sensor is None and self._set_back.commands == 1:
-            self._behind = []
-        if not self._set_back.commands:
-            return result
-        self._behind.append(_Counted(event._replace(values=dict(values)), result, True))
-        if not (back := self._set_back.of_all()):
-            return result
-        told = f"all clocks were set back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s: new segment, filter restarted"
-        self._log.write("clock", told)
-        return self._begin_segment(self._behind)
-
-    def _parsed(self, sensor: str | None, values: _Values) -> _Values:
+    def _parse(self, sensor: str | None, values: _Values) -> _Values:
         """An event's values with a pose in the place of joints, and a commanded orientation as axes."""
-        if self._joints is not None and (told := self._joints.told(values)) is not None:
-            values = self._joints.posed(values, told)
+        if self._joints is not None and (told := self._joints.parse(values)) is not None:
+            values = self._joints.to_pose(values, told)
         if self._tool is not None:
-            return self._tool.parsed(sensor, values)
+            return self._tool.parse(sensor, values)
         if ORIENTATION in values:
             raise ValueError(NO_TOOL)
         return values
 
-    def _settle(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
-        """Enter commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
-        settled = dict[int, UpdateResult]()
-        for stamp, values, stray in commands:
-            for name in stray:
-                self._log.write(
-                    f"stray {name}",
-                    f"a command of {name} at {stamp / 1e9:.3f} s leaps away from those before and after it: stray, not"
-                    " used",
-                )
-            if not self.joints.keys().isdisjoint(stray):  # a pose is of all joints
-                values = {name: value for name, value in values.items() if name not in self.joints}
-            if values or not stray:
-                self._counts.outcomes[COMMAND, _STRAY] -= 1
-                settled[stamp] = self._enter_command(stamp, values)
-        return settled
-
-    def _enter_command(self, stamp: int, values: _Values) -> UpdateResult:
-        """Take a command that is to be used; one in joints changes the poses of others, where joints are later."""
-        oldest = self._oldest()
-        if self._joints is None or (told := self._joints.told(values)) is None:
-            return self._enter(stamp, None, values)
-        by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
-        try:
-            first = self._parsed(None, self._joints.posed(values, by_stamp.pop(stamp)))
-            others = {
-                other: self._parsed(None, self._joints.posed({}, joints_told))
-                for other, joints_told in by_stamp.items()
-            }
-        except ValueError as error:
-            return self._refuse(None, values, _INVALID, str(error))
-        result = self._enter(stamp, None, first)
-        for other, pose in others.items():
-            self._enter(other, None, pose, again=True)
-        return result
-
-    def _enter(self, stamp: int, sensor: str | None, values: _Values, again: bool = False) -> UpdateResult:
-        """Take an event that is to be used; ``again``: in the place of a command of the same stamp."""
-        if self._early is None:
-            return self._feed(stamp, sensor, values, judged=again)
-        if again:
-            self._early = [event for event in self._early if event.sensor is not None or event.stamp != stamp]
-        return self._take_early(_Event(stamp, sensor, dict(values)), again)
-
-    def _judged(self, event: _Event) -> UpdateResult | None:
+    def _judge(self, event: _Event) -> UpdateResult | None:
         """What becomes of an event whose stamp is not plainly right; None if it is to be taken."""
         clock, (stamp, sensor, values) = self._clock, event
         newest, command = clock.newest, sensor is None
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
                 # The commands' clock counts: what came before is of another.
-                self._begin(self._counts.snapshot(self._window))
+                self._restart(self._counts.snapshot(self._window))
                 if self._event_log is not None:
                     self._event_log.begin_segment()
             clock.start(stamp)
@@ -461,6 +380,344 @@ class LiveEstimator:
             self._set_aside.append(_Counted(event._replace(values=dict(values)), result, is_late))
         return result
 
+    def _screen_event(self, event: _Event, parsed: _Values) -> UpdateResult:
+        """Add an event whose stamp is right, as it came and as it is used; a command that leaps waits for the next."""
+        stamp, sensor, values = event
+        if sensor is not None:
+            if stamp > self._screen.until:
+                self._add_screened(self._screen.release())
+            return self._add_in_frame(stamp, sensor, parsed)
+        self._counts.outcomes[COMMAND, _STRAY] += 1  # as long as it waits for the next
+        in_joints = not self.joints.keys().isdisjoint(values)  # which are screened: a pose is of all of them
+        settled = self._add_screened(self._screen.add(stamp, values if in_joints else parsed))
+        waits = "leaps by many times the usual step: not used unless the next one is there, too"
+        return settled.get(stamp) or refuse(values, _STRAY, waits)
+
+    def _add_screened(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
+        """Add commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
+        settled = dict[int, UpdateResult]()
+        for stamp, values, stray in commands:
+            for name in stray:
+                self._log.write(
+                    f"stray {name}",
+                    f"a command of {name} at {stamp / 1e9:.3f} s leaps away from those before and after it: stray, not"
+                    " used",
+                )
+            if not self.joints.keys().isdisjoint(stray):  # a pose is of all joints
+                values = {name: value for name, value in values.items() if name not in self.joints}
+            if values or not stray:
+                self._counts.outcomes[COMMAND, _STRAY] -= 1
+                settled[stamp] = self._add_command(stamp, values)
+        return settled
+
+    def _add_command(self, stamp: int, values: _Values) -> UpdateResult:
+        """Add a command that is to be used; one in joints changes the poses of others, where joints are later."""
+        oldest = self._oldest()
+        if self._joints is None or (told := self._joints.parse(values)) is None:
+            return self._add_in_frame(stamp, None, values)
+        by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
+        try:
+            first = self._parse(None, self._joints.to_pose(values, by_stamp.pop(stamp)))
+            others = {
+                other: self._parse(None, self._joints.to_pose({}, joints_told))
+                for other, joints_told in by_stamp.items()
+            }
+        except ValueError as error:
+            return self._refuse(None, values, _INVALID, str(error))
+        result = self._add_in_frame(stamp, None, first)
+        for other, pose in others.items():
+            self._add_in_frame(other, None, pose, again=True)
+        return result
+
+    def _add_in_frame(self, stamp: int, sensor: str | None, values: _Values, again: bool = False) -> UpdateResult:
+        """Add an event that is to be used; ``again``: in the place of a command of the same stamp."""
+        if self._early is None:
+            return self._add_to_window(stamp, sensor, values, judged=again)
+        if again:
+            self._early = [event for event in self._early if event.sensor is not None or event.stamp != stamp]
+        return self._add_early(_Event(stamp, sensor, dict(values)), again)
+
+    def _add_early(self, event: _Event, again: bool) -> UpdateResult:
+        """Add an event while the frame's place may still change; a command before all others moves it."""
+        assert self._early is not None
+        oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
+        if origin is not None and self._clock.sure - origin > self._clock.window:
+            self._early = None
+            return self._add_to_window(*event, judged=again)
+        x, y = (number(event.values.get(name)) for name in ("x", "y"))
+        if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
+            frame_start = FrameStart(self.config.frame, self.axes)
+            try:
+                frame_start.start_at_command(event.stamp, x, y)
+            except RunError as error:
+                return self._refuse(None, event.values, _INVALID, str(error))
+            early = [earlier for earlier in self._early if earlier.stamp >= oldest]
+            self._restart(self._before)
+            self._early, self._frame_start = early, frame_start
+            for earlier in early:
+                self._add_to_window(*earlier)
+        if len(self._early) >= _MOST_ASIDE:
+            del self._early[: _MOST_ASIDE // 2]
+        self._early.append(event)
+        return self._add_to_window(*event, judged=again)
+
+    def _add_to_window(self, stamp: int, sensor: str | None, values: _Values, judged: bool = False) -> UpdateResult:
+        """Add an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
+        if sensor is not None and not judged:
+            return self._add_row(stamp, sensor, values)
+        bits, stranger = self._fill(stamp, sensor, values)
+        if stamp < (oldest := self._oldest()):
+            return self._refuse_late(stamp, sensor, values, self._counts.outcomes)
+        return self._update(_Event(stamp, sensor, values), bits, stranger, oldest, judged)
+
+    def _add_row(self, stamp: int, sensor: str, values: _Values) -> UpdateResult:
+        """Put a measurement into the window: as it tells of the tool, as noisy as it says, without what is no news."""
+        window, tool, told, noise = self._window, self._tool, None, 1.0
+        if self._spreads:
+            window.spread[:] = self._no_spread
+        if NOISE in values:
+            noise, self._spreads = parse_noise(values), True
+            values = {name: value for name, value in values.items() if name != NOISE}
+        if tool is not None:
+            told = tool.to_tool(sensor, stamp, values)
+            values = told.values
+        bits, stranger = self._fill(stamp, sensor, values)
+        if stamp < (oldest := self._oldest()):
+            return self._refuse_late(stamp, sensor, values, self._counts.outcomes)
+        if told is not None:
+            for name in told.spread.keys() & self._bits.keys():
+                window.spread[self._bits[name]] = told.spread[name]
+        if noise != 1.0:
+            window.spread[:] = [noise * factor for factor in window.spread]
+        if tool is not None and told is not None and told.seen is not None:
+            tool.add(sensor, Row(stamp, told.seen, [*window.value, *window.spread], noise), oldest)
+        held, released = self._find_held(stamp, sensor, bits)
+        if released or held:
+            return self._add_news(stamp, sensor, bits, held, released)
+        return self._update(_Event(stamp, sensor, values), bits, stranger, oldest)
+
+    def _fill(self, stamp: int, sensor: str | None, values: _Values) -> tuple[int, str]:
+        """Put an event's values into the window's ``value``; which axes these are, as bits, and a name that is none."""
+        new, bits, stranger = self._window.value, 0, ""
+        for name, value in values.items():
+            axis = self._bits.get(name)
+            if axis is None:
+                stranger = name
+                continue
+            new[axis] = value if type(value) is float else number(value)
+            bits |= 1 << axis
+        if stranger and self.config.frame is not None:
+            bits |= self._fill_axes(stamp, sensor, values)
+            stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
+        return bits, stranger
+
+    def _fill_axes(self, stamp: int, sensor: str | None, values: _Values, noise: float = 1.0) -> int:
+        """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
+        window, bits, near = self._window, 0, None
+        if sensor is not None:
+            told = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
+            near = np.array([told or 0.0])
+        point = {name: number(values[name]) for name in CARTESIAN if name in values}
+        placed = self._frame_start.in_axes(point, near)
+        for name, component in placed.items():
+            axis = self._bits[name]
+            window.value[axis], spread = component
+            window.spread[axis] = noise * spread
+            bits |= 1 << axis
+        return bits
+
+    def _find_held(self, stamp: int, sensor: str, bits: int) -> tuple[int, list[tuple[int, str, float, float]]]:
+        """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
+        held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
+        follows, values, spread = self._follows[number], self._window.value, self._window.spread
+        for axis, name in enumerate(self.axes):
+            if not bits >> axis & 1:
+                continue
+            judge = self._holds.judge((number, axis), stamp, values[axis], spread, self._commands, follows[axis])
+            if judge is NEWS:
+                continue
+            held |= judge.held << axis
+            self._counts.outcomes[number, _HELD] += judge.held - len(judge.released)
+            released += [(earlier, name, component, factor) for earlier, component, factor in judge.released]
+            if judge.sure:
+                self._log.write(
+                    f"{sensor} {name} held",
+                    f"sensor '{sensor}' repeats its value of {name} to the last digit at {stamp / 1e9:.3f} s: did it"
+                    " freeze, or is it slower than its rows? Held, not used",
+                )
+        return held, released
+
+    def _add_news(
+        self, stamp: int, sensor: str, bits: int, held: int, released: Sequence[tuple[int, str, float, float]]
+    ) -> UpdateResult:
+        """Add to the window what is news of a measurement that has come to it, and what was not used before and is."""
+        self._counts.add_row(self._sensors[sensor], stamp, self._clock.sure)
+        kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (bits & ~held) >> axis & 1}
+        again = [name for name, axis in self._bits.items() if held >> axis & 1]
+        result = self._add_to_window(stamp, sensor, kept, judged=True) if kept else refuse(again, _HELD, REASONS[_HELD])
+        for earlier, name, value, spread in released:
+            self._window.spread[self._bits[name]] = spread
+            self._add_to_window(earlier, sensor, {name: value}, judged=True)
+        return result
+
+    def _update(self, event: _Event, bits: int, stranger: str, oldest: int, judged: bool = False) -> UpdateResult:
+        """Let the filter run on from the place of an event that fills the window's ``value``; what became of it."""
+        window, counts, diagnosis, (stamp, sensor, values) = self._window, self._counts, self._diagnosis, event
+        if not bits:
+            missing = not stranger and len(values) > 0
+            why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
+            outcome = Outcome.BEFORE_START if missing else _UNKNOWN
+            return self._refuse(sensor, values, outcome, why, counts.outcomes)
+        rows, source = window.port.end, COMMAND if sensor is None else self._sensors[sensor]
+        diagnosis.recent.add(stamp, source, bits, window.value, window.spread)
+        if not window.add(stamp, source, bits, oldest):
+            return self._refuse_late(stamp, sensor, values, counts.outcomes)
+        codes = bytes(window.outcome)
+        result = self._answers.get(codes) if not stranger else None
+        result = result or self._answer(codes, stranger)
+        counts.count(window)
+        is_due = self._clock.sure >= diagnosis.due or Outcome.REACQUIRED in codes
+        if is_due and self._screen.until == NEVER:  # a command that waits may explain it all
+            diagnosis.diagnose(window, self._clock.sure)
+        if sensor is None:
+            self._follow_command(event, codes, result.outcome, oldest, judged)
+        else:
+            self._follow_measurement(stamp, sensor, codes, result.outcome, window.port.end == rows, judged)
+        return result
+
+    def _follow_command(self, event: _Event, codes: bytes, outcome: Outcome, oldest: int, judged: bool) -> None:
+        """What a command in the window changes beside the filter: counts, watches, measurements that it places."""
+        stamp, _, values = event
+        if not judged:
+            self._counts.outcomes[COMMAND, outcome] += 1
+            self._doubtful += outcome is _FUSED and self._clock.doubtful
+            if outcome in (_FUSED, Outcome.DUPLICATE):
+                self._watch.watch_intervals(stamp, values)
+        self._commands.add(stamp, codes, self._window.value[:], oldest)
+        self._watch.watch_limits(self._commands)
+        if self._tool is not None:
+            self._amend(self._tool.command(stamp, values, oldest))
+
+    def _follow_measurement(
+        self, stamp: int, sensor: str, codes: bytes, outcome: Outcome, repeats: bool, judged: bool
+    ) -> None:
+        """Count a measurement that is in the window, or ``repeats`` one there; say whom it contradicts."""
+        source, counts = self._sensors[sensor], self._counts
+        if not judged:
+            counts.add_row(source, stamp, self._clock.sure)
+        for code in codes.replace(_ABSENT, b"") if repeats else b"":
+            counts.outcomes[source, code] += 1
+        if self._window.port.contradicts >= 0:
+            self._say_contradiction(stamp, sensor)
+        elif sensor in self._contradicting and outcome is _FUSED:
+            del self._contradicting[sensor]
+
+    def _amend(self, since: int | None) -> None:
+        """Put measurements that the commands place where they are by now, those valid from an instant [ns] on."""
+        if self._tool is None or since is None:
+            return
+        window = self._window
+        for sensor, rows, points in self._tool.placed_since(since):
+            before = np.array([row.numbers for row in rows])
+            for row, point in zip(rows, points, strict=True):
+                values: dict[str, float] = dict(zip(CARTESIAN, point, strict=True))
+                window.value[:], window.spread[:] = row.numbers[: len(self.axes)], row.numbers[len(self.axes) :]
+                for name in values.keys() & self._bits.keys():
+                    window.value[self._bits[name]] = values[name]
+                if self.config.frame is not None:
+                    self._fill_axes(row.stamp, sensor, values, row.noise)
+                row.numbers = [*window.value, *window.spread]
+            stamps, now = np.array([row.stamp for row in rows]), np.array([row.numbers for row in rows])
+            window.amend(self._sensors[sensor], stamps, before, now)
+        window.spread[:] = self._no_spread
+
+    # ---- events that are refused, and what is said of them -----------------------------------------------------------
+
+    def _oldest(self) -> int:
+        """No event stamped before is taken [ns]."""
+        return max(self._clock.sure - self._clock.window, self._window.port.floor)
+
+    def _refuse_late(self, stamp: int, sensor: str | None, values: _Values, outcomes: IntArray) -> UpdateResult:
+        """Count an event that is behind the window; how late it is shows which window it would take."""
+        if sensor is not None:
+            self._counts.add_row(self._sensors[sensor], stamp, self._clock.now)
+        late, window = self._clock.sure - stamp, self._clock.window
+        why = f"stamped {late / 1e9:.3f} s behind the newest; the window is {window / 1e9:g} s"
+        if late <= window:
+            why = f"more than {MOST_EVENTS} events came since: the window holds no more"
+        return self._refuse(sensor, values, _TOO_LATE, why, outcomes)
+
+    def _refuse(
+        self, sensor: str | None, values: _Values, outcome: Outcome, reason: str, outcomes: IntArray | None = None
+    ) -> UpdateResult:
+        """Count an event that never comes into the window, a measurement for each of its axes, among ``outcomes``."""
+        outcomes, result = self._refused if outcomes is None else outcomes, refuse(axes_of(values), outcome, reason)
+        if sensor is None:
+            outcomes[COMMAND, outcome] += 1
+        elif sensor in self._sensors:
+            outcomes[self._sensors[sensor], outcome] += len(result.axes)
+        else:
+            self._strangers += 1
+        return result
+
+    def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
+        """The result of an event by the codes of its axes; the same object for equal codes, but for unknown names."""
+        outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
+        result = update_result(outcomes)
+        if stranger:
+            axes = MappingProxyType({**outcomes, stranger: _UNKNOWN})
+            return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
+        return self._answers.setdefault(codes, result)
+
+    def _no_axis(self, stranger: str) -> str:
+        """Why what an event gives under a name is of no axis."""
+        if stranger in CARTESIAN and self.config.frame is None:
+            return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
+        if not stranger:
+            return "gives no axis"
+        return f"unknown axis '{stranger:.40}'; {suggestion(stranger, [*self.axes, *self.joints])}"
+
+    def _say_contradiction(self, stamp: int, sensor: str) -> None:
+        """Say which other sensor one contradicts, by how much, and since when."""
+        window = self._window
+        other = tuple(self._sensors)[window.port.contradicts]
+        if self._contradicting.get(sensor) == other:
+            return
+        self._contradicting[sensor] = other
+        screens = map(self.config.arm.screen_of, self.axes)
+        off = ", ".join(
+            f"{axis} by {nu * screen.scale:+.4g} {screen.unit}"
+            for axis, screen, outcome, nu in zip(self.axes, screens, window.outcome, window.innovation, strict=True)
+            if outcome == Outcome.REJECTED
+        )
+        self._log.write(
+            f"{sensor} contradicts {other}",
+            f"sensor '{sensor}' contradicts '{other}' since {stamp / 1e9:.3f} s ({off}): {_REJECTED}",
+        )
+
+    # ---- other clocks ------------------------------------------------------------------------------------------------
+
+    def _watch_clocks(self, event: _Event, result: UpdateResult) -> UpdateResult:
+        """Say that a sensor's clock was set back within the window, and start anew where all clocks were."""
+        stamp, sensor, values = event
+        if sensor is not None and (back := self._set_back.of_sensor(self._sensors[sensor])):
+            self._diagnosis.set_back[sensor] = stamp
+            told = (
+                f"sensor '{sensor}': its stamps step back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s and go on there:"
+                " was its clock set? If it was right before, its measurements are stamped too early by that now"
+            )
+            self._log.write(f"{sensor} set back", told)
+        if sensor is None and self._set_back.commands == 1:
+            self._behind = []
+        if not self._set_back.commands:
+            return result
+        self._behind.append(_Counted(event._replace(values=dict(values)), result, True))
+        if not (back := self._set_back.of_all()):
+            return result
+        told = f"all clocks were set back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s: new segment, filter restarted"
+        self._log.write("clock", told)
+        return self._begin_segment(self._behind)
+
     def _forget(self, after: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""
         self._counts.forget(self._window, after)
@@ -468,7 +725,7 @@ class LiveEstimator:
             if part is not None:
                 part.forget(after)
         if self._tool is not None:
-            self._place_again(self._tool.forget(after))
+            self._amend(self._tool.forget(after))
         self._screen.restart()
         if self._event_log is not None:
             self._event_log.discard(after)
@@ -498,236 +755,22 @@ class LiveEstimator:
         self._start = {}
         if self._joints is not None:
             self._joints.restart()
-        self._begin(self._counts.snapshot(self._window))
+        self._restart(self._counts.snapshot(self._window))
         if self._event_log is not None:
             self._event_log.begin_segment()
         self._clock.start(next(event.stamp for event in events if event.sensor is None))
-        return [self._take(*event) for event in events][-1]
+        return [self._add(*event) for event in events][-1]
 
-    def _take_early(self, event: _Event, again: bool) -> UpdateResult:
-        """Take an event while the frame's place may still change; a command before all others moves it."""
-        assert self._early is not None
-        oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
-        if origin is not None and self._clock.sure - origin > self._clock.window:
-            self._early = None
-            return self._feed(*event, judged=again)
-        x, y = (number(event.values.get(name)) for name in ("x", "y"))
-        if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
-            frame_start = FrameStart(self.config.frame, self.axes)
-            try:
-                frame_start.begin(event.stamp, x, y)
-            except RunError as error:
-                return self._refuse(None, event.values, _INVALID, str(error))
-            early = [earlier for earlier in self._early if earlier.stamp >= oldest]
-            self._begin(self._before)
-            self._early, self._frame_start = early, frame_start
-            for earlier in early:
-                self._feed(*earlier)
-        if len(self._early) >= _MOST_ASIDE:
-            del self._early[: _MOST_ASIDE // 2]
-        self._early.append(event)
-        return self._feed(*event, judged=again)
-
-    def _feed(self, stamp: int, sensor: str | None, values: _Values, judged: bool = False) -> UpdateResult:
-        """Give an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
-        window, counts, bits, stranger = self._window, self._counts, 0, ""
-        new, told, noise, tool = window.value, None, 1.0, self._tool
-        measured = None if judged else sensor  # whose row it is that comes for the first time
-        if measured is not None:
-            if self._spreads:
-                window.spread[:] = self._no_spread
-            if NOISE in values:
-                noise, self._spreads = row_noise(values), True
-                values = {name: value for name, value in values.items() if name != NOISE}
-            if tool is not None:
-                told = tool.of_tool(measured, stamp, values)
-                values = told.values
-        for name, value in values.items():
-            axis = self._bits.get(name)
-            if axis is None:
-                stranger = name
-                continue
-            new[axis] = value if type(value) is float else number(value)
-            bits |= 1 << axis
-        if stranger and self.config.frame is not None:
-            bits |= self._turned(stamp, sensor, values)
-            stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
-        oldest = self._oldest()
-        if stamp < oldest:
-            return self._refuse_late(stamp, sensor, values, counts.outcomes)
-        if told is not None:
-            for name in told.spread.keys() & self._bits.keys():
-                window.spread[self._bits[name]] = told.spread[name]
-        if noise != 1.0:
-            window.spread[:] = [noise * factor for factor in window.spread]
-        if measured is not None:
-            if tool is not None and told is not None and told.seen is not None:
-                tool.keep(measured, Row(stamp, told.seen, [*new, *window.spread], noise), oldest)
-            held, released = self._held(stamp, measured, bits)
-            if released or held:
-                return self._without_held(stamp, measured, bits, held, released)
-        if not bits:
-            missing = not stranger and len(values) > 0
-            why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
-            outcome = Outcome.BEFORE_START if missing else _UNKNOWN
-            return self._refuse(sensor, values, outcome, why, counts.outcomes)
-        rows, diagnosis = window.port.end, self._diagnosis
-        source = COMMAND if sensor is None else self._sensors[sensor]
-        diagnosis.recent.keep(stamp, source, bits, new, window.spread)
-        taken = window.add(stamp, source, bits, oldest)
-        if not taken:
-            return self._refuse_late(stamp, sensor, values, counts.outcomes)
-        codes = bytes(window.outcome)
-        result = self._answers.get(codes) if not stranger else None
-        result = result or self._answer(codes, stranger)
-        counts.read(window)
-        is_due = self._clock.sure >= diagnosis.due or Outcome.REACQUIRED in codes
-        if is_due and self._screen.until == NEVER:  # a command that waits may explain it all
-            diagnosis.look(window, self._clock.sure)
-        if sensor is None:
-            if not judged:
-                counts.outcomes[COMMAND, result.outcome] += 1
-                self._doubtful += result.outcome is _FUSED and self._clock.doubtful
-                if result.outcome in (_FUSED, Outcome.DUPLICATE):
-                    self._watch.intervals(stamp, values)
-            self._commands.add(stamp, codes, window.value[:], oldest)
-            self._watch.limits(self._commands)
-            if self._tool is not None:
-                self._place_again(self._tool.command(stamp, values, oldest))
-            return result
-        if not judged:
-            counts.came(source, stamp, self._clock.sure)
-        if window.port.end == rows:  # it repeats another
-            for code in codes.replace(_ABSENT, b""):
-                counts.outcomes[source, code] += 1
-        if window.port.contradicts >= 0:
-            self._say_contradiction(stamp, sensor)
-        elif sensor in self._contradicting and result.outcome is _FUSED:
-            del self._contradicting[sensor]
-        return result
-
-    def _without_held(
-        self, stamp: int, sensor: str, bits: int, held: int, released: Sequence[tuple[int, str, float, float]]
-    ) -> UpdateResult:
-        """Give the window what is news of a measurement that has come to it, and what was not used before and is."""
-        self._counts.came(self._sensors[sensor], stamp, self._clock.sure)
-        kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (bits & ~held) >> axis & 1}
-        again = [name for name, axis in self._bits.items() if held >> axis & 1]
-        result = self._feed(stamp, sensor, kept, judged=True) if kept else refused(again, _HELD, REASONS[_HELD])
-        for earlier, name, value, spread in released:
-            self._window.spread[self._bits[name]] = spread
-            self._feed(earlier, sensor, {name: value}, judged=True)
-        return result
-
-    def _held(self, stamp: int, sensor: str, bits: int) -> tuple[int, list[tuple[int, str, float, float]]]:
-        """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
-        held, released, number = 0, list[tuple[int, str, float, float]](), self._sensors[sensor]
-        follows, values, spread = self._follows[number], self._window.value, self._window.spread
-        for axis, name in enumerate(self.axes):
-            if not bits >> axis & 1:
-                continue
-            judge = self._holds.judge((number, axis), stamp, values[axis], spread, self._commands, follows[axis])
-            if judge is NEWS:
-                continue
-            held |= judge.held << axis
-            self._counts.outcomes[number, _HELD] += judge.held - len(judge.released)
-            released += [(earlier, name, component, factor) for earlier, component, factor in judge.released]
-            if judge.sure:
-                self._log.write(
-                    f"{sensor} {name} held",
-                    f"sensor '{sensor}' repeats its value of {name} to the last digit at {stamp / 1e9:.3f} s: did it"
-                    " freeze, or is it slower than its rows? Held, not used",
-                )
-        return held, released
-
-    def _place_again(self, since: int | None) -> None:
-        """Put measurements that the commands place where they are by now, those valid from an instant [ns] on."""
-        if self._tool is None or since is None:
-            return
-        window = self._window
-        for sensor, rows, points in self._tool.placed_since(since):
-            before = np.array([row.numbers for row in rows])
-            for row, point in zip(rows, points, strict=True):
-                values: dict[str, float] = dict(zip(CARTESIAN, point, strict=True))
-                window.value[:], window.spread[:] = row.numbers[: len(self.axes)], row.numbers[len(self.axes) :]
-                for name in values.keys() & self._bits.keys():
-                    window.value[self._bits[name]] = values[name]
-                if self.config.frame is not None:
-                    self._turned(row.stamp, sensor, values, row.noise)
-                row.numbers = [*window.value, *window.spread]
-            stamps, now = np.array([row.stamp for row in rows]), np.array([row.numbers for row in rows])
-            window.amend(self._sensors[sensor], stamps, before, now)
-        window.spread[:] = self._no_spread
-
-    def _turned(self, stamp: int, sensor: str | None, values: _Values, noise: float = 1.0) -> int:
-        """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
-        window, bits, near = self._window, 0, None
-        if sensor is not None:
-            told = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
-            near = np.array([told or 0.0])
-        point = {name: number(values[name]) for name in CARTESIAN if name in values}
-        placed = self._frame_start.in_axes(point, near)
-        for name, component in placed.items():
-            axis = self._bits[name]
-            window.value[axis], spread = component
-            window.spread[axis] = noise * spread
-            bits |= 1 << axis
-        return bits
-
-    def _say_contradiction(self, stamp: int, sensor: str) -> None:
-        """Say which other sensor one contradicts, by how much, and since when."""
-        window = self._window
-        other = tuple(self._sensors)[window.port.contradicts]
-        if self._contradicting.get(sensor) == other:
-            return
-        self._contradicting[sensor] = other
-        screens = map(self.config.arm.screen_of, self.axes)
-        off = ", ".join(
-            f"{axis} by {nu * screen.scale:+.4g} {screen.unit}"
-            for axis, screen, outcome, nu in zip(self.axes, screens, window.outcome, window.innovation, strict=True)
-            if outcome == Outcome.REJECTED
-        )
-        self._log.write(
-            f"{sensor} contradicts {other}",
-            f"sensor '{sensor}' contradicts '{other}' since {stamp / 1e9:.3f} s ({off}): {_REJECTED}",
-        )
-
-    def _no_axis(self, stranger: str) -> str:
-        """Why what an event gives under a name is of no axis."""
-        if stranger in CARTESIAN and self.config.frame is None:
-            return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
-        if not stranger:
-            return "gives no axis"
-        return f"unknown axis '{stranger:.40}'; {suggestion(stranger, [*self.axes, *self.joints])}"
-
-    def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
-        """The result of an event by the codes of its axes; the same object for equal codes, but for unknown names."""
-        outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
-        result = update_result(outcomes)
-        if stranger:
-            axes = MappingProxyType({**outcomes, stranger: _UNKNOWN})
-            return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
-        return self._answers.setdefault(codes, result)
-
-    def _refuse_late(self, stamp: int, sensor: str | None, values: _Values, outcomes: IntArray) -> UpdateResult:
-        """Count an event that is behind the window; how late it is shows which window it would take."""
-        if sensor is not None:
-            self._counts.came(self._sensors[sensor], stamp, self._clock.now)
-        late, window = self._clock.sure - stamp, self._clock.window
-        why = f"stamped {late / 1e9:.3f} s behind the newest; the window is {window / 1e9:g} s"
-        if late <= window:
-            why = f"more than {MOST_EVENTS} events came since: the window holds no more"
-        return self._refuse(sensor, values, _TOO_LATE, why, outcomes)
-
-    def _refuse(
-        self, sensor: str | None, values: _Values, outcome: Outcome, reason: str, outcomes: IntArray | None = None
-    ) -> UpdateResult:
-        """Count an event that never comes into the window, a measurement for each of its axes, among ``outcomes``."""
-        outcomes, result = self._refused if outcomes is None else outcomes, refused(axes_of(values), outcome, reason)
-        if sensor is None:
-            outcomes[COMMAND, outcome] += 1
-        elif sensor in self._sensors:
-            outcomes[self._sensors[sensor], outcome] += len(result.axes)
-        else:
-            self._strangers += 1
-        return result
+    def _restart(self, counts: Counts) -> None:
+        """An empty window; ``counts`` go on."""
+        self._frame_start = FrameStart(self.config.frame, self.axes)
+        model = live_model(self.config, self._frame_start.start_at_level(self._start))
+        self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
+        self._tool = tool_of(self.config, self._log)
+        self._spreads = self._tool is not None or self.config.frame is not None  # whether noise is scaled, as is known
+        for part in (self._watch, self._screen, self._holds, self._diagnosis, self._set_back, counts):
+            part.restart()
+        # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
+        # what came is fed again then, and counted anew.
+        self._early: list[_Event] | None = [] if self._frame_start.waits else None
+        self._counts, self._before = counts, copy.deepcopy(counts)

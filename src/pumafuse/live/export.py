@@ -53,7 +53,7 @@ def header(config: FusionConfig, name: str, source: str) -> str:
         mark=MARK,
         version=version("pumafuse"),
         source=_comment(source),
-        frame="" if (missing := left_out(config)) is None else f", in the axes of the arm: {missing} not in here",
+        frame="" if (missing := omissions(config)) is None else f", in the axes of the arm: {missing} not in here",
         upper=upper,
         name=name,
         interface=VERSION,
@@ -65,7 +65,7 @@ def header(config: FusionConfig, name: str, source: str) -> str:
     )
 
 
-def left_out(config: FusionConfig) -> str | None:
+def omissions(config: FusionConfig) -> str | None:
     """What of a configuration turns events into the arm's axes and is not in its header, with a verb; or None."""
     placed = [name for name, sensor in config.sensors.items() if sensor.is_placed]
     parts = ["its [frame]"] if config.frame is not None else []

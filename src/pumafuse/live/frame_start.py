@@ -27,7 +27,7 @@ class FrameStart:
         """Whether a command is needed to know the start."""
         return self._frame is not None and self.placed is None
 
-    def start(self, level: Mapping[str, float]) -> dict[str, float]:
+    def start_at_level(self, level: Mapping[str, float]) -> dict[str, float]:
         """Convert a start level to axes [m]; its x and y start the frame."""
         in_axes = {name: value for name, value in level.items() if name in self._axes}
         others = {name: value for name, value in level.items() if name not in in_axes}
@@ -39,7 +39,7 @@ class FrameStart:
             self.placed = self.placed or placed_at(self._frame, others["x"], others["y"], "start")
         return in_axes | {axis: value for axis, (value, _) in self.in_axes(others, None).items()}
 
-    def begin(self, stamp: int, x: float, y: float) -> None:
+    def start_at_command(self, stamp: int, x: float, y: float) -> None:
         """Start the frame at a command's x and y [m]."""
         assert self._frame is not None
         self.placed, self.since = placed_at(self._frame, x, y, "command"), stamp

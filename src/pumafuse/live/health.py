@@ -89,7 +89,7 @@ class _Intervals:
     dropouts: int = 0
     in_a_row: int = 0
 
-    def look_at(self, stamps: list[int]) -> None:
+    def add(self, stamps: list[int]) -> None:
         """Count each interval [ns]: as a dropout, or to the usual one."""
         for stamp in stamps:
             last, self.last = self.last, stamp
@@ -130,27 +130,27 @@ class Counts:
         for interval in self._intervals:
             interval.last = None
 
-    def came(self, sensor: int, stamp: int, newest: int) -> None:
+    def add_row(self, sensor: int, stamp: int, newest: int) -> None:
         """Count a row that comes; ``newest`` [ns] is the newest stamp of all."""
         self._came.append((sensor, stamp, newest))
         if len(self._came) >= _MOST:
             self._count_what_came()
 
-    def read(self, window: Window) -> None:
+    def count(self, window: Window) -> None:
         """Count some of what has left the window, if that is much; after each event, for it is not there for ever."""
         if window.port.begin - self._unread >= _MOST:
-            self._read(window, self._unread + _MOST)
+            self._count_rows(window, self._unread + _MOST)
 
     def snapshot(self, window: Window) -> Counts:
         """What there was until now, with what is still in the window."""
-        self._settle(window)
+        self._count_all(window)
         now = copy.deepcopy(self)
-        now._read(window, window.port.end)
+        now._count_rows(window, window.port.end)
         return now
 
     def forget(self, window: Window, after: int) -> None:
         """Before the window does: what is stamped after ``after`` [ns] is invalid, and nothing else remains of it."""
-        self._settle(window)
+        self._count_all(window)
         stamp, source, results = window.read(window.port.begin, window.port.end)
         late, measured = stamp > after, source >= 0
         given_rows = np.count_nonzero(results.outcome != ABSENT, axis=1)
@@ -180,10 +180,10 @@ class Counts:
             outcomes=by_word(self.outcomes[sensor] + outcomes),
         )
 
-    def _settle(self, window: Window) -> None:
+    def _count_all(self, window: Window) -> None:
         """Count all that came and all that has left the window."""
         self._count_what_came()
-        self._read(window, window.port.begin)
+        self._count_rows(window, window.port.begin)
 
     def _count_what_came(self) -> None:
         sensor, stamp, newest = np.array(self._came, dtype=np.int64).reshape(-1, 3).T
@@ -196,13 +196,13 @@ class Counts:
         np.add.at(self._minute[_LATENESS], cell, late)
         np.maximum.at(self._minute[_LATEST], cell, late)
 
-    def _read(self, window: Window, end: int) -> None:
+    def _count_rows(self, window: Window, end: int) -> None:
         """Count what became of the rows to ``end``, which leave the window."""
         stamp, source, results = window.read(self._unread, end)
         self._unread, sensors, measured = end, len(self.rows), source >= 0
         stamp, source, codes = stamp[measured], source[measured].astype(np.int64), results.outcome[measured]
-        reshape = np.bincount((256 * source[:, None] + codes).ravel(), minlength=256 * sensors).reshape(sensors, 256)
-        self.outcomes[:-1] += reshape[:, : len(Outcome)]
+        table = np.bincount((256 * source[:, None] + codes).ravel(), minlength=256 * sensors).reshape(sensors, 256)
+        self.outcomes[:-1] += table[:, : len(Outcome)]
         cell, is_recent = self._places(source, stamp)
         taken = ((codes == Outcome.FUSED) | (codes == Outcome.REACQUIRED)) & is_recent[:, None]
         nis = (results.innovation[measured][taken] / results.innovation_sd[measured][taken]) ** 2
@@ -210,7 +210,7 @@ class Counts:
         np.add.at(self._minute[_NIS], cell, nis)
         np.add.at(self._minute[_VALUES], cell, 1.0)
         for sensor, intervals in enumerate(self._intervals):
-            intervals.look_at(stamp[source == sensor].tolist())
+            intervals.add(stamp[source == sensor].tolist())
 
     def _places(self, sensor: IntArray, stamp: TimeArray) -> tuple[IntArray, BoolArray]:
         """Where in the last minute rows are counted (n,), and which of them are not a minute old (n,)."""

@@ -47,7 +47,7 @@ class Joints:
         """Begin anew by another clock."""
         self._told_at, self._told = list[int](), list[Told]()
 
-    def told(self, values: Mapping[str, Any]) -> Told | None:
+    def parse(self, values: Mapping[str, Any]) -> Told | None:
         """Where an event tells the joints to be; None if it tells of none."""
         if self.kinds.keys().isdisjoint(values):
             return None
@@ -61,7 +61,7 @@ class Joints:
             raise ValueError(f"gives joints and {twice}, which their pose has; give one")
         return told
 
-    def posed(self, values: Mapping[str, Any], told: Told) -> dict[str, Any]:
+    def to_pose(self, values: Mapping[str, Any], told: Told) -> dict[str, Any]:
         """The values of an event with the pose of the tool in the place of joints."""
         return {name: value for name, value in values.items() if name not in self.kinds} | self._pose(told)
 
@@ -71,7 +71,7 @@ class Joints:
         return pose | {ORIENTATION: tuple(orientation[0].tolist())} if self._turns else pose
 
     def command(self, stamp: int, told: Told, oldest: int) -> dict[int, Told]:
-        """Take a command in: by stamps where it tells each joint to be, and where those tell it that it changes.
+        """Add a command; by stamps where it tells each joint to be, and where those tell it that it changes.
 
         A joint that answers later is told later, on the line from command to command, as
         :meth:`pumafuse.logs.run.Source.delayed` has it.
@@ -81,12 +81,12 @@ class Joints:
         self._told_at[at : at + again], self._told[at : at + again] = [stamp], [told]
         until = self._told_at[at + 1] + self._latest if at + 1 < len(self._told_at) else stamp
         end = max(bisect_left(self._told_at, until), at + 1) if self._late else at + 1
-        command = {self._told_at[row]: self._delayed(row) for row in range(at, end)}
+        command = {self._told_at[row]: self._delay(row) for row in range(at, end)}
         while len(self._told_at) > 1 and self._told_at[1] <= oldest - self._latest:  # one is on the line to the next
             del self._told_at[0], self._told[0]
         return command
 
-    def _delayed(self, row: int) -> Told:
+    def _delay(self, row: int) -> Told:
         """Where a command tells the joints to be, those that are later by what was told before."""
         told = list(self._told[row])
         for joint, by in self._late.items():

@@ -91,7 +91,7 @@ def _condition(where: Mapping[str, bool | int | float | str]) -> Callable[[Any],
     return met
 
 
-def _turned(orientation: Orientation, where: str) -> Callable[[Any], tuple[float, ...] | None]:
+def _quaternion_getter(orientation: Orientation, where: str) -> Callable[[Any], tuple[float, ...] | None]:
     """The quaternion x, y, z, w of a row; None where it has none."""
     plain = orientation.quaternion is not None
     columns = [Column(name, orientation.unit) for name in orientation.columns]
@@ -153,7 +153,7 @@ class Reader:
             axis: [_Number(column, where) for column in columns]
             for axis, columns in (*entry.axes.items(), *entry.joints.items())
         }
-        self._turned = None if entry.orientation is None else _turned(entry.orientation, where)
+        self._turned = None if entry.orientation is None else _quaternion_getter(entry.orientation, where)
         self._noise = None if entry.noise is None else getter(entry.noise.column)
         self._commanded, self._turns, self._away = commanded, entry.turns, dict[str, float]()
         self._is_of_paths = PATH in holders(entry.fields)
@@ -167,7 +167,7 @@ class Reader:
         self._coming: Iterator[SimpleNamespace] = iter(())
         self._next: SimpleNamespace | None = None  # of the path; then come the others
 
-    def lacks(self, empty: Any) -> list[str]:
+    def missing_fields(self, empty: Any) -> list[str]:
         """The fields that a type of messages has not, of which this is an empty one."""
         parts = _rows(empty, self._asks_whole)
         if self._is_of_paths:

@@ -73,7 +73,7 @@ class UdpListener:
         if not self._backlog:
             select.select([self._socket], [], [], QUIET)
         self._receive(_MOST_RECEIVED)
-        if (lost := self._lost()) > self._reported:
+        if (lost := self._count_lost()) > self._reported:
             self._reported = lost
             self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
         return _lines(self._backlog.some(time.monotonic()))
@@ -81,7 +81,7 @@ class UdpListener:
     def stop(self) -> list[bytes]:
         """Close the socket, and return the lines that have come and were not given yet."""
         self._receive(_MOST_LEFT)
-        self._lost()  # for the last time
+        self._count_lost()  # for the last time
         self._socket.close()
         return _lines(self._backlog.remaining())
 
@@ -89,7 +89,7 @@ class UdpListener:
         """How many came, and how many were lost or refused."""
         waited = self._backlog
         taken = waited.received - waited.dropped - waited.shed
-        text = f"{self._name}: {taken} datagrams taken in, {self._lost()} lost{waited.shed_words}"
+        text = f"{self._name}: {taken} datagrams taken in, {self._count_lost()} lost{waited.shed_words}"
         return f"{text}, {self._refused} refused" if self._refused else text
 
     def _receive(self, most: int) -> None:
@@ -104,9 +104,9 @@ class UdpListener:
                 self._refused += 1
                 self._log.write("refused", f"a datagram from {sender[0]}, which --allow does not name: refused")
                 continue
-            self._backlog.append(now, bytes(self._room[:size]))
+            self._backlog.add(now, bytes(self._room[:size]))
 
-    def _lost(self) -> int:
+    def _count_lost(self) -> int:
         """How many datagrams were dropped, here or by the system."""
         if sys.platform == "linux" and self._socket.fileno() >= 0:
             with contextlib.suppress(OSError):
@@ -125,6 +125,10 @@ class _Merged:
     def __init__(self) -> None:
         self._pieces = queue.Queue[Items](_MOST_PIECES)
 
+    def add(self, items: Items) -> None:
+        """Add what a thread has; it waits where there is no room."""
+        self._pieces.put(items)
+
     def get(self) -> Items:
         """Some of one thread; none after a tenth of a second without any."""
         try:
@@ -132,17 +136,8 @@ class _Merged:
         except queue.Empty:
             return []
 
-
-class _Tcp(_Merged):
-    """Connections of lines, each read by a thread."""
-
-    def __init__(self, notify: Callable[[str], None]) -> None:
-        super().__init__()
-        self._notify, self._log = notify, RateLimitedLog(notify)
-
-    def stop(self) -> Items:
-        """What has come and was not given yet; the connections end with the process."""
-        self._log = _SILENT
+    def remaining(self) -> Items:
+        """What has come and was not given yet; the threads end with the process."""
         left = list[bytes | Event]()
         with contextlib.suppress(queue.Empty):
             for _ in range(_MOST_PIECES + _MOST_CONNECTIONS):  # and one that each thread holds; a flood has no end
@@ -168,12 +163,13 @@ def _read_lines(
     return some
 
 
-class TcpListener(_Tcp):
+class TcpListener(_Merged):
     """Lines from all who connect."""
 
     def __init__(self, socket_address: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
-        super().__init__(notify)
+        super().__init__()
         self._address, self._allowed = socket_address, allowed
+        self._notify, self._log = notify, RateLimitedLog(notify)
         self._open, self._silent = set[socket.socket](), dict[socket.socket, None]()
         self._accepted = self._refused = 0
 
@@ -184,6 +180,11 @@ class TcpListener(_Tcp):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._name = _listen(self._socket, "tcp-listen", self._address[1], self._notify)
         _in_a_thread(self._accept_all)
+
+    def stop(self) -> Items:
+        """What has come and was not given yet; the connections end with the process."""
+        self._log = _SILENT
+        return self.remaining()
 
     def summary(self) -> str:
         """How many connections there were and are."""
@@ -223,7 +224,7 @@ class TcpListener(_Tcp):
         return False
 
     def _serve(self, connection: socket.socket, peer: str) -> None:
-        _read_lines(connection, self._pieces.put, lambda: self._silent.pop(connection, None))
+        _read_lines(connection, self.add, lambda: self._silent.pop(connection, None))
         self._silent.pop(connection, None)
         self._open.discard(connection)
         self._log.write("gone", f"the connection from {peer} has ended")
@@ -276,20 +277,24 @@ class _Client:
         raise NotImplementedError
 
 
-class TcpClient(_Client, _Tcp):
+class TcpClient(_Client):
     """Lines from a server."""
 
     def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
-        _Tcp.__init__(self, notify)
-        _Client.__init__(self, address, notify)
+        super().__init__(address, notify)
+        self._merged = _Merged()
+
+    def get(self) -> Items:
+        """Some lines; none after a tenth of a second without any."""
+        return self._merged.get()
 
     def stop(self) -> Items:
         """What has come and was not given yet; no connection is made any more."""
         self._end()
-        return super().stop()
+        return self._merged.remaining()
 
     def _read(self, connection: socket.socket) -> bool:
-        return _read_lines(connection, self._pieces.put)
+        return _read_lines(connection, self._merged.add)
 
 
 class Refused(Exception):  # noqa: N818 - what a server does, and never leaves the thread that reads
@@ -329,18 +334,18 @@ class EventClient(_Client):
         with connection, contextlib.suppress(OSError):
             _keep_alive(connection)
             try:
-                for events in self._received(connection):
+                for events in self._receive(connection):
                     now = time.monotonic()
                     with self._came:
                         for event in events:
-                            self._backlog.append(now, event)
+                            self._backlog.add(now, event)
                         self._came.notify()
                     some = True
             except (Refused, ConfigError, struct.error) as error:
                 self._log.write("refused", f"{self._name}: {self.REFUSED}{error}")
         return some
 
-    def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
+    def _receive(self, connection: socket.socket) -> Iterator[list[Event]]:
         """The events of each message; what is refused, or too short, is raised as Refused or struct.error."""
         raise NotImplementedError
 
@@ -400,7 +405,7 @@ class Several(_Merged):
         try:
             while not self._ended.is_set():
                 if items := source.get():
-                    self._pieces.put(items)
+                    self.add(items)
         except Exception as error:  # it is the thread that takes what comes that is to end by it
             self._error = error
 

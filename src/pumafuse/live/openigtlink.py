@@ -50,7 +50,7 @@ class OpenIgtLinkSource(EventClient):
         self._axes = [in_space or axis in config.arm.axes for axis in CARTESIAN]
         self._turns, self._on_receipt = takes_orientation(config), address.on_receipt
 
-    def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
+    def _receive(self, connection: socket.socket) -> Iterator[list[Event]]:
         for stamp, seen, poses in _messages(connection.makefile("rb")):
             stamp = time.time_ns() if self._on_receipt or not stamp else stamp
             told = ((device, pose if seen else [math.nan] * len(pose)) for device, pose in poses)
@@ -98,7 +98,7 @@ def _messages(stream: BinaryIO) -> Iterator[tuple[int, bool, _Poses]]:
             if len(body) < size:
                 return
             stamp = seconds * 10**9 + (fraction * 10**9 >> 32)
-            content, seen = (body, True) if version == 1 else _without_metadata(body)
+            content, seen = (body, True) if version == 1 else _drop_metadata(body)
             yield stamp, seen, _poses(name, _text(device), content)
 
 
@@ -108,7 +108,7 @@ def _pass_over(stream: BinaryIO, size: int) -> None:
         size -= len(piece)
 
 
-def _without_metadata(body: bytes) -> tuple[bytes, bool]:
+def _drop_metadata(body: bytes) -> tuple[bytes, bool]:
     """The content of a body of version 2 or later, and whether its metadata say that the device is seen."""
     before, index, texts = _EXTENDED.unpack_from(body)
     end = len(body) - index - texts

@@ -205,7 +205,7 @@ class Recorder:
             self.lost += number
         elif number:
             rows = {_file(sensor): b"".join(lines) for sensor, lines in by_source.items()}
-            if self._writer.hand_over(Job(self._folder, rows, self._manifest(listed), number)):
+            if self._writer.add(Job(self._folder, rows, self._manifest(listed), number)):
                 self._taken += number
                 self._listed = listed
             else:
@@ -265,8 +265,8 @@ class Writer:
         self._thread = threading.Thread(target=self._work, name="record", daemon=True)  # a dead disk may hold it
         self._thread.start()
 
-    def hand_over(self, job: Job) -> bool:
-        """Take a job in if there is room for it; whether there was."""
+    def add(self, job: Job) -> bool:
+        """Add a job if there is room for it; whether there was."""
         size = sum(map(len, job.rows.values()))
         if self._taken - self._done + size > _MOST_WAITING:
             return False
@@ -283,8 +283,8 @@ class Writer:
     def _work(self) -> None:
         while (job := self._jobs.get()) is not None:
             size = sum(map(len, job.rows.values()))
-            while not self._tried(job):
-                if self._ended.wait(_TRIED_AGAIN) and not self._tried(job):
+            while not self._write_rest(job):
+                if self._ended.wait(_TRIED_AGAIN) and not self._write_rest(job):
                     return
             self._done += size
             self.rows += job.number
@@ -293,7 +293,7 @@ class Writer:
         self._folder, self._manifest = folder, ""
         self._sizes: dict[str, int] = {}  # of each file, as far as its rows are complete
 
-    def _tried(self, job: Job) -> bool:
+    def _write_rest(self, job: Job) -> bool:
         """Write what is left of a job; whether all of it is written."""
         try:
             if job.folder != self._folder:

@@ -48,7 +48,7 @@ def update_result(outcomes: Mapping[str, Outcome]) -> UpdateResult:
     return UpdateResult(best, MappingProxyType(dict(outcomes)), reasons)
 
 
-def refused(values: Iterable[str], outcome: Outcome, reason: str) -> UpdateResult:
+def refuse(values: Iterable[str], outcome: Outcome, reason: str) -> UpdateResult:
     """The result of an event that never came to the filter, whatever it gives."""
     return UpdateResult(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
 

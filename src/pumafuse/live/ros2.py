@@ -87,16 +87,16 @@ class Ros2Source:
         self._backlog.name = self.node.get_fully_qualified_name()
         for topic in self._topics:
             try:
-                self._resolved(topic)
+                self._resolve(topic)
             except Exception as error:  # of the middleware
                 self.close()
                 raise ConfigError(f"run.toml: topic '{topic.name}' is no name of ROS 2: {reason(error)}") from None
 
     def start(self) -> None:
         """Listen."""
-        self._notify(f"{self._backlog.name}: listening at {', '.join(map(self._resolved, self._topics))}")
+        self._notify(f"{self._backlog.name}: listening at {', '.join(map(self._resolve, self._topics))}")
         self._began = time.monotonic()
-        self._look(self._began)
+        self._find_publishers(self._began)
 
     def get(self) -> list[Event]:
         """Some events in the order of their receipt; none after a tenth of a second without any."""
@@ -106,7 +106,7 @@ class Ros2Source:
         now = time.monotonic()
         self._receive(now)
         if now - self._looked > _LOOK:
-            self._look(now)
+            self._find_publishers(now)
         return self._backlog.some(now)
 
     def stop(self) -> list[Event]:
@@ -139,16 +139,16 @@ class Ros2Source:
                         taken = subscription.handle.take_message(subscription.msg_type, False)
                         if taken is None:
                             break
-                        self._take(topic, *taken)
+                        self._add(topic, *taken)
         if self._command.next_due is not None:
             at = self.clock()
             self._burst += [(at, event) for event in self._command.due(at)]
         self._burst.sort(key=lambda received: received[0])
         for _, event in self._burst:
-            self._backlog.append(now, event)
+            self._backlog.add(now, event)
         self._burst.clear()
 
-    def _take(self, topic: Topic, message: Any, info: Mapping[str, Any]) -> None:
+    def _add(self, topic: Topic, message: Any, info: Mapping[str, Any]) -> None:
         received = self.clock() if self.simulated else info["received_timestamp"]
         for reader in topic.readers:
             try:
@@ -158,14 +158,14 @@ class Ros2Source:
         if not self.frame and not topic.readers[-1].name:
             self.frame = getattr(getattr(message, "header", None), "frame_id", "")
 
-    def _resolved(self, topic: Topic) -> str:
+    def _resolve(self, topic: Topic) -> str:
         return self.node.resolve_topic_name(topic.name)
 
-    def _look(self, now: float) -> None:
+    def _find_publishers(self, now: float) -> None:
         """Look at who publishes, and subscribe to what somebody does."""
         self._looked, self.simulated = now, bool(self.node.get_parameter("use_sim_time").value)
         for topic in self._topics:
-            name, before = self._resolved(topic), topic.publishers
+            name, before = self._resolve(topic), topic.publishers
             count = self.node.count_publishers(name)
             if count and topic.subscription is None:
                 self._subscribe(topic, name)
@@ -191,7 +191,7 @@ class Ros2Source:
             package, _, type_name = kind.partition("/")
             try:
                 message = getattr(import_module(f"{package}.msg"), type_name.rpartition("/")[2])
-                lacking = [path for reader in topic.readers for path in reader.lacks(message())]
+                lacking = [path for reader in topic.readers for path in reader.missing_fields(message())]
             except (ImportError, AttributeError):
                 self._log.write(f"{name} {kind}", f"{name}: no package here has its type {kind}: source one that does")
                 continue
@@ -203,8 +203,8 @@ class Ros2Source:
                 continue
             qos = load("rclpy.qos")
             depth = qos.QoSProfile(depth=_DEPTH, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
-            handler, take = load("rclpy.event_handler"), partial(self._take, topic)
-            lost = handler.SubscriptionEventCallbacks(message_lost=partial(self._lost, topic))
+            handler, take = load("rclpy.event_handler"), partial(self._add, topic)
+            lost = handler.SubscriptionEventCallbacks(message_lost=partial(self._count_lost, topic))
             subscribe = partial(self.node.create_subscription, message, topic.name, take, depth)
             try:
                 topic.subscription = subscribe(event_callbacks=lost)
@@ -213,7 +213,7 @@ class Ros2Source:
             topic.kind = kind
             return
 
-    def _lost(self, topic: Topic, status: Any) -> None:
+    def _count_lost(self, topic: Topic, status: Any) -> None:
         topic.lost += status.total_count_change
         self._log.write(f"{topic.name} lost", f"{topic.name}: {topic.lost} messages lost on the way")
 

@@ -53,7 +53,7 @@ class RtdeSource(EventClient):
         if not self._variables:
             raise ConfigError(f"{self._name}: run.toml names no column of the robot, as in target_q_0")
 
-    def _received(self, connection: socket.socket) -> Iterator[list[Event]]:
+    def _receive(self, connection: socket.socket) -> Iterator[list[Event]]:
         connection.settimeout(_PATIENCE)
         packages = _packages(connection)
         recipe, layout, columns = self._agree(connection, packages)
@@ -88,7 +88,7 @@ class RtdeSource(EventClient):
             for column in ([name] if size == 1 else [f"{name}_{index}" for index in range(size)])
         ]
         empty = SimpleNamespace(**dict.fromkeys(columns, 0.0))
-        if lacking := [path for reader in self._readers for path in reader.lacks(empty)]:
+        if lacking := [path for reader in self._readers for path in reader.missing_fields(empty)]:
             raise Refused(f"the robot has no column {', '.join(lacking)}; it has {', '.join(columns)}")
         if ask(_BEGIN, b"") != b"\x01":
             raise Refused(f"the robot does not begin to send {self._rate:g} times a second")

@@ -38,7 +38,7 @@ class Steps:
         self._recent, self._new = deque[float](maxlen=_REMEMBERED), 0
 
     def add(self, value: float, consecutive: bool = True) -> None:
-        """Take the next value; one that is not ``consecutive`` tells of no step."""
+        """Add the next value; one that is not ``consecutive`` tells of no step."""
         self.pace, self.value = abs(value - self.value) if consecutive else 0.0, value
         if not self.pace > 0.0:
             return
@@ -51,7 +51,7 @@ class Steps:
             steps = np.array(self._recent)
             self._new, self.usual = 0, max(usual_of(steps), _BELIEVED * float(steps.max()))
 
-    def leapt(self, value: float) -> bool:
+    def has_leapt(self, value: float) -> bool:
         """Whether the next value is many times the usual step away."""
         return self.usual > 0.0 and leaps(value, self.value, max(self.usual, self.pace))
 
@@ -68,7 +68,7 @@ class _Repeated:
         self._new = 0
 
     def is_new(self, stamp: int, value: float) -> bool:
-        """Take the next value; whether it is another one."""
+        """Add the next value; whether it is another one."""
         self.stamp = stamp
         if value == self.value:
             self.count += 1
@@ -173,30 +173,30 @@ class CommandScreen:
         self._last, self.until = ALWAYS, NEVER  # who waits is believed when something is stamped later [ns]
         self._waiting: list[tuple[int, dict[str, Any]]] = []
 
-    def take(self, stamp: int, values: Mapping[str, Any]) -> list[Screened]:
-        """Take a command; those that are decided by now, without what is stray, and that."""
+    def add(self, stamp: int, values: Mapping[str, Any]) -> list[Screened]:
+        """Add a command; those that are decided by now, without what is stray, and that."""
         consecutive, self._last = 0 < stamp - self._last <= self._apart, stamp
         told = list[Screened]()
         if self._waiting and consecutive:
-            told = self._back(values)
+            told = self._judge_waiting(values)
             if not told and len(self._waiting) < MOST_STRAY:
                 self._waiting.append((stamp, dict(values)))
                 return []
-        told = told or self.believed()
+        told = told or self.release()
         if consecutive and any(self._leaps(name, value) for name, value in values.items()):
             self._waiting, self.until = [(stamp, dict(values))], stamp + self._patience
             return told
         self._learn(values, consecutive)
         return [*told, Screened(stamp, dict(values), {})]
 
-    def believed(self) -> list[Screened]:
+    def release(self) -> list[Screened]:
         """Those that wait, as nothing has shown that they are stray."""
         told, self._waiting, self.until = self._waiting, [], NEVER
         for _, values in told:
             self._learn(values, True)
         return [Screened(stamp, values, {}) for stamp, values in told]
 
-    def _back(self, now: Mapping[str, Any]) -> list[Screened]:
+    def _judge_waiting(self, now: Mapping[str, Any]) -> list[Screened]:
         """Those that wait, without what is stray, if each axis that has leapt is back now; else none."""
         told = list[Screened]()
         for stamp, values in self._waiting:
@@ -209,7 +209,7 @@ class CommandScreen:
         return told
 
     def _leaps(self, name: str, value: Any) -> bool:
-        return name in self._axes and self._axes[name].leapt(number(value))
+        return name in self._axes and self._axes[name].has_leapt(number(value))
 
     def _learn(self, values: Mapping[str, Any], consecutive: bool) -> None:
         for name, value in values.items():

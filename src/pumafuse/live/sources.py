@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import NO_STAMP, TimeArray
 from ..errors import RunError
 from ..fusion.config import FusionConfig
-from ..fusion.segments import as_commanded
+from ..fusion.segments import believed_commands
 from ..logs.clock import segments
 from ..logs.run import Run, Source
 from .tool import NOISE, ORIENTATION
@@ -42,7 +42,7 @@ def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
         yield lines.cut(piece)
 
 
-def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Event]]:
+def replay(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Event]]:
     """A run's events in the order of their arrival, at ``speed`` times its own pace; an empty list while it is quiet.
 
     A row arrives when the run says that it came; where it does not say, when its stamp says, and one that steps back
@@ -52,12 +52,12 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
     if run.clock != "stamps" and run.has_orientation:
         raise RunError(f"run '{run.name}': with orientations its clock = '{run.clock}' cannot be replayed; fuse it")
     for part in segments(run)[0]:
-        yield from _paced(*_arrivals(part, config), speed)
+        yield from _pace(*_arrivals(part, config), speed)
 
 
 def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     """When each event arrives [ns], ascending, (n,), and the events."""
-    sources = [*run.sensors.items(), ("", as_commanded(run, config))]
+    sources = [*run.sensors.items(), ("", believed_commands(run, config))]
     told = (source.arrival if len(source.arrival) else source.stamp for _, source in sources)
     arrival = np.concatenate([np.maximum.accumulate(stamp) for stamp in told])
     events = [event for name, source in sources for event in _events(name, source.in_joints())]
@@ -80,7 +80,7 @@ def _events(name: str, source: Source) -> Iterator[Event]:
         yield Event(math.nan if stamp == NO_STAMP else stamp, name, values or every)
 
 
-def _paced(arrival: TimeArray, events: list[Event], speed: float) -> Iterator[list[Event]]:
+def _pace(arrival: TimeArray, events: list[Event], speed: float) -> Iterator[list[Event]]:
     """Events when they are due by the wall clock; ``arrival`` is when each arrives [ns], ascending, (n,)."""
     first = int(arrival[arrival != NO_STAMP].min(initial=np.iinfo(np.int64).max))
     due = (np.maximum(arrival, first) - first) / 1e9 / speed  # rows without a stamp come at once

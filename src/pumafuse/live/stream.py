@@ -59,14 +59,17 @@ class Stream:
         self._out: list[bytes] = []
         self._log = RateLimitedLog(notify)
 
-    def take(self, items: Iterable[bytes | Event]) -> None:
-        """Take in lines and events, and write the estimates that are due after each."""
+    def add(self, items: Iterable[bytes | Event]) -> None:
+        """Add lines and events, and write the estimates that are due after each."""
         for item in items:
-            self.line(item) if isinstance(item, bytes) else self.event(item)
+            if isinstance(item, bytes):
+                self._add_line(item)
+            else:
+                self._add_event(item)
             self.flush()
 
-    def line(self, line: bytes) -> None:
-        """Take in one line."""
+    def _add_line(self, line: bytes) -> None:
+        """Add one line."""
         if not line.strip():
             return
         self.lines += 1
@@ -78,10 +81,10 @@ class Stream:
             reason = str(error)
             self._log.write(f"bad line, {reason.partition(':')[0]}", f"bad line {self.lines}: {reason[:200]}: {shown}")
             return
-        self.event(event)
+        self._add_event(event)
 
-    def event(self, event: Event) -> None:
-        """Take in one event."""
+    def _add_event(self, event: Event) -> None:
+        """Add one event."""
         live, (t, sensor, values) = self.live, event
         self._with_ns = isinstance(t, int)
         if self._step is not None:

@@ -42,7 +42,7 @@ def axes_of(values: Iterable[str]) -> list[str]:
     return [axis for name in values if name != NOISE for axis in (TURNING if name == ORIENTATION else (name,))]
 
 
-def row_noise(values: Mapping[str, Any]) -> float:
+def parse_noise(values: Mapping[str, Any]) -> float:
     """By what a row's noise is scaled; 1 where it does not tell a positive number."""
     told = number(values.get(NOISE))
     return told if 0.0 < told < math.inf else 1.0
@@ -106,7 +106,7 @@ class Tool:
         self._turn = CommandedTurn(arm) if self._rows else None
         self._behind = round((max(map(arm.delay_of, arm.axes)) + max((*self._latency.values(), 0)) / 1e9) * 1e9)
 
-    def parsed(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    def parse(self, sensor: str | None, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """An event's values: a commanded orientation as axes, a measured one as a quaternion, (1, 4)."""
         if self._reference is not None and (twice := next((axis for axis in TURNING if axis in values), None)):
             raise ValueError(f"'{twice}': with [tool] an orientation comes as a quaternion x, y, z, w")
@@ -118,9 +118,9 @@ class Tool:
         told = unit(parsed.pop(ORIENTATION))
         if sensor is not None:
             return parsed | {ORIENTATION: told}
-        return parsed if self._reference is None else parsed | self._commanded(told, self._reference)
+        return parsed if self._reference is None else parsed | self._commanded_axes(told, self._reference)
 
-    def _commanded(self, told: FloatArray, reference: FloatArray) -> dict[str, float]:
+    def _commanded_axes(self, told: FloatArray, reference: FloatArray) -> dict[str, float]:
         """A commanded orientation (1, 4) as axes."""
         vector: list[float] = rotations.vectors(told, reference)[0].tolist()
         turn = math.hypot(*vector)
@@ -131,7 +131,7 @@ class Tool:
             self._log.write("turn", f"{far}: beyond 120° error bars of its orientation are too small")
         return dict(zip(TURNING, vector, strict=True))
 
-    def of_tool(self, sensor: str, stamp: int, values: Mapping[str, Any]) -> Told:
+    def to_tool(self, sensor: str, stamp: int, values: Mapping[str, Any]) -> Told:
         """What a sensor tells of the tool."""
         of_axes, spread = dict(values), dict[str, FloatArray]()
         oriented: FloatArray | None = of_axes.pop(ORIENTATION, None)
@@ -139,9 +139,9 @@ class Tool:
         if placing is not None:
             oriented = oriented if placing.is_oriented else None
             measured = np.array([[number(values.get(axis)) for axis in CARTESIAN]])
-            point = placing.seen(measured)
+            point = placing.to_base(measured)
             if oriented is not None:
-                oriented = np.where(lost(measured)[:, None], np.nan, placing.oriented(oriented))
+                oriented = np.where(lost(measured)[:, None], np.nan, placing.orientation(oriented))
             if placing.has_marker and oriented is None:
                 seen = point[0]
                 point = point - self._lever(sensor, np.array([stamp]))
@@ -162,15 +162,15 @@ class Tool:
         turn = self._turn.at(stamp - self._latency[sensor])
         return self._placings[sensor].lever(rotations.quaternions(turn, self._reference))
 
-    def keep(self, sensor: str, row: Row, oldest: int) -> None:
-        """Keep a row that the commands place; nothing that is stamped before ``oldest`` [ns] will come any more."""
+    def add(self, sensor: str, row: Row, oldest: int) -> None:
+        """Add a row that the commands place; nothing that is stamped before ``oldest`` [ns] will come any more."""
         if (rows := self._rows.get(sensor)) is not None:
             rows.insert(bisect_right(rows, row.stamp, key=_stamp), row)
             if rows[0].stamp < oldest - self._behind:
                 del rows[0]
 
     def command(self, stamp: int, values: Mapping[str, Any], oldest: int) -> int | None:
-        """Take a command in; from which instant on it turns the tool otherwise than was known [ns], if from any."""
+        """Add a command; from which instant on it turns the tool otherwise than was known [ns], if from any."""
         if self._turn is None or any(axis not in values for axis in TURNING):
             return None
         return self._turn.add(stamp, [values[axis] for axis in TURNING], oldest - self._behind)

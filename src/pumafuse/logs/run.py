@@ -246,7 +246,7 @@ class Source:
         if self.joints is not None:
             told = np.column_stack([between(value) for value in self.joints.values.T])
             return finer.posed(Joints(self.joints.chain, told))
-        turned = None if self.orientation is None else rotations.between(self.orientation, row, share)
+        turned = None if self.orientation is None else rotations.slerp(self.orientation, row, share)
         return replace(finer, orientation=turned)
 
     def on_timeline(self) -> tuple[Source, str | None]:

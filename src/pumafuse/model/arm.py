@@ -101,8 +101,8 @@ class Sag(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         ):
             if knee is not None and slope is not None:
                 ends = None if slope_ci95 is None else (1.0 + slope_ci95[0], 1.0 + slope_ci95[1])
-                times = _sized(1.0 + slope, ends, 1.0 / (1.0 + self.slope))
-                at = f"{_sized(knee, knee_ci95, screen.scale)} {screen.unit}"
+                times = _scale(1.0 + slope, ends, 1.0 / (1.0 + self.slope))
+                at = f"{_scale(knee, knee_ci95, screen.scale)} {screen.unit}"
                 phrases.append(f"sag: {side} {at} it moves {times} times as far as elsewhere")
         return phrases
 
@@ -159,10 +159,10 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         """Its play, fastest speed and sag, with intervals, and of which motion its lag is; of a linear axis nothing."""
         screen, phrases = SCREEN[self.kind], list[str]()
         if self.play:
-            size = f"{_sized(self.play, self.play_ci95, screen.scale)} {screen.unit}"
+            size = f"{_scale(self.play, self.play_ci95, screen.scale)} {screen.unit}"
             phrases.append(f"play: {size}, half of which over its speed adds to its lag")
         if self.max_speed:
-            size = f"{_sized(self.max_speed, self.max_speed_ci95, screen.scale)} {screen.unit}/s"
+            size = f"{_scale(self.max_speed, self.max_speed_ci95, screen.scale)} {screen.unit}/s"
             phrases.append(f"fastest speed: {size}, up to which its lag holds")
         return [*phrases, *(self.sag.words(screen) if self.sag else [])]
 
@@ -375,7 +375,7 @@ def commanded_speed(step: FloatArray, period: float) -> FloatArray:
     return np.abs(step) / period
 
 
-def _sized(value: float, ci95: Interval | None, scale: float) -> str:
+def _scale(value: float, ci95: Interval | None, scale: float) -> str:
     """A number with its interval, if there is one, both times ``scale``."""
     if ci95 is None:
         return f"about {value * scale:.4g}"

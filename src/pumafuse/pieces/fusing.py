@@ -1,8 +1,8 @@
 """Fusion of a long run piece by piece: one filter whose state goes on from piece to piece.
 
-Each piece is a table of events of its own (:func:`pumafuse.fusion.segments.build`) with some rows of the pieces before
-and after it, so that every row has the neighbours that it has in the whole run: estimates and outcomes are the same to
-the last bit. What the neighbourhood of a row says in words (notes, skill) is said piece by piece.
+Each piece is a table of events of its own (:func:`pumafuse.fusion.segments.build_segment`) with some rows of the pieces
+before and after it, so that every row has the neighbours that it has in the whole run: estimates and outcomes are the
+same to the last bit. What the neighbourhood of a row says in words (notes, skill) is said piece by piece.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.engine import filter_piece
 from ..fusion.estimates import Estimates
-from ..fusion.faults import by_axis, latency_questions, sensor_faults, starts_in_motion
-from ..fusion.offline import Part, estimates_of, found_by
+from ..fusion.faults import by_axis, check_sensors, latency_questions, starts_in_motion
+from ..fusion.offline import Part, estimates_of, row_notes
 from ..fusion.placing import in_base
 from ..fusion.results import Making
-from ..fusion.segments import Segment, build, no_estimates, output_times
+from ..fusion.segments import Segment, build_segment, no_estimates, output_times
 from ..fusion.setup import filter_model
 from ..fusion.summary import Summary, encode
 from ..fusion.verdicts import sensor_problems
@@ -35,7 +35,7 @@ from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, clock_faults
 from ..logs.manifest import stamps_of
 from ..logs.run import Run
 from ..logs.set_back import going_on
-from .merging import Digest, digest, merged
+from .merging import Digest, digest, merge
 from .reading import Log
 
 PIECE = 1_000_000  # rows that are read at a time
@@ -50,7 +50,7 @@ def fuse_to(
     results.check_writable(folder, force)
     stamps = stamps_of(path)
     with folders.replacing(folder) as new:
-        results.note_log(new, stamps)
+        results.write_stamps(new, stamps)
         digests = list[Digest]()
         with ExitStack() as files:
             names = results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE
@@ -66,7 +66,7 @@ def fuse_to(
                     progress(done)
         if not any(digest.estimates for digest in digests):
             raise no_estimates(how.rate)
-        summary = merged(digests)
+        summary = merge(digests)
         results.check_fused(summary.rows, how.config)
         how.config.save(new)
         (new / results.SUMMARY).write_bytes(encode(summary))
@@ -105,7 +105,7 @@ def _margins(config: FusionConfig) -> tuple[int, int]:
 def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> tuple[Segment, Filter]:
     """What the pieces of a run share, by its first rows: its first segment, and the filter, at rest before it."""
     run = in_base(run.between(), config)[0]
-    segment = build(run, config, chosen)
+    segment = build_segment(run, config, chosen)
     biases = [
         [
             name
@@ -127,7 +127,7 @@ def _piece(run: Run, how: Making, begun: Segment, core: Filter, span: tuple[int,
     lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
         raise RunError(f"{label}: the clock is set back by {lag.max():.3f} s; {_IN_ORDER}")
-    segment = build(in_place, config, how.selected, begun, span)
+    segment = build_segment(in_place, config, how.selected, begun, span)
     times = output_times(segment, config, how.rate, span=span)
     filtered = filter_piece(segment, core, config, times, span)
     first = span[0] == ALWAYS
@@ -135,9 +135,9 @@ def _piece(run: Run, how: Making, begun: Segment, core: Filter, span: tuple[int,
         segment = replace(segment, start={axis: float(segment.commands_of(axis)[1][0]) for axis in segment.axes})
     part = Part(in_place, segment, times, filtered)
     est = estimates_of(run, in_place, placed, config, [part])
-    faults = sensor_faults(segment, config)
+    faults = check_sensors(segment, config)
     notes = [*clock_faults(in_place, config.arm.update_period, []), *(fault.sentence for fault in faults)]
-    notes += found_by(est, [part])
+    notes += row_notes(est, [part])
     if first:
         notes += [*starts_in_motion(segment, config), *latency_questions(config, segment.sensors)]
     notes += sensor_problems(est)

@@ -22,15 +22,15 @@ from ..fusion.estimates import Estimates
 from ..fusion.offline import UNCOVERED
 from ..fusion.overruns import Overrun, overrun_notes, overruns
 from ..fusion.score import OrientationScore
-from ..fusion.segments import added
+from ..fusion.segments import sum_counts
 from ..fusion.summary import (
     AxisSummary,
     SensorSummary,
     Summary,
     axis_summary,
     orientation_score,
-    pooled,
-    pooled_number,
+    pool,
+    pool_number,
     sensor_summary,
     summary_of,
     weighted_mean,
@@ -79,7 +79,7 @@ def digest(est: Estimates, span: tuple[int, int]) -> Digest:
     return Digest(small, len(est.time), axes, innovations, est.reference is not None, orientation_score(est), beyond)
 
 
-def merged(digests: Sequence[Digest]) -> Summary:
+def merge(digests: Sequence[Digest]) -> Summary:
     """The summary of a run from what is left of its pieces, in their order."""
     parts = [digest.est for digest in digests]
     first, config = parts[0], parts[0].config
@@ -97,13 +97,13 @@ def merged(digests: Sequence[Digest]) -> Summary:
     whole = replace(
         first,
         time=np.concatenate([part.time for part in parts]),
-        command_counts=added(part.command_counts for part in parts),
-        counts={name: added(part.counts[name] for part in parts) for name in first.counts},
+        command_counts=sum_counts(part.command_counts for part in parts),
+        counts={name: sum_counts(part.counts[name] for part in parts) for name in first.counts},
         speed=speed,
         notes=tuple(notes),
     )
     oriented = [digest.orientation for digest in digests if digest.orientation is not None]
-    turned = pooled(oriented, [score.rows for score in oriented])
+    turned = pool(oriented, [score.rows for score in oriented])
     return msgspec.structs.replace(
         summary_of(whole, axes, turned), estimates=sum(digest.estimates for digest in digests)
     )
@@ -130,7 +130,7 @@ def _axis(digests: Sequence[Digest], axis: str) -> AxisSummary:
     return AxisSummary(
         sensors=sensors,
         log_likelihood=sum(part.log_likelihood for part in parts),
-        score=pooled(scores, [score.rows for score in scores]),
+        score=pool(scores, [score.rows for score in scores]),
         nees_band=chi_square_band(fused) if fused else None,
         kind=parts[0].kind,
     )
@@ -140,7 +140,7 @@ def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
     having = [digest for digest in digests if name in digest.axes[axis].sensors]
     parts = [part.axes[axis].sensors[name] for part in having]
     skills = [part.skill for part in parts if part.skill]
-    outcomes, skill = added(part.outcomes for part in parts), pooled(skills, [skill.predictions for skill in skills])
+    outcomes, skill = sum_counts(part.outcomes for part in parts), pool(skills, [skill.predictions for skill in skills])
     fused = [_fused(part) for part in parts]
     if not sum(fused):
         return SensorSummary(outcomes=outcomes, skill=skill)
@@ -148,7 +148,7 @@ def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
     faults = [fault for part in having if (fault := part.est.faults.get((name, axis)))]
     consistency = _consistency(parts, innovations, digests[0].est.config, name, axis)
     consistency = replace(consistency, fault=faults[0] if faults else "")
-    rms, sd = (pooled_number(key, [getattr(part, key) for part in parts], fused) or 0.0 for key in _SIZES)
+    rms, sd = (pool_number(key, [getattr(part, key) for part in parts], fused) or 0.0 for key in _SIZES)
     bias = digests[-1].est.biases.get(name, {}).get(axis)
     return sensor_summary(axis, outcomes, consistency, rms, sd, bias, skill)
 

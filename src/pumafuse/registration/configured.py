@@ -59,7 +59,7 @@ def configuration(
     begun: FusionConfig,
 ) -> FusionConfig:
     """A configuration to begin with: the arm that was found, and noise as it looks along the base's axes."""
-    config = as_late(placed_by(begun, registrations, latencies), registrations)
+    config = set_lags(set_placements(begun, registrations, latencies), registrations)
     placed = [in_base(run, config)[0] for run in runs]
     latency = {name: sensor.latency for name, sensor in config.sensors.items()}
     guessed = first_guess([guess(Survey(Path(run.name), run, relations(run)), latency) for run in placed])
@@ -88,7 +88,7 @@ def configuration(
     )
 
 
-def placed_by(
+def set_placements(
     config: FusionConfig, registrations: Mapping[str, Registration], latencies: Mapping[str, Quantity]
 ) -> FusionConfig:
     """The configuration with frame, marker, latency and bias of sensors."""
@@ -114,7 +114,7 @@ def _placement(placed: Registered | None) -> Placement | None:
     """A place as a configuration has it; None for one that is where the robot's is."""
     if placed is None:
         return None
-    at, rotation = (_rounded(vector) for vector in (placed.at, placed.rotation))
+    at, rotation = (_round(vector) for vector in (placed.at, placed.rotation))
     return Placement(at=at, rotation=rotation) if any(at) or any(rotation) else None
 
 
@@ -129,7 +129,7 @@ def _noise(sensor: Sensor, frame: Placement | None) -> float | dict[str, float]:
     return sd
 
 
-def _rounded(vector: Vector) -> Vector:
+def _round(vector: Vector) -> Vector:
     x, y, z = (round(number, DIGITS) for number in vector)
     return x, y, z
 
@@ -163,7 +163,7 @@ def _biases(sensor: Sensor, constants: Mapping[str, float], count: int) -> dict[
     }
 
 
-def as_late(config: FusionConfig, registrations: Mapping[str, Registration]) -> FusionConfig:
+def set_lags(config: FusionConfig, registrations: Mapping[str, Registration]) -> FusionConfig:
     """The configuration whose arm is as late as sensors of known latencies saw it: by its delays.
 
     Each counts as its lag is sure.
@@ -206,6 +206,6 @@ def _plant(response: Response) -> FirstOrder:
     return FirstOrder(time_constant=max(response.time_constant.value, _SHORTEST))
 
 
-def with_joints(config: FusionConfig, joints: dict[str, Joint]) -> FusionConfig:
+def set_joints(config: FusionConfig, joints: dict[str, Joint]) -> FusionConfig:
     """The configuration with other joints of its arm."""
     return msgspec.structs.replace(config, arm=msgspec.structs.replace(config.arm, joints=joints))

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray
 from .motion import Motion, Plant
-from .register import Quantity, Registration, rows_of, thinned, within
-from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, residual, slopes, tell
+from .register import Quantity, Registration, rows_of, thin, within
+from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, information_of, residual, slopes
 
 Later = Mapping[str, float]  # of each joint [s]
 Told = Callable[[Later], Sequence[Motion]]  # the commands of each run, with joints told later [s]
@@ -66,7 +66,7 @@ def joint_lags(
 
 def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Registration) -> _Step:
     """How much later each joint is beside a registration."""
-    sensor = _seen(told(later), sensor)
+    sensor = _drop_start(told(later), sensor)
     attitude = registration.rms_rotation is not None
     mean = np.concatenate([motion.position for motion in sensor]).mean(axis=0)
     state = _state(registration, mean)
@@ -85,18 +85,18 @@ def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Regi
         np.concatenate([slope[:, :, _BESIDE], by], axis=2)
         for slope, by in zip(slopes(rows, state, off.poses), by_joint, strict=True)
     ]
-    before = tell(slope, off.blocks, off.whitening(), expected=False)
+    before = information_of(slope, off.blocks, off.whitening(), expected=False)
     step = before.step()
     left = [block + by @ step for block, by in zip(off.blocks, slope, strict=True)]
-    after = tell(slope, left, off.whitening(), expected=True)
+    after = information_of(slope, left, off.whitening(), expected=True)
     of_joints = slice(-len(later), None)
     return _Step(step[of_joints], after.half_widths(np.eye(len(step))[of_joints]), off.noise())
 
 
-def _seen(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:
+def _drop_start(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:
     """What the sensor told once it is forgotten how the arm moved before the first command."""
     both = zip(command, sensor, strict=True)
-    return thinned(
+    return thin(
         [within(motion.valid(), command_motion.valid().time, _SETTLED) for command_motion, motion in both], _ROWS
     )
 

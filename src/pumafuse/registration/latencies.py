@@ -16,12 +16,12 @@ from ..arrays import BoolArray, FloatArray, median
 from ..fusion.config import FusionConfig
 from ..fusion.placing import Placing
 from ..logs.run import Run
-from .configured import placed_by
+from .configured import set_placements
 from .intervals import blocks
-from .motion import Answer, Motion, Plant, measured, motion_of
+from .motion import Answer, Motion, Plant, drop_repeated, motion_of
 from .register import Quantity, Registration
 from .solve import MEDIAN, curvature, weights
-from .start import despiked
+from .start import despike
 
 _SPEED = 0.05  # s, over which a velocity is taken
 _ROUNDS = 10  # of the weights and of the time
@@ -46,7 +46,7 @@ def latencies_of(
     if not lags:
         return {}
     best = min(lags, key=lambda name: (registrations[name].rms_rotation is None, lags[name].half))
-    beside, placed = {best: Quantity.around(0.0)}, placed_by(config, registrations, {})
+    beside, placed = {best: Quantity.around(0.0)}, set_placements(config, registrations, {})
     for name in (other for other in lags if other != best):
         both = [run for run in runs if {name, best} <= run.sensors.keys()]
         points = [_of_point(run, best, registrations[best], placed, name) for run in both]
@@ -67,24 +67,24 @@ def latencies_of(
 
 def _in_base(run: Run, name: str, config: FusionConfig) -> Motion:
     """What a placed sensor sees, where it is in the base's frame."""
-    seen = measured(run.sensors[name]).valid()
-    return seen._replace(position=Placing(config.sensors[name], config.arm).seen(seen.position))
+    seen = drop_repeated(run.sensors[name]).valid()
+    return seen._replace(position=Placing(config.sensors[name], config.arm).to_base(seen.position))
 
 
 def _of_point(run: Run, name: str, registration: Registration, config: FusionConfig, point: str) -> Motion:
     """What a placed sensor tells of the point that another one sees, and how the tool is turned, if that is told."""
     seen, placing = _in_base(run, name, config), Placing(config.sensors[name], config.arm)
     if seen.quaternion is not None and registration.rms_rotation is not None:
-        turned = placing.oriented(seen.quaternion)
+        turned = placing.orientation(seen.quaternion)
     else:
-        turned = _commanded(run, seen.time, registration)
+        turned = _commanded_orientation(run, seen.time, registration)
     if turned is None:
         return seen._replace(quaternion=None)
     lever = Placing(config.sensors[point], config.arm).lever(turned) - placing.lever(turned)
     return Motion(seen.time, seen.position + lever, turned)
 
 
-def _commanded(run: Run, time: FloatArray, registration: Registration) -> FloatArray | None:
+def _commanded_orientation(run: Run, time: FloatArray, registration: Registration) -> FloatArray | None:
     """How the commands have turned the tool when a sensor measures, as quaternions; None where they do not tell."""
     command, response = motion_of(run.command).valid(), registration.rotation or registration.position
     if command.quaternion is None or response is None:
@@ -105,7 +105,7 @@ def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) 
     tool is turned; one entry a run. None where both have too little in common, or it is not known to 50 ms.
     """
     pairs = [(_Path(a.valid()), b.valid()) for a, b in zip(first, other, strict=True)]
-    pairs = [(path, b.only(path.holds(b.time - about))) for path, b in pairs]
+    pairs = [(path, b.only(path.covers(b.time - about))) for path, b in pairs]
     pairs = [(path, b) for path, b in pairs if len(b.time) >= _FEWEST]
     if not pairs:
         return None
@@ -128,9 +128,9 @@ class _Path:
 
     def __init__(self, first: Motion) -> None:
         turned = [] if first.quaternion is None else [Rotation.from_quat(first.quaternion).as_matrix().reshape(-1, 9)]
-        self._time, self._told = first.time, np.hstack([despiked(first.position), *turned])
+        self._time, self._told = first.time, np.hstack([despike(first.position), *turned])
 
-    def holds(self, time: FloatArray) -> BoolArray:
+    def covers(self, time: FloatArray) -> BoolArray:
         """Whether there are velocities at some instants, also when they are shifted a little."""
         first, last = (self._time[0], self._time[-1]) if len(self._time) else (np.inf, -np.inf)
         return (time >= first + 2.0 * _SPEED) & (time <= last - 2.0 * _SPEED)

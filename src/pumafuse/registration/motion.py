@@ -54,7 +54,7 @@ def motion_of(source: Source) -> Motion:
     return Motion(seconds(source.stamp), position, source.orientation)
 
 
-def measured(source: Source) -> Motion:
+def drop_repeated(source: Source) -> Motion:
     """What a sensor tells, without what is no news: values that it repeats, and zeros, as it writes them when lost."""
     motion = motion_of(source)
     far = ~(np.abs(motion.position) < _FARTHEST).all(axis=1)
@@ -68,7 +68,7 @@ class Plant(NamedTuple):
     delay: float  # dead time [s], the sensor's latency with it
     time_constant: float  # τ of a first-order plant [s]
 
-    def changed(self, delay: float, share: float) -> Plant:
+    def change(self, delay: float, share: float) -> Plant:
         """With a dead time that is longer [s], and a time constant that is longer by a small share."""
         return Plant(self.delay + delay, self.time_constant * float(np.exp(share)))
 
@@ -106,13 +106,13 @@ class Answer:
         where = self._through(self._position, position)
         if not self.turns:
             return Poses(where, np.broadcast_to(np.eye(3), (len(where), 3, 3)))
-        return Poses(where, self._turned(rotation).as_matrix() @ self._reference.as_matrix())
+        return Poses(where, self._rotate(rotation).as_matrix() @ self._reference.as_matrix())
 
     def quaternions(self, rotation: Plant) -> FloatArray:
         """The orientations under a plant, as x, y, z, w, (n, 4); only where they are commanded."""
-        return (self._turned(rotation) * self._reference).as_quat()
+        return (self._rotate(rotation) * self._reference).as_quat()
 
-    def _turned(self, rotation: Plant) -> Rotation:
+    def _rotate(self, rotation: Plant) -> Rotation:
         """From the mean of the orientations."""
         return Rotation.from_rotvec(self._through(self._angle, rotation))
 
@@ -120,7 +120,7 @@ class Answer:
         """How position and orientation [rad along the base's axes] change with dead time [s] and log τ, (n, 3) each."""
         moved, turned = list[FloatArray](), list[FloatArray]()
         for delay, share in ((_STEP, 0.0), (0.0, _STEP)):
-            poses = self.poses(position.changed(delay, share), rotation.changed(delay, share))
+            poses = self.poses(position.change(delay, share), rotation.change(delay, share))
             moved.append((poses.position - here.position) / _STEP)
             turn = poses.rotation @ here.rotation.swapaxes(1, 2)
             turned.append(0.5 / _STEP * np.stack([turn[:, i - 1, i - 2] - turn[:, i - 2, i - 1] for i in range(3)], -1))

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray, median
 from ..fusion.config import Placement
-from ..space.rotations import crossed, left_jacobian
+from ..space.rotations import cross_matrix, left_jacobian
 from ..toml import Interval
 from ..units import DEG
 from .findings import AS_READ, Finding, Found, Reading, Vector
 from .motion import Answer, Motion, Plant
-from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, fitted
-from .start import Rough, aligned_turns, despiked, kabsch, ratio, read, rough, unit
+from .solve import ANGLE, CENTRE, MARKER, POSITION, ROTATION, SCALE, SIZE, TURN, Fit, Rows, State, fit_poses
+from .start import Rough, align_turns, despike, kabsch, ratio, read, rough, unit
 
 _SETTLED = 6.0  # rough lags after the first command: how the arm moved before is forgotten
 _AT_LEAST, _FEWEST = 5.0, 60  # s and rows of a sensor beside commands
@@ -102,7 +102,7 @@ class Response(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Registration(msgspec.Struct, frozen=True, kw_only=True):
-    """What :func:`registered` finds."""
+    """What :func:`register_sensor` finds."""
 
     frame: Registered | None = None  # base from sensor; None where a finding prevents it
     marker: Registered | None = None  # tool from marker; likewise
@@ -125,7 +125,7 @@ class Registration(msgspec.Struct, frozen=True, kw_only=True):
         return any(finding.finding is Finding.ALONG_BASE for finding in self.findings)
 
 
-def registered(
+def register_sensor(
     command: Sequence[Motion],
     sensor: Sequence[Motion],
     *,
@@ -152,9 +152,9 @@ def registered(
     if about.correlation < _FOLLOWS:
         return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
     settling = _SETTLED * max(about.lag, 0.0)
-    seen = [news(a, without_gaps(a.time, within(b, a.time, settling), settling)) for a, b in both]
-    begun = _begun(told, seen, about, marker or Placement(), fix_marker, loosely)
-    return _fitted(begun, fix_marker, loosely)
+    seen = [news(a, drop_gaps(a.time, within(b, a.time, settling), settling)) for a, b in both]
+    begun = _begin(told, seen, about, marker or Placement(), fix_marker, loosely)
+    return _fit(begun, fix_marker, loosely)
 
 
 def within(sensor: Motion, span: FloatArray, settling: float = 0.0) -> Motion:
@@ -164,7 +164,7 @@ def within(sensor: Motion, span: FloatArray, settling: float = 0.0) -> Motion:
     return sensor.only((sensor.time >= span[0] + settling) & (sensor.time <= span[-1]))
 
 
-def without_gaps(span: FloatArray, sensor: Motion, settling: float) -> Motion:
+def drop_gaps(span: FloatArray, sensor: Motion, settling: float) -> Motion:
     """What a sensor told, but for gaps of the commands, whose instants are ``span`` [s], (n,).
 
     Where the tool was told to be in a gap is not known; it may move as was told for ``settling`` [s] after it.
@@ -194,7 +194,7 @@ def news(command: Motion, sensor: Motion) -> Motion:
     return sensor.only(kept) if many and np.count_nonzero(kept) >= _FEWEST else sensor
 
 
-def thinned(sensor: Sequence[Motion], rows: int) -> list[Motion]:
+def thin(sensor: Sequence[Motion], rows: int) -> list[Motion]:
     """About so many rows at most."""
     step = -(-sum(len(motion.time) for motion in sensor) // rows)
     return [motion.only(np.arange(0, len(motion.time), step)) for motion in sensor]
@@ -222,19 +222,19 @@ class _Begin(NamedTuple):
     findings: list[Found]  # what was found on the way
 
 
-def _begun(
+def _begin(
     command: list[Motion], sensor: list[Motion], about: Rough, marker: Placement, fix_marker: bool, loosely: bool
 ) -> _Begin:
     """Unit, handedness and reading of orientations, from positions alone at first."""
     ahead = about.scale if np.isfinite(about.scale) and abs(np.log(about.scale)) > np.log(_ANOTHER) else 1.0
     sensor = [motion._replace(position=ahead * motion.position) for motion in sensor]
     about = about._replace(scale=about.scale / ahead)
-    few, findings = thinned(sensor, _COARSE), list[Found]()
-    mean = np.concatenate([despiked(motion.position) for motion in few]).mean(axis=0)
-    seen = np.concatenate([despiked(motion.position) for motion in few]) - mean
+    few, findings = thin(sensor, _COARSE), list[Found]()
+    mean = np.concatenate([despike(motion.position) for motion in few]).mean(axis=0)
+    seen = np.concatenate([despike(motion.position) for motion in few]) - mean
     spread = float(np.std(seen))
     begin = partial(_coarse, sensor=few, mean=mean, about=about, marker=marker, fix_marker=fix_marker)
-    command, proper, otherwise = _told_as(command, begin, spread)
+    command, proper, otherwise = _choose_reading(command, begin, spread)
     findings += otherwise
     mirrored = begin(command, sign=-1.0)
     spread, left, other = spread * proper.state.scale, proper.left(), mirrored.left()
@@ -244,8 +244,8 @@ def _begun(
         moves = about.correlation > _MOVES
         if moves:
             by_speeds = (ratio(command, sensor, about.lag, turns=False), _ROUGHLY)
-            named = _unit_named(about.scale * ahead) if np.isfinite(about.scale) else _unit_named(*by_speeds)
-            findings += [*named, _unexplained(command, sensor, about.lag, min(left, other) / spread)]
+            named = _unit_finding(about.scale * ahead) if np.isfinite(about.scale) else _unit_finding(*by_speeds)
+            findings += [*named, _unexplained_finding(command, sensor, about.lag, min(left, other) / spread)]
         else:
             findings.append(Found(finding=Finding.UNRELATED, size=about.correlation))
     elif other < _MIRROR * left:
@@ -260,10 +260,12 @@ def _begun(
     whole = none._replace(sensor=sensor, mean=factor * mean, state=state)
     if sensor[0].quaternion is None or not Answer(command, []).turns:
         return whole
-    return _with_attitude(whole, about, marker, fix_marker)
+    return _add_attitude(whole, about, marker, fix_marker)
 
 
-def _told_as(command: list[Motion], begin: Callable[..., Fit], spread: float) -> tuple[list[Motion], Fit, list[Found]]:
+def _choose_reading(
+    command: list[Motion], begin: Callable[..., Fit], spread: float
+) -> tuple[list[Motion], Fit, list[Found]]:
     """The commands as their orientations are to be read, a first fit, and that they are read otherwise.
 
     Where the path alone does not tell how the sensor is turned, its marker may: then it begins from turns all around.
@@ -305,18 +307,18 @@ def _coarse(
     poses, rows = rows.answer.poses(plant, plant), rows._replace(centred=rows.centred * [1.0, 1.0, sign])
     at = np.array(marker.at)
     path = poses.position + poses.rotation @ at
-    seen = np.concatenate([despiked(motion.position) for motion in sensor]) - mean
+    seen = np.concatenate([despike(motion.position) for motion in sensor]) - mean
     moves = bool(np.std(path, axis=0).max() > _BESIDE)  # else a scale is one of the marker
     scale = about.scale if moves and np.isfinite(about.scale) else 1.0
     rotation = kabsch(unit(path), unit(seen * [1.0, 1.0, sign]))[0]
     turn = Rotation.from_rotvec(marker.rotation).as_matrix()
-    markers = np.zeros((3, 0)) if fix_marker else _turned(poses.rotation)[1]
+    markers = np.zeros((3, 0)) if fix_marker else _split_directions(poses.rotation)[1]
     begin = State(first @ rotation, path.mean(axis=0), at, turn, scale, plant, plant)
     told = markers.size > 0
     held, free = (_free(np.eye(3), markers, turn=False, scale=of, own_lag=of and told) for of in (False, moves))
-    nearer = fitted(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
+    nearer = fit_poses(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
     again = _plant(nearer.position.lag)
-    both = (fitted(rows, start, free) for start in (begin, nearer._replace(position=again, angle=again)))
+    both = (fit_poses(rows, start, free) for start in (begin, nearer._replace(position=again, angle=again)))
     best = min(both, key=lambda fit: fit.left() / fit.state.scale)
     return best._replace(state=best.state._replace(angle=best.state.position))  # few rows may not tell that of turning
 
@@ -327,7 +329,7 @@ def _plant(lag: float) -> Plant:
     return Plant(lag - time_constant, time_constant)
 
 
-def _turned(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _split_directions(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Directions on the tool along which a marker's place is not told, and is told, as columns."""
     moved = rotation - rotation.mean(axis=0)
     square, directions = np.linalg.eigh(np.einsum("nij,nik->jk", moved, moved) / len(moved))
@@ -354,11 +356,11 @@ def _unit_of(fit: Fit, ahead: float, loosely: bool) -> tuple[float, list[Found]]
     wide = float(fit.half_widths(np.eye(SIZE)[SCALE])[0])
     if abs(np.log(scale)) < max(_OTHER, wide):
         return 1.0, []
-    findings = _unit_named(scale) or ([] if loosely else [Found(finding=Finding.SCALE, size=scale)])
+    findings = _unit_finding(scale) or ([] if loosely else [Found(finding=Finding.SCALE, size=scale)])
     return (findings[0].size or scale if findings else 1.0), findings
 
 
-def _unit_named(scale: float, within: float = _UNIT) -> list[Found]:
+def _unit_finding(scale: float, within: float = _UNIT) -> list[Found]:
     """That lengths are of another unit, where a scale is that of two units."""
     if not scale > 0.0:
         return []
@@ -371,12 +373,12 @@ def _unit_named(scale: float, within: float = _UNIT) -> list[Found]:
     return [Found(finding=Finding.SCALE, size=float(factors[best]), unit="in {}, read as {}".format(*names[best]))]
 
 
-def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: bool) -> _Begin:
+def _add_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: bool) -> _Begin:
     """With the sensor's orientations, where they follow; read otherwise where they follow then."""
-    few = thinned(begin.sensor, _COARSE)
+    few = thin(begin.sensor, _COARSE)
     told = ("sensor", Reading.AS_TOLD)
     ways = [told, *product(("sensor", "command"), tuple(Reading)[1:])]
-    aligned = {way: _aligned(begin, few, *way) for way in ways}
+    aligned = {way: _align(begin, few, *way) for way in ways}
     best = min(ways, key=lambda way: aligned[way].left)
     if aligned[told].left <= max(aligned[best].left / _CLEARER, _SURELY):
         best = told
@@ -384,14 +386,16 @@ def _with_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: b
         frame, left = aligned[told].attitude
         angle = float(Rotation.from_matrix(frame @ begin.state.rotation.T).magnitude())
         kind = Finding.ATTITUDE if left < _ALIKE else Finding.ATTITUDE_UNRELATED
-        unit = _angles_named(begin.command, begin.sensor, about.lag) if kind is Finding.ATTITUDE_UNRELATED else None
+        unit = (
+            _angle_unit_finding(begin.command, begin.sensor, about.lag) if kind is Finding.ATTITUDE_UNRELATED else None
+        )
         return begin._replace(findings=[*begin.findings, Found(finding=kind, size=angle, unit=unit)])
     frame = aligned[best].frame
     command, sensor = _read_as(begin.command, begin.sensor, *best)
     state, findings = begin.state, list(begin.findings)
     if best != told:
         findings.append(Found(finding=Finding.READING, source=best[0], reading=best[1]))
-    few = thinned(sensor, _COARSE)
+    few = thin(sensor, _COARSE)
     if best[0] == "command":
         state = _coarse(command, few, begin.mean, about, marker, fix_marker).state._replace(scale=1.0)
     rows = rows_of(command, few, begin.mean, attitude=True)
@@ -426,14 +430,14 @@ class _Aligned(NamedTuple):
     attitude: tuple[FloatArray, float]  # that of orientations, and what it leaves of them
 
 
-def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) -> _Aligned:
+def _align(begin: _Begin, few: list[Motion], source: str, reading: Reading) -> _Aligned:
     """One frame for both, orientations of a source read in some way."""
     command, sensor = _read_as(begin.command, few, source, reading)
     rows, state = rows_of(command, sensor, begin.mean, attitude=True), begin.state
     assert rows.turned is not None
     poses = rows.answer.poses(state.position, state.angle)
     path, seen = unit(poses.position + poses.rotation @ state.marker), unit(rows.centred)
-    turns = aligned_turns(Rotation.from_matrix(poses.rotation), Rotation.from_matrix(rows.turned))
+    turns = align_turns(Rotation.from_matrix(poses.rotation), Rotation.from_matrix(rows.turned))
     size = max(float(np.linalg.norm(turns[0])) / np.sqrt(len(turns[0])), _NOTABLE) * np.sqrt(len(turns[0]) / len(path))
     told, measured = (turn / size for turn in turns)
     frame, left = kabsch(np.vstack([path, told]), np.vstack([seen, measured]))
@@ -445,15 +449,15 @@ def _aligned(begin: _Begin, few: list[Motion], source: str, reading: Reading) ->
     return _Aligned(frame, share, excess, (rotation, float(np.sqrt(alone / half))))
 
 
-def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
+def _fit(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     """The least squares over all, and what they do not tell."""
     findings = begin.findings
     if any(finding.prevents for finding in findings):
         return Registration(findings=tuple(findings))
-    sensor = thinned(begin.sensor, _ROWS)
+    sensor = thin(begin.sensor, _ROWS)
     rows, state = rows_of(begin.command, sensor, begin.mean, attitude=begin.attitude), begin.state
     poses = rows.answer.poses(state.position, state.angle)
-    blind, told = _turned(poses.rotation)
+    blind, told = _split_directions(poses.rotation)
     if fix_marker:
         blind = told = np.zeros((3, 0))
     elif blind.shape[1] == 3:
@@ -470,17 +474,17 @@ def _fitted(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     own_lag = rows.answer.turns and len(told.T) > 0 and moves  # else nothing tells the lag of positions
     if own_lag and not begin.attitude:
         state = _turning_anew(begin, allowed(own_lag=True))
-    fit = fitted(rows, state, allowed(own_lag=own_lag))
+    fit = fit_poses(rows, state, allowed(own_lag=own_lag))
     if own_lag and not begin.attitude and fit.half_widths(_numbers(fit.state, begin.mean)[1])[15] > _SURE:
-        own_lag, fit = False, fitted(rows, state, allowed(own_lag=False))
+        own_lag, fit = False, fit_poses(rows, state, allowed(own_lag=False))
     spread = float(np.std(rows.centred))
     odd = any(finding.finding is Finding.SCALE and not finding.unit for finding in findings)
     most = (_LOOSELY if loosely else _ODD if odd else _UNEXPLAINED) * spread
     if fit.left() ** 2 - _jitter(begin.sensor) ** 2 > most**2:
         said = [finding for finding in findings if finding.finding is Finding.SCALE and finding.unit]
-        unexplained = _unexplained(begin.command, begin.sensor, fit.state.angle.lag, fit.left() / spread)
+        unexplained = _unexplained_finding(begin.command, begin.sensor, fit.state.angle.lag, fit.left() / spread)
         return Registration(findings=(*said, unexplained))
-    return _told(fit, begin, loose, blind, own_lag)
+    return _add_intervals(fit, begin, loose, blind, own_lag)
 
 
 def _turning_anew(begin: _Begin, free: FloatArray) -> State:
@@ -488,22 +492,22 @@ def _turning_anew(begin: _Begin, free: FloatArray) -> State:
 
     The marker makes up for it, by a millimetre.
     """
-    few = rows_of(begin.command, thinned(begin.sensor, _COARSE), begin.mean, attitude=False)
+    few = rows_of(begin.command, thin(begin.sensor, _COARSE), begin.mean, attitude=False)
     lag = begin.state.angle.lag
     constants = np.maximum(np.array(_SHARES) * lag, _SMOOTH).tolist()
-    fits = [fitted(few, begin.state._replace(angle=Plant(lag - each, each)), free) for each in constants]
+    fits = [fit_poses(few, begin.state._replace(angle=Plant(lag - each, each)), free) for each in constants]
     whitening = fits[0].off.whitening()
     return min(fits, key=lambda fit: fit.off.cost(whitening)).state
 
 
-def _unexplained(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, share: float) -> Found:
+def _unexplained_finding(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, share: float) -> Found:
     """That no frame explains a share of the motion, and whether it may be as the commands tell no orientation."""
     told_less = command[0].quaternion is None and sensor[0].quaternion is not None
-    unit = _angles_named(command, sensor, lag)
+    unit = _angle_unit_finding(command, sensor, lag)
     return Found(finding=Finding.UNEXPLAINED, size=share, source="command" if told_less else None, unit=unit)
 
 
-def _angles_named(command: Sequence[Motion], sensor: Sequence[Motion], lag: float) -> str | None:
+def _angle_unit_finding(command: Sequence[Motion], sensor: Sequence[Motion], lag: float) -> str | None:
     """That angles are of another unit, where the tool is told to turn as many times as far as deg are of rad."""
     turns = ratio(command, sensor, lag, turns=True)
     if turns > 0.0 and abs(abs(np.log(turns)) - np.log(DEG)) < _ANGLES:
@@ -535,7 +539,7 @@ def _vector(of: FloatArray) -> Vector:
     return x, y, z
 
 
-def _told(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray, own_lag: bool) -> Registration:
+def _add_intervals(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray, own_lag: bool) -> Registration:
     """The numbers with their intervals."""
     state = fit.state
     values, slopes = _numbers(state, begin.mean)
@@ -554,8 +558,8 @@ def _told(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray, own_lag
     along = is_here(state.centre - begin.mean, turned)
     ahead = [Found(finding=Finding.AHEAD, size=-position.lag.value)] if position.lag.ci95[1] < 0.0 else []
     return Registration(
-        frame=_registered(told[:6]),
-        marker=_registered(told[6:12]),
+        frame=_of_numbers(told[:6]),
+        marker=_of_numbers(told[6:12]),
         position=position,
         rotation=rotation if own_lag else None,
         rms=noise[0],
@@ -571,7 +575,7 @@ def is_here(at: Vector | FloatArray, rotation: Vector | FloatArray) -> bool:
     return bool(np.linalg.norm(at) < _HERE and np.linalg.norm(rotation) < _AS_TURNED)
 
 
-def _registered(told: Sequence[Quantity]) -> Registered:
+def _of_numbers(told: Sequence[Quantity]) -> Registered:
     """From six numbers."""
     x, y, z, a, b, c = told
     return Registered(
@@ -588,7 +592,7 @@ def _numbers(state: State, mean: FloatArray) -> tuple[FloatArray, FloatArray]:
     values, slopes = np.zeros(18), np.zeros((18, SIZE))
     values[0:3], values[6:9] = state.centre - middle, state.marker
     slopes[0:3, CENTRE], slopes[6:9, MARKER] = np.eye(3), np.eye(3)
-    slopes[0:3, ROTATION] = crossed(middle[None])[0]
+    slopes[0:3, ROTATION] = cross_matrix(middle[None])[0]
     for first, matrix, where in ((3, state.rotation, ROTATION), (9, state.turn, TURN)):
         values[first : first + 3] = Rotation.from_matrix(matrix).as_rotvec()
         slopes[first : first + 3, where] = np.linalg.inv(left_jacobian(values[None, first : first + 3])[0])

@@ -15,17 +15,17 @@ from .. import toml
 from ..discovery.own_frames import own_frames
 from ..errors import ConfigError, PumafuseWarning, RunError, UnknownNameError
 from ..fusion.config import FusionConfig
-from ..fusion.placing import with_tool
+from ..fusion.placing import add_tool
 from ..logs.clock import missing_commands, without_strays
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run
 from ..model.arm import Joint
 from ..toml import Interval
-from .configured import DIGITS, arm_of, as_late, configuration, lag_in_space, placed_by, with_joints
+from .configured import DIGITS, arm_of, configuration, lag_in_space, set_joints, set_lags, set_placements
 from .joints import Later, Told, joint_lags
 from .latencies import latencies_of
-from .motion import Motion, measured, motion_of
-from .register import Quantity, Registered, Registration, is_here, registered
+from .motion import Motion, drop_repeated, motion_of
+from .register import Quantity, Registered, Registration, is_here, register_sensor
 
 FIXED = ("marker", "latency")  # what can be left as it is
 _AS_CONFIGURED, _ALONG_BASE = "stays as configured", "is taken to measure along the base's axes"
@@ -136,21 +136,21 @@ def register(
     left = [] if sensor else [name for name in _sensors_of(every, config) if name not in {*names, *along_base}]
     framed = {name for run in every for name in own_frames(run)} & set(left) if left and config is None else set[str]()
     instead = _AS_CONFIGURED if config else _ALONG_BASE
-    notes = [_not_registered(every, name, _LEFT_OUT if name in framed else instead) for name in left]
-    every = [_without(run, framed | (_incomplete(run) & set(names))) for run in every]
+    notes = [_missing_note(every, name, _LEFT_OUT if name in framed else instead) for name in left]
+    every = [_drop_sensors(run, framed | (_incomplete(run) & set(names))) for run in every]
     if config is not None and any(run.command.joints is None for run in every):
         notes += config.arm.joint_doubts()
     joints = _joints([_complete(run) for run in every], names) if config is None else config.arm.joints
-    config = config and with_joints(config, {})  # they are heeded in the commands from here on
+    config = config and set_joints(config, {})  # they are heeded in the commands from here on
     later = {name: joint.later for name, joint in joints.items()}
     for run in every:
         if missing := missing_commands(run.command):
             notes.append(f"run '{run.name}': {missing}: what sensors saw in a gap is not used")
     every = [replace(run, command=run.command.delayed(later)) for run in every]
     whole = [_complete(run) for run in every]
-    registrations = {name: _registered(whole, name, config, fixed="marker" in fixed) for name in names}
+    registrations = {name: _register_sensor(whole, name, config, fixed="marker" in fixed) for name in names}
     placed = {name: registration for name, registration in registrations.items() if registration.frame is not None}
-    placed |= {name: _without_frame(registration) for name, registration in placed.items() if registration.along_base}
+    placed |= {name: _drop_frame(registration) for name, registration in placed.items() if registration.along_base}
     for name in placed.keys() & along_base:
         placed[name] = msgspec.structs.replace(placed[name], frame=None, marker=None)
     said = {
@@ -159,9 +159,9 @@ def register(
     }
     if not placed:
         raise RunError("; ".join(note for notes_of in said.values() for note in notes_of))
-    begun = arm_of(every, placed) if config is None else with_tool(config, every[0])
+    begun = arm_of(every, placed) if config is None else add_tool(config, every[0])
     if "latency" in fixed:
-        begun = as_late(begun, placed)
+        begun = set_lags(begun, placed)
         kept = [name for name, registration in placed.items() if not registration.read_otherwise]
         latencies = {name: Quantity.around(begun.sensors[name].latency) for name in kept}
     else:
@@ -171,19 +171,19 @@ def register(
     }
     if config is None:
         alone = placed.keys() if sensor else None
-        config = configuration([_as_registered(run, placed, alone) for run in every], placed, latencies, begun)
+        config = configuration([_prepare(run, placed, alone) for run in every], placed, latencies, begun)
     else:
-        config = placed_by(begun, placed, latencies)
+        config = set_placements(begun, placed, latencies)
     for note in (*(note for notes_of in said.values() for note in notes_of), *notes):
         warnings.warn(note, PumafuseWarning, stacklevel=2)
     named = [run.name for run in every]
     summary = RegistrationSummary(pumafuse=version("pumafuse"), runs=named, sensors=details, joints=joints)
-    return Registrations(with_joints(config, joints), summary)
+    return Registrations(set_joints(config, joints), summary)
 
 
 def _complete(run: Run) -> Run:
     """A run with the sensors that give x, y and z."""
-    return _without(run, _incomplete(run))
+    return _drop_sensors(run, _incomplete(run))
 
 
 def _incomplete(run: Run) -> set[str]:
@@ -191,12 +191,12 @@ def _incomplete(run: Run) -> set[str]:
     return {name for name, sensor in run.sensors.items() if not set(CARTESIAN) <= sensor.values.keys()}
 
 
-def _without(run: Run, names: Collection[str]) -> Run:
+def _drop_sensors(run: Run, names: Collection[str]) -> Run:
     """A run without some sensors."""
     return replace(run, sensors={name: sensor for name, sensor in run.sensors.items() if name not in names})
 
 
-def _as_registered(run: Run, registrations: Mapping[str, Registration], kept: Collection[str] | None) -> Run:
+def _prepare(run: Run, registrations: Mapping[str, Registration], kept: Collection[str] | None) -> Run:
     """The run without orientations that do not follow the commanded ones, and with some sensors alone, if any are."""
     sensors = dict(run.sensors)
     for name, registration in registrations.items():
@@ -217,7 +217,7 @@ def _joints(runs: Sequence[Run], names: Sequence[str]) -> dict[str, Joint]:
     best, late = np.inf, dict[str, Quantity]()
     for name in names:
         told, sensor = _apart(runs, name)
-        register = partial(registered, sensor=sensor, loosely=True)
+        register = partial(register_sensor, sensor=sensor, loosely=True)
         begun = register(told({}))
         if begun.position is None or begun.read_otherwise or begun.position.lag.half >= best:
             continue
@@ -235,7 +235,7 @@ def _apart(runs: Sequence[Run], name: str) -> tuple[Told, list[Motion]]:
     def told(later: Later) -> list[Motion]:
         return [motion_of(run.command.delayed(later)) for run in runs_of_sensor]
 
-    return told, [measured(run.sensors[name]) for run in runs_of_sensor]
+    return told, [drop_repeated(run.sensors[name]) for run in runs_of_sensor]
 
 
 def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | None) -> list[str]:
@@ -271,19 +271,19 @@ def _lacking(runs: Sequence[Run], name: str) -> str:
     return f"sensor '{name}' gives no {' and no '.join(missing)}"
 
 
-def _not_registered(runs: Sequence[Run], name: str, instead: str) -> str:
+def _missing_note(runs: Sequence[Run], name: str, instead: str) -> str:
     """What to say of a sensor that does not give x, y and z."""
     return f"{_lacking(runs, name)}, without which it is not registered, and {instead}: add what is missing (run.toml)"
 
 
-def _registered(runs: Sequence[Run], name: str, config: FusionConfig | None, *, fixed: bool) -> Registration:
+def _register_sensor(runs: Sequence[Run], name: str, config: FusionConfig | None, *, fixed: bool) -> Registration:
     """The registration of one sensor by the runs that have it."""
     told, sensor = _apart(runs, name)
     marker = None if config is None or name not in config.sensors else config.sensors[name].marker
-    return registered(told({}), sensor, marker=marker, fix_marker=fixed)
+    return register_sensor(told({}), sensor, marker=marker, fix_marker=fixed)
 
 
-def _without_frame(registration: Registration) -> Registration:
+def _drop_frame(registration: Registration) -> Registration:
     """The same of a sensor that needs no frame, nor a marker where that is the tool point."""
     marker = registration.marker
     seen = marker if marker and not is_here(marker.at, marker.rotation) else None

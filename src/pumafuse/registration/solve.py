@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import FloatArray, median
-from ..space.rotations import crossed
+from ..space.rotations import cross_matrix
 from .intervals import Blocks, blocks, inverse, of_poses
 from .motion import Answer, Plant, Poses
 
@@ -48,7 +48,7 @@ class State(NamedTuple):
     position: Plant  # the plant of positions
     angle: Plant  # the plant of orientations
 
-    def moved(self, step: FloatArray) -> State:
+    def move(self, step: FloatArray) -> State:
         """After a step, (17,)."""
         plants = [
             Plant(
@@ -121,7 +121,7 @@ class Fit(NamedTuple):
         return np.hypot(self.told.half_widths(numbers), _NORMAL * np.sqrt(np.sum(by @ self.of_poses * by, axis=1)))
 
 
-def fitted(rows: Rows, state: State, free: FloatArray) -> Fit:
+def fit_poses(rows: Rows, state: State, free: FloatArray) -> Fit:
     """The robust least squares from a start; the steps that are allowed are columns, (17, k)."""
     off = residual(rows, state)
     for _ in range(_STEPS):
@@ -154,7 +154,7 @@ def _better(
 ) -> tuple[State, Off] | None:
     """After a step, halved until it leads down; None where it does not."""
     for _ in range(_HALVED):
-        moved = state.moved(step)
+        moved = state.move(step)
         off = residual(rows, moved)
         if off.cost(whitening) < cost:
             return moved, off
@@ -166,7 +166,9 @@ def _normal(
     rows: Rows, state: State, off: Off, whitening: Sequence[FloatArray], free: FloatArray, *, expected: bool
 ) -> Blocks:
     """The information of the free steps and the slope of half the sum, of each block of rows."""
-    return tell([slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, whitening, expected=expected)
+    return information_of(
+        [slope @ free for slope in slopes(rows, state, off.poses)], off.blocks, whitening, expected=expected
+    )
 
 
 def _of_poses(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArray:
@@ -179,7 +181,7 @@ def _of_poses(rows: Rows, state: State, off: Off, free: FloatArray) -> FloatArra
     return covariance
 
 
-def tell(
+def information_of(
     slope: Sequence[FloatArray], off: Sequence[FloatArray], whitening: Sequence[FloatArray], *, expected: bool
 ) -> Blocks:
     """The information and the score of rows, by how far they are off and how that changes with a step.
@@ -213,7 +215,7 @@ def slopes(rows: Rows, state: State, poses: Poses) -> list[FloatArray]:
     seen = state.scale * rows.centred @ state.rotation.T
     arm = poses.rotation @ state.marker
     jacobian = np.zeros((len(seen), 3, SIZE))
-    jacobian[:, :, ROTATION] = crossed(seen)
+    jacobian[:, :, ROTATION] = cross_matrix(seen)
     jacobian[:, :, CENTRE] = -np.eye(3)
     jacobian[:, :, MARKER] = poses.rotation
     jacobian[:, :, SCALE] = -seen[:, :, None]

@@ -66,7 +66,7 @@ def _speeds(motion: Motion, steps: int, *, held: bool) -> list[FloatArray]:
     last = np.searchsorted(motion.time, grid, side="right") - 1
     path: FloatArray = motion.position[last]
     if not held:
-        smooth = despiked(motion.position)
+        smooth = despike(motion.position)
         for axis in range(3):
             path[:, axis] = np.interp(grid, motion.time, smooth[:, axis])
     speeds = [np.linalg.norm(path[steps:] - path[:-steps], axis=1)]
@@ -76,7 +76,7 @@ def _speeds(motion: Motion, steps: int, *, held: bool) -> list[FloatArray]:
     return [np.minimum(part, np.quantile(part, _QUIET)) for part in speeds if len(part)]
 
 
-def despiked(position: FloatArray) -> FloatArray:
+def despike(position: FloatArray) -> FloatArray:
     """Positions without single outliers."""
     return median_filter(position, size=(_OUTLIER, 1), mode="nearest")
 
@@ -140,16 +140,16 @@ def unit(vectors: FloatArray) -> FloatArray:
     return about / max(float(np.linalg.norm(about)) / np.sqrt(len(about)), 1e-300)
 
 
-def between(turned: Rotation) -> FloatArray:
+def rotations_between(turned: Rotation) -> FloatArray:
     """Rotation vectors [rad] along the base's axes from some orientations to others, (m, 3)."""
     count = len(turned)
     shifts = [max(round(share * count), 1) for share in _APART]
     return np.concatenate([(turned[shift:] * turned[:-shift].inv()).as_rotvec() for shift in shifts])
 
 
-def aligned_turns(told: Rotation, seen: Rotation) -> tuple[FloatArray, FloatArray]:
+def align_turns(told: Rotation, seen: Rotation) -> tuple[FloatArray, FloatArray]:
     """Rotations between the same rows of both, those of which the axis is sure."""
-    turns, other = between(told), between(seen)
+    turns, other = rotations_between(told), rotations_between(seen)
     sure = np.maximum(np.linalg.norm(turns, axis=1), np.linalg.norm(other, axis=1)) < _HALF_TURN
     return turns[sure], other[sure]
 

@@ -5,8 +5,8 @@ event, the gain error e decays as exp(−bt) with b = 1 / recovery, so that over
 
     z⁺ = e^(pΔ) z + (e^(pΔ) − 1)/p · u + (e^(pΔ) − e^(−bΔ))/(p + b) · e + ∫ e^(p(Δ−s)) dW(s).
 
-A drive with a fastest speed is no sum of poles: what the commands make of it is integrated (:func:`_limited`), and the
-noise moves it as it moves the plant below that speed.
+A drive with a fastest speed is no sum of poles: what the commands make of it is integrated (:func:`_limit_speed`), and
+the noise moves it as it moves the plant below that speed.
 
 Nothing of the filter's discretisation is used here: the filter is tested against this.
 """
@@ -107,7 +107,7 @@ def simulate_axis(
         forced += np.einsum("ij,ij->i", response, white)
         position[1:] += (share * sum_of_decays(np.exp(pole * distinct)[row], forced)).real
     if axis.max_speed is not None:
-        position[1:] += _limited(axis, axis.max_speed, time, level, error, decay_rate)
+        position[1:] += _limit_speed(axis, axis.max_speed, time, level, error, decay_rate)
 
     position = _backlash(position, axis.backlash or 0.0)
     if axis.sag is not None:
@@ -193,7 +193,7 @@ def _events(acting: TimeArray, instants: TimeArray, fastest: float) -> TimeArray
     return time[np.diff(time, prepend=-1) > 0]
 
 
-def _limited(
+def _limit_speed(
     axis: TrueAxis, max_speed: float, time: TimeArray, level: FloatArray, error: FloatArray, decay_rate: float
 ) -> FloatArray:
     """Where a drive with a fastest speed is at all instants but the first [m], (k,).

@@ -34,7 +34,7 @@ def rough(time: TimeArray, sd: float, length: float, rng: np.random.Generator) -
     """An Ornstein-Uhlenbeck process of this ``sd`` at ``time`` (int64 ns, ascending, (n,)); ``length`` [s], (n,)."""
     fading = -np.diff(time) / 1e9 / length
     share = np.concatenate((np.ones(min(len(time), 1)), np.sqrt(-np.expm1(2.0 * fading))))
-    return _summed(fading, sd * share * rng.standard_normal(len(time)))
+    return _sum(fading, sd * share * rng.standard_normal(len(time)))
 
 
 def smooth(time: TimeArray, sd: float, length: float, rng: np.random.Generator) -> FloatArray:
@@ -52,13 +52,13 @@ def smooth(time: TimeArray, sd: float, length: float, rng: np.random.Generator) 
     sd_v = rate * np.sqrt(2.0 * p1)  # the covariance's Cholesky factor [sd_v 0; along across]
     along = np.divide(rate * p2, sd_v, out=np.zeros(len(time)), where=sd_v > 0.0)
     across = np.sqrt(np.maximum(p3 - along**2, 0.0))
-    v = _summed(-rate * interval, sd * sd_v * first)
+    v = _sum(-rate * interval, sd * sd_v * first)
     fed = sd * (along * first + across * second)
     fed[1:] += interval * np.exp(-rate * interval) * v[:-1]
-    return _summed(-rate * interval, fed)
+    return _sum(-rate * interval, fed)
 
 
-def _summed(fading: FloatArray, added: FloatArray) -> FloatArray:
+def _sum(fading: FloatArray, added: FloatArray) -> FloatArray:
     """A process from what it ``added`` at each instant, (n,), and the logarithm by which it faded between, (n − 1,)."""
     decay = np.concatenate((np.zeros(min(len(added), 1)), np.exp(fading)))
     return sum_of_decays(decay.astype(np.complex128), added.astype(np.complex128)).real

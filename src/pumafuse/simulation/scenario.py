@@ -17,12 +17,12 @@ from ..fusion.config import (
     PerAxis,
     Process,
     by_axis,
+    fill_defaults,
     load_arm,
     of_all_axes,
     of_axis,
-    with_defaults,
-    with_kinds,
-    with_names_of_lengths,
+    rename_to_kinds,
+    rename_to_lengths,
 )
 from ..logs import save
 from ..logs.frames import CARTESIAN, Frame
@@ -181,12 +181,12 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             },
             "sensors": {name: sensor.to_config() for name, sensor in self.sensors.items()},
         }
-        override = with_names_of_lengths(self.filter, self.arm, "filter")
+        override = rename_to_lengths(self.filter, self.arm, "filter")
         if isinstance(override.get("sensors"), dict):
             for name in override["sensors"]:
                 if name not in self.sensors:
                     raise UnknownNameError("filter.sensors", "sensor", name, self.sensors)
-        return toml.struct({**_merged(simulated, override), "arm": self.arm}, FusionConfig, "filter")
+        return toml.struct({**_merge(simulated, override), "arm": self.arm}, FusionConfig, "filter")
 
     def to_toml(self, seed: int, arm: str) -> str:
         """The text of a ``scenario.toml`` with this ``seed``, and its arm in the file ``arm``."""
@@ -195,14 +195,14 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         for key, parts in (("true_arm", self.true_arm), ("process", self.process)):
             tree[key] = {axis: toml.builtins(part, models[axis].kind) for axis, part in parts.items()}
         tree["trajectory"] = toml.builtins(self.trajectory, _kind_of(self.trajectory.moving, self.arm))
-        tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
+        tree["start"] = rename_to_kinds(tree["start"], self.arm, ["offset_sd_mm"])
         screens = {axis: self.arm.screen_of(axis) for axis in self.start.level}
         tree["start"]["level"] = {f"{axis}_{screens[axis].unit}": level for axis, level in self.start.level.items()}
-        tree["reference"] = with_kinds(tree["reference"], self.arm, ["sd_mm"])
+        tree["reference"] = rename_to_kinds(tree["reference"], self.arm, ["sd_mm"])
         for name, sensor in tree["sensors"].items():
-            tree["sensors"][name] = with_kinds(sensor, self.arm, PER_AXIS)
+            tree["sensors"][name] = rename_to_kinds(sensor, self.arm, PER_AXIS)
             if "outliers" in sensor:
-                tree["sensors"][name]["outliers"] = with_kinds(sensor["outliers"], self.arm, OF_OUTLIERS)
+                tree["sensors"][name]["outliers"] = rename_to_kinds(sensor["outliers"], self.arm, OF_OUTLIERS)
         return toml.text({key: value for key, value in tree.items() if value != {}})
 
     @staticmethod
@@ -217,7 +217,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         tree, where = toml.read(path), str(path)
         _check_magnitudes({key: value for key, value in tree.items() if key != "seed"}, where)
         tree["arm"] = load_arm(tree, path)
-        scenario = toml.struct(_with_names_of_lengths(tree, tree["arm"], where), Scenario, where)
+        scenario = toml.struct(_rename_to_lengths(tree, tree["arm"], where), Scenario, where)
         trajectory = scenario.trajectory
         if isinstance(trajectory, PathFromFile):
             beside = msgspec.structs.replace(trajectory, file=str(path.parent / trajectory.file))
@@ -229,14 +229,14 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return scenario
 
 
-def _with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
+def _rename_to_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
     """The tables of a file (SI numbers) with the key names for lengths, where those of angles are."""
     lengths = dict(tree)
     for key, kind in (("true_arm", TrueArm), ("process", Process)):
         if isinstance(lengths.get(key), dict):
             lengths[key] = by_axis(lengths[key], kind, arm, where, key)
     if isinstance(lengths.get("process"), dict):
-        lengths["process"] = with_defaults(lengths["process"], arm)
+        lengths["process"] = fill_defaults(lengths["process"], arm)
     if isinstance(start := lengths.get("start"), dict):
         lengths["start"] = _start(cast(dict[str, Any], start), arm, where)
     if "reference" in lengths:
@@ -293,10 +293,10 @@ def _check_magnitudes(tree: Mapping[str, Any], where: str, path: str = "", inher
                 raise ConfigError(f"{where}: {path}{key}: a size with which nothing can be simulated")
 
 
-def _merged(tree: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(tree: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
     """``tree`` with the entries of ``override`` in their places."""
     merged = dict(tree)
     for key, value in override.items():
         before = merged.get(key)
-        merged[key] = _merged(before, value) if isinstance(before, Mapping) and isinstance(value, Mapping) else value  # pyright: ignore
+        merged[key] = _merge(before, value) if isinstance(before, Mapping) and isinstance(value, Mapping) else value  # pyright: ignore
     return merged

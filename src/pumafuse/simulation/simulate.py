@@ -88,25 +88,25 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
         measured = axes if sensor.axes is None else tuple(axis for axis in axes if axis in sensor.axes)
         if measured:
             valid = valid_times(sensor, instants, _stream(seed, "rate", name))
-            true = _logged(scenario, {axis: motions[axis].at(valid) for axis in measured}, in_axes=bool(sensor.axes))
+            true = _to_log(scenario, {axis: motions[axis].at(valid) for axis in measured}, in_axes=bool(sensor.axes))
             source = measure(sensor, name, valid, true, _stream(seed, "sensor", name))
-            sensors[name] = _rounded(source, scales)
+            sensors[name] = _round(source, scales)
     parts = scenario.reference.rows_per_command
     rows = instants[np.rint(np.arange(count * parts) * (POINTS / parts)).astype(np.int64)]
     noise = _stream(seed, "reference")
     reference = {
         axis: true + of_axis(scenario.reference.sd, axis) * noise.standard_normal(len(rows))
-        for axis, true in _logged(scenario, {axis: motion.at(rows) for axis, motion in motions.items()}).items()
+        for axis, true in _to_log(scenario, {axis: motion.at(rows) for axis, motion in motions.items()}).items()
     }
     jitter = scenario.command.stamp_jitter * _stream(seed, "stamps").standard_normal(count)
     stamp = np.maximum.accumulate(tick + np.rint(jitter * 1e9).astype(np.int64))
-    start = _logged(scenario, {axis: np.zeros(1) for axis in axes})
+    start = _to_log(scenario, {axis: np.zeros(1) for axis in axes})
     run = Run(
         name=f"{scenario.name}, seed {seed}",
-        command=_rounded(Source(stamp, _logged(scenario, commands), "command"), scales),
+        command=_round(Source(stamp, _to_log(scenario, commands), "command"), scales),
         sensors=sensors,
-        reference=_rounded(Source(rows, reference, "reference", sd=scenario.reference.sd), scales),
-        start={axis: float(_as_in_files(level, scales.get(axis, MM))[0]) for axis, level in start.items()},
+        reference=_round(Source(rows, reference, "reference", sd=scenario.reference.sd), scales),
+        start={axis: float(_round_as_files(level, scales.get(axis, MM))[0]) for axis, level in start.items()},
         clock=scenario.command.clock,
         frame=scenario.frame,
         kinds={axis: kind for axis, kind in scenario.arm.kind_of.items() if axis in start},
@@ -188,7 +188,7 @@ def _files_of(folder: Path) -> set[str]:
     return {*_ALWAYS_WRITTEN, TRIALS, SAMPLES, *_PATHS, *files}
 
 
-def _logged(scenario: Scenario, moved: Mapping[str, FloatArray], *, in_axes: bool = False) -> dict[str, FloatArray]:
+def _to_log(scenario: Scenario, moved: Mapping[str, FloatArray], *, in_axes: bool = False) -> dict[str, FloatArray]:
     """Positions ``moved`` [m] from the start level as the log has them: in x, y, z if it has a frame.
 
     ``in_axes``: in the axes also then, as a sensor that names its axes.
@@ -221,11 +221,11 @@ def _commands(scenario: Scenario, seed: int) -> dict[str, FloatArray]:
     return commands
 
 
-def _as_in_files(value: FloatArray, scale: float) -> FloatArray:
+def _round_as_files(value: FloatArray, scale: float) -> FloatArray:
     """Positions [m or rad] rounded as files have them, so that a run is the same in memory and read back."""
     return np.round(value * scale, 6) / scale
 
 
-def _rounded(source: Source, scales: Mapping[str, float]) -> Source:
-    values = {axis: _as_in_files(value, scales.get(axis, MM)) for axis, value in source.values.items()}
+def _round(source: Source, scales: Mapping[str, float]) -> Source:
+    values = {axis: _round_as_files(value, scales.get(axis, MM)) for axis, value in source.values.items()}
     return replace(source, values=values)

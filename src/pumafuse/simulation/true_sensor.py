@@ -122,7 +122,7 @@ def measure(
         values[axis] = np.rint(z / step) * step if step else z
     late = sensor.latency + sensor.latency_sd * noises[3].standard_normal(count)
     own_clock = (seconds + late) * (1.0 + sensor.clock_drift * 1e-6) + sensor.clock_offset
-    logged = (noises[4].random(count) >= sensor.dropouts) & ~_lost(sensor, seconds, noises[5])
+    logged = (noises[4].random(count) >= sensor.dropouts) & ~_find_lost(sensor, seconds, noises[5])
     source = Source(np.rint(own_clock * 1e9).astype(np.int64), values, name).rows(logged)
     return source.rows(np.argsort(source.stamp, kind="stable").astype(np.int64))
 
@@ -139,7 +139,7 @@ def _outliers(sensor: TrueSensor, count: int, axes: list[str], rng: np.random.Ge
     return errors
 
 
-def _lost(sensor: TrueSensor, seconds: FloatArray, rng: np.random.Generator) -> BoolArray:
+def _find_lost(sensor: TrueSensor, seconds: FloatArray, rng: np.random.Generator) -> BoolArray:
     """Rows within an outage or a burst of losses."""
     spans = list(sensor.outages)
     if sensor.bursts is not None and len(seconds):

@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError
 from ..units import Kind
-from .rotations import cross, of_angles, product, turned
+from .rotations import cross, of_angles, product, rotate
 from .urdf import MOST, Joint, read
 
 _STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])  # the quaternion of no turn
@@ -116,7 +116,7 @@ class Chain:
         for motion, (position, turn) in zip(self._motions, frames[1:], strict=True):
             if motion.joint.kind is None:
                 continue
-            velocity = motion.multiplier * turned(turn, motion.joint.axis)
+            velocity = motion.multiplier * rotate(turn, motion.joint.axis)
             if motion.joint.kind == "angle":
                 jacobian[:, 3:, motion.column] += velocity
                 velocity = cross(velocity, tip - position)
@@ -137,7 +137,7 @@ class Chain:
         for link, (position, turn) in enumerate(self._frames(q)):
             frames[:, link, :3, 3] = position
             for column, unit in enumerate(np.eye(3)):
-                frames[:, link, :3, column] = turned(turn, unit[None])
+                frames[:, link, :3, column] = rotate(turn, unit[None])
         return frames
 
     def _frames(self, q: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -150,14 +150,14 @@ class Chain:
         turn = np.where(finite, _STRAIGHT, np.nan)
         yield position, turn
         for motion in self._motions:
-            position = position + turned(turn, motion.joint.at)
+            position = position + rotate(turn, motion.joint.at)
             turn = product(turn, motion.turn)
             if motion.joint.kind is not None:
                 value = motion.multiplier * q[:, motion.column, None] + motion.offset
                 if motion.joint.kind == "angle":
                     turn = product(turn, _about(motion.joint.axis, value))
                 else:
-                    position = position + value * turned(turn, motion.joint.axis)
+                    position = position + value * rotate(turn, motion.joint.axis)
             yield position, turn
 
 

@@ -87,7 +87,7 @@ def inverse(quaternion: FloatArray) -> FloatArray:
     return quaternion * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
-def turned(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
+def rotate(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
     """R v, row by row, (n, 4) and (n, 3) → (n, 3); either may be one row for all."""
     across = 2.0 * cross(quaternion[:, :3], vector)
     return vector + quaternion[:, 3:] * across + cross(quaternion[:, :3], across)
@@ -99,7 +99,7 @@ def cross(left: FloatArray, right: FloatArray) -> FloatArray:
     return left.take(first, 1) * right.take(two, 1) - left.take(two, 1) * right.take(first, 1)
 
 
-def between(quaternion: FloatArray, row: IntArray, share: FloatArray) -> FloatArray:
+def slerp(quaternion: FloatArray, row: IntArray, share: FloatArray) -> FloatArray:
     """Orientations on the shortest turn from some rows (m,) of (n, 4) to the ones after them, (m, 4).
 
     The share says how far, 0 to 1, (m,); from the last row on there is no turn.
@@ -112,7 +112,7 @@ def between(quaternion: FloatArray, row: IntArray, share: FloatArray) -> FloatAr
 
 def matrix(vector: FloatArray) -> FloatArray:
     """The rotation matrix of a rotation vector [rad], (3,) → (3, 3)."""
-    return turned(of_vectors(vector[None]), np.eye(3)).T
+    return rotate(of_vectors(vector[None]), np.eye(3)).T
 
 
 def nearest(matrix: FloatArray) -> FloatArray:
@@ -130,7 +130,7 @@ def aligning(first: FloatArray, second: FloatArray) -> tuple[FloatArray, float]:
     return rotation, float(np.sum(rotation * matrix)) / power if power > 0.0 else 0.0
 
 
-def crossed(vectors: FloatArray) -> FloatArray:
+def cross_matrix(vectors: FloatArray) -> FloatArray:
     """The matrices that take w to v × w, (n, 3) → (n, 3, 3)."""
     return np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2)
 
@@ -145,7 +145,7 @@ def left_jacobian(vector: FloatArray) -> FloatArray:
     safe = np.where(small, 1.0, angle)
     of_cosine = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)[:, None, None]
     two = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)[:, None, None]
-    cross = crossed(vector)
+    cross = cross_matrix(vector)
     return np.eye(3) + of_cosine * cross + two * (cross @ cross)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
-from ..filter.core import AXIS, Record, at, checked, library
+from ..filter.core import AXIS, Record, at, check, library
 from ..filter.response import record_of
 from ..model.arm import AxisModel, Gain, Sag
 from ..model.plants import FirstOrder, SecondOrder
@@ -384,7 +384,7 @@ class Measured:
             records["start"] = recording.start
             rows = len(recording.time), at(recording.time), at(variance), c, at(white)
             commands = len(recording.told), at(recording.told), at(recording.command)
-            checked(library.pf_weigh(at(record), *rows, *commands, len(arms), at(records), at(products_here)))
+            check(library.pf_weigh(at(record), *rows, *commands, len(arms), at(records), at(products_here)))
             products += products_here
         every = np.zeros((len(arms), 2 + c, 2 + c))  # products of plain response, gain, measurements and biases
         every[:, :2], every[:, :, :2], every[:, 2:, 2:] = products, products.swapaxes(1, 2), columns_alone
@@ -549,7 +549,7 @@ class Measured:
             moved = np.empty((len(arms), len(recording.time)))
             commands = len(recording.told), at(recording.told), at(recording.command)
             asked = len(recording.time), at(recording.time), at(moved)
-            checked(library.pf_response(len(arms), at(records), *commands, *asked))
+            check(library.pf_response(len(arms), at(records), *commands, *asked))
             responses.append(moved)
         return responses
 
@@ -582,7 +582,7 @@ class Measured:
             self._noise_record(noise), self._variance(recording, noise), np.empty_like(columns), np.empty(1)
         )  # fmt: skip
         rows = len(recording.time), at(recording.time), at(variance)
-        checked(library.pf_whiten(at(record), *rows, len(columns), at(columns), at(white), at(log)))
+        check(library.pf_whiten(at(record), *rows, len(columns), at(columns), at(white), at(log)))
         return white, float(log[0])
 
 

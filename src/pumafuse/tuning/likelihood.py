@@ -28,11 +28,11 @@ from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
-from ..fusion.engine import innovations, linearised
-from ..fusion.faults import Fault, not_following, starts_in_motion, within_a_turn
+from ..fusion.engine import innovation_derivatives, innovations
+from ..fusion.faults import Fault, find_not_following, find_turns, starts_in_motion
 from ..fusion.overruns import overrun_notes, overruns
 from ..fusion.placing import in_base
-from ..fusion.segments import Segment, added, build
+from ..fusion.segments import Segment, build_segment, sum_counts
 from ..logs.clock import clock_faults, segments
 from ..logs.run import Run
 from ..model.arm import ArmModel
@@ -146,14 +146,14 @@ class Likelihood:
         for name, part in named:
             asked = [name for name in chosen if name in part.sensors]
             clocks = clock_faults(part, config.arm.update_period, asked)
-            built.append(build(part, config, chosen))
-            turns = [fault.sentence for fault in within_a_turn(built[-1], config)]
+            built.append(build_segment(part, config, chosen))
+            turns = [fault.sentence for fault in find_turns(built[-1], config)]
             notes = (*clocks, *built[-1].notes, *turns, *starts_in_motion(built[-1], config))
             self.notes += [f"run '{name}': {note}" for note in notes]
             counted.setdefault(name, []).append(built[-1])
-        self.commands = {name: added(part.command_counts for part in parts) for name, parts in counted.items()}
+        self.commands = {name: sum_counts(part.command_counts for part in parts) for name, parts in counted.items()}
         self.rows = {
-            name: {sensor: added(part.counts[sensor] for part in parts) for sensor in parts[0].counts}
+            name: {sensor: sum_counts(part.counts[sensor] for part in parts) for sensor in parts[0].counts}
             for name, parts in counted.items()
         }
         self.config = config
@@ -166,7 +166,7 @@ class Likelihood:
             share = f"{_MOST / every:.0%} of {every:,} measurements"
             self.notes.append(f"fitted to {share}: of each axis where it moves most, in {_STRETCHES} parts of a run")
         self._parts = [
-            _Part(number, self.axes.index(axis), segment.of_axis(axis, rows), rows, column)
+            _Part(number, self.axes.index(axis), segment.select_axis(axis, rows), rows, column)
             for number, segment in enumerate(self._segments)
             for column, axis in enumerate(segment.axes)
             if len(rows := np.flatnonzero(segment.measurement_rows.codes[:, column] == Outcome.FUSED))
@@ -289,7 +289,7 @@ class Likelihood:
 
     def faults(self, config: FusionConfig) -> list[Fault]:
         """Why sensors do not follow the commands, those that do not."""
-        return [fault for segment in self._segments for fault in not_following(segment, config)]
+        return [fault for segment in self._segments for fault in find_not_following(segment, config)]
 
     def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> Point:
         """The log-likelihood of the measurements, without priors; for ``outcomes`` of None the gates decide on them."""
@@ -318,7 +318,7 @@ class Likelihood:
             for parameter in (parameters[number] for number in numbers):
                 other = parameter.move(config, parameter.at(config) + _STEP)
                 beside.append((other, math.expm1(_STEP) if parameter.log else _STEP))
-            filtered, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
+            filtered, d_nu, d_s = innovation_derivatives(part.segment, config, outcome[:, None], beside)
             fused, sd = outcome != int(Outcome.REJECTED), filtered.innovation_sd[:, 0]
             r, d_nu, d_s = filtered.innovation[:, 0] / sd, d_nu[:, :, 0] * (fused / sd), d_s[:, :, 0] / sd**2
             excess = np.where(fused, r * r - 1.0, -1.0)

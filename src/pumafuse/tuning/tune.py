@@ -15,7 +15,7 @@ from ..arrays import NEVER, NO_STAMP
 from ..errors import ConfigError, PumafuseWarning
 from ..fusion.config import FusionConfig
 from ..fusion.faults import latency_questions
-from ..fusion.placing import with_tool
+from ..fusion.placing import add_tool
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..units import MS
@@ -131,7 +131,7 @@ def tune(
     runs = [runs] if isinstance(runs, Run) else runs
     kinds, fixed = kinds_of(fit), list(fix)
     _check(runs, config, kinds, fixed, share)
-    config = with_tool(config, runs[0])
+    config = add_tool(config, runs[0])
     plan = Plan(kinds, fixed, sd_prior=sd_prior, one_delay="delay" in share)
     pipeline = Pipeline(runs, config, plans(config, plan, trust), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on

@@ -18,7 +18,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.consistency import chi_square_band, consistency, densities_of
 from ..fusion.estimates import AxisEstimate, Estimates, Measurements
 from ..fusion.offline import fuse
-from ..fusion.score import Z95, interpolated, score
+from ..fusion.score import Z95, interpolate, score
 from ..fusion.skill import skill
 from ..logs.run import Run
 from ..units import MM, Kind, of_kind
@@ -157,7 +157,7 @@ def _squares(est: Estimates, axis: str) -> FloatArray:
     """Squared errors on the reference [m²], NaN where it has a gap, (n,)."""
     if est.reference is None:
         return np.zeros(len(est.time))
-    return (est[axis].position - interpolated(est.time, est.segment, est.reference, axis)) ** 2
+    return (est[axis].position - interpolate(est.time, est.segment, est.reference, axis)) ** 2
 
 
 def _beyond_chance(growth: FloatArray) -> bool:

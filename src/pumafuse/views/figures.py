@@ -18,7 +18,7 @@ from ..filter.response import response
 from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates, Measurements, busiest
 from ..fusion.results import Result
-from ..fusion.score import Z95, ReferenceTrack, interpolated, score
+from ..fusion.score import Z95, ReferenceTrack, interpolate, score
 from ..fusion.verdicts import sentence
 from ..logs.frames import CARTESIAN, in_space
 from ..logs.run import Run
@@ -93,7 +93,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
                 if reference is None and result is first:
                     continue
                 if reference is not None and axis in reference.position:
-                    what, apart = "error", interpolated(result.time, result.segment, reference, axis)
+                    what, apart = "error", interpolate(result.time, result.segment, reference, axis)
                 else:
                     apart = np.interp(result.time, first.time, first.axes[axis].position)
                 shown.append(position - apart)
@@ -162,10 +162,10 @@ def error_figure(est: Estimates) -> Figure | None:
     with _figure(est, len(scored), [_TIME], [1.0]) as figure:
         for axes, (name, scored_axis) in zip(figure.axes, scored.items(), strict=True):
             screen = est.config.arm.screen_of(name)
-            error = est[name].position - interpolated(est.time, est.segment, est.reference, name)
+            error = est[name].position - interpolate(est.time, est.segment, est.reference, name)
             for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
                 measured = est.measured_positions(sensor, name)
-                raw = measured.value - interpolated(measured.time, measured.segment, est.reference, name)
+                raw = measured.value - interpolate(measured.time, measured.segment, est.reference, name)
                 label = f"{sensor}, latency removed"
                 axes.plot(measured.time, raw * screen.scale, ".", ms=1.5, color=colour, alpha=0.6, label=label)
             _band(axes, est, name, np.zeros(len(est.time)))

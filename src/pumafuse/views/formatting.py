@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..tuning.validation import Check
 
 
-def with_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:
+def format_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:
     """``value ± half the interval``, both times ``unit``, rounded to two digits of the interval."""
     if interval is None or not np.isfinite(interval).all():
         return f"{value * unit:.4g}"
@@ -29,7 +29,7 @@ def with_interval(value: float, interval: Interval | None, unit: float = 1.0) ->
     return f"{value * unit:.{digits}f} ± {half:.{digits}f}"
 
 
-def between(value: float, interval: Interval | None, unit: float = 1.0) -> str:
+def format_range(value: float, interval: Interval | None, unit: float = 1.0) -> str:
     """``value (low to high)``, all times ``unit``, to two digits of the interval; without it the value alone."""
     if interval is None:
         return f"{value * unit:.4g}"
@@ -42,7 +42,7 @@ def between(value: float, interval: Interval | None, unit: float = 1.0) -> str:
 
 def milliseconds(estimate: Estimate | None) -> str:
     """An estimate [s] with its interval in milliseconds; a dash without one."""
-    return "–" if estimate is None else with_interval(estimate.value, estimate.ci95, MS)
+    return "–" if estimate is None else format_interval(estimate.value, estimate.ci95, MS)
 
 
 def lag(arm: ArmModel) -> list[str]:
@@ -54,7 +54,7 @@ def lag(arm: ArmModel) -> list[str]:
     ]
 
 
-def chosen(orders: Mapping[str, str]) -> list[str]:
+def chosen_orders(orders: Mapping[str, str]) -> list[str]:
     """What was chosen for each axis, a line each, below one that says what the numbers are; none for none."""
     head = (
         "chosen, and in brackets what the alternative gains in log-likelihood less the penalty for its numbers (BIC):"
@@ -68,7 +68,7 @@ def limits(ci95: tuple[float | None, float | None], computed: bool = True) -> st
     return f"{low} to {high}" if computed or ci95 != (None, None) else "–"
 
 
-def fitted(summary: TuningSummary) -> list[list[str]]:
+def fitted_rows(summary: TuningSummary) -> list[list[str]]:
     """Rows of the lags and the parameters: name, before, fitted, 95 % interval, and what to know of it."""
     lags = [
         [f"lag of {axis}, ms", f"{lag.before_ms:.4g}", f"{lag.lag_ms:.4g}", limits(lag.lag_ms_ci95), ""]
@@ -100,15 +100,15 @@ def level(level: Level) -> str:
 def plant(plant_shape: PLANTS, first: str = "τ {} ms", second: str = "ω {} rad/s, ζ {}") -> str:
     """A plant's parameters with their intervals, in the words for its order."""
     if isinstance(plant_shape, FirstOrder):
-        return first.format(with_interval(plant_shape.time_constant, plant_shape.time_constant_ci95, MS))
-    omega = with_interval(plant_shape.natural_frequency, plant_shape.natural_frequency_ci95)
-    return second.format(omega, with_interval(plant_shape.damping, plant_shape.damping_ci95))
+        return first.format(format_interval(plant_shape.time_constant, plant_shape.time_constant_ci95, MS))
+    omega = format_interval(plant_shape.natural_frequency, plant_shape.natural_frequency_ci95)
+    return second.format(omega, format_interval(plant_shape.damping, plant_shape.damping_ci95))
 
 
 def gain(gain: Gain) -> str:
     """The gain K as a line over the speed s."""
-    line = with_interval(gain.intercept, gain.intercept_ci95)
-    return f"{line} + ({with_interval(gain.slope, gain.slope_ci95)}) s" if gain.slope else line
+    line = format_interval(gain.intercept, gain.intercept_ci95)
+    return f"{line} + ({format_interval(gain.slope, gain.slope_ci95)}) s" if gain.slope else line
 
 
 def change(values: Sequence[float | None], form: str) -> str:
@@ -136,7 +136,7 @@ class Validated(NamedTuple):
     coverage: str
 
 
-def validated(check: Check) -> Validated:
+def validation_rows(check: Check) -> Validated:
     """The numbers of a validation, joined by arrows."""
     states = (check.before, check.after)
     names = list(dict.fromkeys(name for state in states for name in state.sensors))

@@ -108,7 +108,7 @@ class LiveView:
         self._write(header)
 
     def event(self, event: Event, result: UpdateResult) -> None:
-        """Take in an event and what became of it."""
+        """Add an event and what became of it."""
         if not self._draws or result.outcome not in COMPARED:
             return
         t, sensor, values = event
@@ -118,7 +118,7 @@ class LiveView:
         self._events[sensor].append((moment - self._origin, values, result.axes))
 
     def estimate(self, estimate: LiveEstimate) -> None:
-        """Take in an estimate."""
+        """Add an estimate."""
         if not self._draws or self._origin is None or estimate.outcome is not Outcome.FUSED:
             return
         moment = estimate.stamp / 1e9 - self._origin
@@ -141,7 +141,7 @@ class LiveView:
         """Send the last frame and end the drawing."""
         self._closed, deadline = True, time.monotonic() + _LONGEST_END
         with contextlib.suppress(queue.Full):
-            for message in (_encoded(self._frame()), None) if self._draws else ():
+            for message in (_encode(self._frame()), None) if self._draws else ():
                 self._waiting.put(message, timeout=max(deadline - time.monotonic(), 0.0))
         self._listener.join(max(deadline - time.monotonic(), 0.0))
         if self._listener.is_alive():
@@ -152,7 +152,7 @@ class LiveView:
         """Everything since the frame before, evenly thinned where there is too much."""
         frame: Frame = {}
         for source, events in self._events.items():
-            for moment, values, outcomes in _taken(events):
+            for moment, values, outcomes in _drain(events):
                 for axis, outcome in outcomes.items():
                     if axis in values and source and outcome in COMPARED:
                         row = moment, float(values[axis]), float(outcome is Outcome.REJECTED)
@@ -161,7 +161,7 @@ class LiveView:
                         frame.setdefault(f"command/{axis}", []).append((moment, float(values[axis])))
                 if source in self._in_space:
                     self._add_position(frame, source or "command", moment, values)
-        for moment, axes, cartesian in _taken(self._estimates):
+        for moment, axes, cartesian in _drain(self._estimates):
             for axis, now in axes.items():
                 frame.setdefault(f"estimate/{axis}", []).append((moment, now.position, now.position_sd))
             positions = cartesian if self._framed else {axis: now.position for axis, now in axes.items()}
@@ -194,7 +194,7 @@ class LiveView:
         if self._waiting.full():
             self.dropped += 1
         else:
-            self._waiting.put(_encoded(message))
+            self._waiting.put(_encode(message))
 
     def _write_all(self) -> None:
         """Write what waits, as soon as the pipe takes it."""
@@ -222,11 +222,11 @@ class LiveView:
             os.killpg(self._child.pid, signal.SIGKILL)
 
 
-def _encoded(message: Header | Frame) -> bytes:
+def _encode(message: Header | Frame) -> bytes:
     return msgspec.json.encode(message, enc_hook=float) + b"\n"
 
 
-def _taken(rows: list[Any]) -> list[Any]:
+def _drain(rows: list[Any]) -> list[Any]:
     """The rows, evenly thinned where they are too many; the list is empty then."""
     taken = rows[:: 1 + len(rows) // _MOST]
     rows.clear()

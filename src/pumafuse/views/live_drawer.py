@@ -79,7 +79,7 @@ class Picture:
         taken: dict[tuple[str, str], FloatArray] = {}
         for (axis, name), residuals in self._residuals.items():
             residuals.add(_columns(frame, f"measurement/{axis}/{name}", 3))
-            time, position, residual, rejected = residuals.take()
+            time, position, residual, rejected = residuals.drain()
             taken[axis, name] = np.array([time, position, rejected], dtype=np.float64)
             screen, fused = self._screens[axis], ~rejected
             shown = self._estimates[axis].clip(position, screen)
@@ -99,7 +99,7 @@ class Picture:
         if self._tool is not None:
             self._tool.draw()
             for name, colour in self._of_sensors.items():
-                self._tool.draw_seen(name, colour, [taken[axis, name] for axis in CARTESIAN])
+                self._tool.draw_measured(name, colour, [taken[axis, name] for axis in CARTESIAN])
 
     def _draw_path(self, name: str, colour: str, rows: FloatArray) -> None:
         """The last seconds of a path; measurements as points. A negative radius is in points of the screen."""
@@ -113,7 +113,7 @@ class Picture:
         path = self._paths.setdefault(name, Recent(4))
         path.add(rows)
         strip, rgb = path.rows[1:].T * MM, colours.rgb(colour)
-        thinned, now = _thinned(strip), float(rows[0, -1])
+        thinned, now = _thin(strip), float(rows[0, -1])
         if name in self._header.sensors:
             shape = rr.Points3D(thinned, colors=[rgb], radii=-1.0)
         else:
@@ -148,7 +148,7 @@ class Tool:
         turned, root = rotations.quaternions(turn, self._reference), np.diag([rows[2, -1] for rows in lengths])
         scene.send_tool(self._sink, lengths[0][0, -1:], point, turned, root[None], _LARGER)
 
-    def draw_seen(self, name: str, colour: str, taken: Sequence[FloatArray]) -> None:
+    def draw_measured(self, name: str, colour: str, taken: Sequence[FloatArray]) -> None:
         """Send where the last seconds of a sensor's measurements put the tool."""
         shared = scene.in_all([time for time, _, _ in taken])
         if not len(shared[0]):
@@ -157,10 +157,10 @@ class Tool:
         seen = self._seen[name]
         seen.add(np.array([axes[0][0], *(axis[1] for axis in axes), np.max([axis[2] for axis in axes], axis=0)]))
         rows, flag = seen.rows[1:4].T, seen.rows[4] > 0.0
-        fused, rejected = _thinned(rows[~flag]), _thinned(rows[flag])  # each by itself: few are rejected
+        fused, rejected = _thin(rows[~flag]), _thin(rows[flag])  # each by itself: few are rejected
         red = np.repeat([False, True], [len(fused), len(rejected)])
-        points = scene.seen(np.concatenate([fused, rejected]) * MM, red, colour)
-        self._sink.log_at(float(seen.rows[0, -1]), scene.measured(name), points)
+        points = scene.measured_points(np.concatenate([fused, rejected]) * MM, red, colour)
+        self._sink.log_at(float(seen.rows[0, -1]), scene.measured_entity(name), points)
 
 
 class Recent:
@@ -208,7 +208,7 @@ class Residuals:
         rows = np.array([stamp - self._sensor.latency, value / self._sensor.scale, rejected])
         self._waiting = np.concatenate([self._waiting, rows], axis=1)[:, -_MOST_KEPT:]
 
-    def take(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    def drain(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Valid times [s], positions, positions less the estimate [SI], and which were rejected."""
         if self._estimates.rows.shape[1] < 2:
             return np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.bool_)
@@ -222,7 +222,7 @@ class Residuals:
         return time, position - self._bias, residual - self._bias, rejected
 
 
-def _thinned(rows: FloatArray) -> FloatArray:
+def _thin(rows: FloatArray) -> FloatArray:
     """As many rows as a path needs, the newest among them."""
     return rows[:: -(1 + len(rows) // _PATH_POINTS)]
 
@@ -329,7 +329,7 @@ def _draw(viewer: Viewer, header: Header, frames: queue.Queue[Frame | None]) -> 
     _leave(viewer)
 
 
-def _put(frames: queue.Queue[Frame | None], frame: Frame | None) -> None:
+def _add_frame(frames: queue.Queue[Frame | None], frame: Frame | None) -> None:
     """Have a frame drawn, or the drawing ended; where too many wait, the oldest is left out."""
     if frames.full():
         with contextlib.suppress(queue.Empty):
@@ -355,8 +355,8 @@ def main() -> None:
     drawing.start()
     for line in sys.stdin.buffer:
         if line.endswith(b"\n"):  # the last one may be torn
-            _put(frames, msgspec.json.decode(line))
-    _put(frames, None)
+            _add_frame(frames, msgspec.json.decode(line))
+    _add_frame(frames, None)
     drawing.join(_LAST)
     _leave(viewer)
 

@@ -153,7 +153,7 @@ def verdict(result: AxisVerification) -> str:
         f"{result.run}, {result.axis}: the model is off by {result.model.rms * screen.scale:.3f} {screen.unit} RMS,"
         f" {result.model.percent:.1f} % of the motion; the best model of its order would be off by"
         f" {best.fit.rms * screen.scale:.3f}: {result.verdict}; by the model the arm is {result.lag * MS:.1f} ms late,"
-        f" here it is {formatting.with_interval(best.lag, best.lag_ci95, MS)} ms; the best model has a gain of"
+        f" here it is {formatting.format_interval(best.lag, best.lag_ci95, MS)} ms; the best model has a gain of"
         f" {best.gain:.3f}, a dead time of {best.delay * MS:.1f} ms and {plant}; the start level is"
         f" {result.start * screen.scale:g} {screen.unit} ({result.start_from}){left_out}"
     )
@@ -165,12 +165,12 @@ def verdict(result: AxisVerification) -> str:
 def answers(summary: LatencySummary) -> list[str]:
     """How late each axis and each sensor is, whether that changes, and what the motion was too poor for."""
     lines = [
-        f"{axis} is {formatting.between(lag.lag, lag.lag_ci95, MS)} ms late." for axis, lag in summary.axes.items()
+        f"{axis} is {formatting.format_range(lag.lag, lag.lag_ci95, MS)} ms late." for axis, lag in summary.axes.items()
     ]
     for name, sensor in summary.sensors.items():
         sign, word = (-1.0, "earlier") if sensor.latency < 0.0 else (1.0, "later")
         low, high = sorted(sign * end for end in sensor.latency_ci95)
-        late = formatting.between(abs(sensor.latency), (low, high), MS)
+        late = formatting.format_range(abs(sensor.latency), (low, high), MS)
         same = ": as late, as far as can be told" if low < 0.0 < high else ""
         lines.append(f"{name} is {late} ms {word} than {summary.sensor}{same}.")
     lines.append(
@@ -214,7 +214,7 @@ def lags(summary: LatencySummary) -> TextTable:
     """A row for each axis and each sensor."""
 
     def time(value: float, interval: tuple[float, float], shared: bool = False) -> str:
-        return formatting.between(value, interval, MS).replace(" (", f"{' *' if shared else ''}\n(", 1)
+        return formatting.format_range(value, interval, MS).replace(" (", f"{' *' if shared else ''}\n(", 1)
 
     rows = list[list[str]]()
     for axis, lag in summary.axes.items():
@@ -227,22 +227,24 @@ def lags(summary: LatencySummary) -> TextTable:
 def _plant_of(lag: AxisLag) -> str:
     lines, screen = list[str](), SCREEN[lag.kind]
     if lag.time_constant is not None:
-        lines.append(f"τ {formatting.between(lag.time_constant, lag.time_constant_ci95, MS)} ms")
+        lines.append(f"τ {formatting.format_range(lag.time_constant, lag.time_constant_ci95, MS)} ms")
     else:
-        lines.append(f"ω {formatting.between(lag.natural_frequency or 0.0, lag.natural_frequency_ci95)} rad/s")
-        lines.append(f"ζ {formatting.between(lag.damping or 0.0, lag.damping_ci95)}")
+        lines.append(f"ω {formatting.format_range(lag.natural_frequency or 0.0, lag.natural_frequency_ci95)} rad/s")
+        lines.append(f"ζ {formatting.format_range(lag.damping or 0.0, lag.damping_ci95)}")
     if lag.play:
-        lines.append(f"play {formatting.between(lag.play, lag.play_ci95, screen.scale)} {screen.unit}")
+        lines.append(f"play {formatting.format_range(lag.play, lag.play_ci95, screen.scale)} {screen.unit}")
     if lag.max_speed:
-        lines.append(f"up to {formatting.between(lag.max_speed, lag.max_speed_ci95, screen.scale)} {screen.unit}/s")
+        lines.append(
+            f"up to {formatting.format_range(lag.max_speed, lag.max_speed_ci95, screen.scale)} {screen.unit}/s"
+        )
     return "\n".join(lines)
 
 
 def _gain_of(lag: AxisLag) -> str:
-    gain = "1" if lag.gain_ci95 is None else formatting.between(lag.gain, lag.gain_ci95)
+    gain = "1" if lag.gain_ci95 is None else formatting.format_range(lag.gain, lag.gain_ci95)
     if lag.gain_recovery is None:
         return gain
-    return f"{gain}\nrecovers: {formatting.between(lag.gain_recovery, lag.gain_recovery_ci95, MS)} ms"
+    return f"{gain}\nrecovers: {formatting.format_range(lag.gain_recovery, lag.gain_recovery_ci95, MS)} ms"
 
 
 def settings(latency: Latency) -> str:
@@ -382,7 +384,7 @@ def _coefficients(fit: OrderFit, screen: Screen) -> list[str]:
     values += [(fit.time_constant, fit.time_constant_ci95, MS)]
     values += [(fit.natural_frequency, fit.natural_frequency_ci95, 1.0), (fit.damping, fit.damping_ci95, 1.0)]
     coefficients_told = [
-        formatting.with_interval(value, ci95, unit) for value, ci95, unit in values if value is not None
+        formatting.format_interval(value, ci95, unit) for value, ci95, unit in values if value is not None
     ]
     return [*coefficients_told, f"{fit.rms * screen.scale:.3f} ({fit.rms_percent:.1f} %)"]
 

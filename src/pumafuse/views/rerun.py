@@ -108,7 +108,7 @@ def _send(est: Estimates, run: Run, sink: Sink) -> None:
         for sensor in est.measurements.sensors:
             _sensor(sink, est, sensor, name, by_sensor[sensor])
         sink.band(f"{name}/estimate", "estimate ± sd", est.time, axis.position, axis.position_sd, screen)
-        if name not in _measured(est):
+        if name not in _measured_axes(est):
             continue
         nothing = np.zeros(len(est.time))
         sink.band(f"residual/{name}/estimate", "estimate's sd", est.time, nothing, axis.position_sd, screen)
@@ -125,7 +125,7 @@ def _send(est: Estimates, run: Run, sink: Sink) -> None:
     send_scene(sink, est, run)
 
 
-def _measured(est: Estimates) -> list[str]:
+def _measured_axes(est: Estimates) -> list[str]:
     """The axes that sensors give values for."""
     return [est.measurements.axes[number] for number in np.unique(est.measurements.axis)]
 
@@ -182,7 +182,7 @@ def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:
         screen, limit = est.config.arm.screen_of(name), _residual_span(est, name)
         span, unit = _span(axis.position[shown], screen), screen.unit
         positions[name] = _plot(f"/{name}", f"{name} [{unit}]", (start, end), span, legend=not positions)
-        if name in _measured(est):
+        if name in _measured_axes(est):
             title = f"{name}: innovation / its sd, ±2" + (f"; {_NOISE}" if _adapts(est, name) else "")
             innovations[name] = _plot(f"/innovation/{name}", title, whole, (-5.0, 5.0))
             title = f"{name}: measurement − estimate [{unit}]"

@@ -62,7 +62,7 @@ def send_scene(sink: Sink, est: Estimates, run: Run) -> None:
         send_tool(sink, est.time[every], pose.position[every], pose.quaternion[every], root, larger)
         centre = np.mean(pose.position, axis=0)
         for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
-            _measured(sink, est, sensor, colour)
+            _send_measured(sink, est, sensor, colour)
             if configured := est.config.sensors.get(sensor):
                 send_placed(sink, sensor, configured, colour, centre, length)
     else:
@@ -174,7 +174,7 @@ def _links(command: Source, joints: Joints) -> tuple[TimeArray, FloatArray]:
     return command.stamp[rows[is_known]], links[is_known]
 
 
-def _measured(sink: Sink, est: Estimates, sensor: str, colour: str) -> None:
+def _send_measured(sink: Sink, est: Estimates, sensor: str, colour: str) -> None:
     """Send where the measurements of a sensor put the tool."""
     axes = CARTESIAN if est.placed is None else ("tangential", "radial", "vertical")
     parts = [est.measured_positions(sensor, axis) for axis in axes]
@@ -187,10 +187,10 @@ def _measured(sink: Sink, est: Estimates, sensor: str, colour: str) -> None:
         value[:2] = est.placed.to_log(value[0], value[1])
     outcome = np.stack([part.outcome[row] for part, row in zip(parts, rows, strict=True)])
     rejected = (outcome == Outcome.REJECTED).any(axis=0)
-    sink.log(measured(sensor), seen(_points(value) * sink.scale, rejected, colour))
+    sink.log(measured_entity(sensor), measured_points(_points(value) * sink.scale, rejected, colour))
 
 
-def measured(sensor: str) -> str:
+def measured_entity(sensor: str) -> str:
     """The entity of where the measurements of a sensor put the tool."""
     return f"path/measured/{styles.entity(sensor)}"
 
@@ -202,7 +202,7 @@ def in_all(stamps: Sequence[FloatArray]) -> list[IntArray]:
     return [rows[np.searchsorted(stamp[rows], common)] for stamp, rows in zip(stamps, order, strict=True)]
 
 
-def seen(point: FloatArray, rejected: BoolArray, colour: str) -> rr.Points3D:
+def measured_points(point: FloatArray, rejected: BoolArray, colour: str) -> rr.Points3D:
     """Measurements (n, 3), in the unit of the scene; those that were rejected in red."""
     shades = np.where(rejected[:, None], colours.rgb(colours.REJECTED), colours.rgb(colour)).astype(np.uint8)
     return rr.Points3D(point, colors=shades, radii=[-0.8])

@@ -57,10 +57,10 @@ def page(tuning: Tuning, runs: Sequence[Run]) -> str:
             *summary.notes,
             *summary.not_identifiable,
             *map(formatting.together, summary.correlations),
-            *formatting.chosen(summary.orders),
+            *formatting.chosen_orders(summary.orders),
         ],
         "lag_words": formatting.lag(tuning.config.arm),
-        "fitted": formatting.fitted(summary),
+        "fitted": formatting.fitted_rows(summary),
         "config": tuning.config,
         "known": configured,
         "outside": sum(not low <= value <= high for value, low, high in configured),
@@ -68,7 +68,7 @@ def page(tuning: Tuning, runs: Sequence[Run]) -> str:
         "open": not summary.interrupted and any(None in parameter.ci95 for parameter in summary.parameters),
         "two_maxima": [profile.key for profile in tuning.profiles if profile.bimodal],
         "profiles": profile_figure(tuning.profiles, fitted) if tuning.profiles else None,
-        "validation": [(formatting.validated(check), check) for check in summary.validation or ()],
+        "validation": [(formatting.validation_rows(check), check) for check in summary.validation or ()],
         "innovations": [
             (innovation_figure(before, after, *pair, both), _sentence(*pair, both)) for pair, both in tests.items()
         ],
