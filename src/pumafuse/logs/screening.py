@@ -56,9 +56,11 @@ def first_zeros(source: Source, others: Sequence[Source]) -> int:
     if (values[:, first][~leapt] != 0.0).any():
         return 0
 
+    since = int(source.stamp[first])
+
     def was_there(axis: str, level: float) -> bool:
         for stamp, value in (other.series(axis) for other in others if axis in other.values):
-            before = max(int(np.searchsorted(stamp, source.stamp[first])) - 1, 0)
+            before = max(int(np.searchsorted(stamp, since)) - 1, 0)
             if len(stamp) and abs(float(value[before]) - level) < BACK * abs(level):
                 return True
         return False
