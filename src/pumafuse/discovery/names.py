@@ -58,7 +58,7 @@ _QUANTITIES = words_in(
     " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tor tq tau moment moments force forces"
     " tension tensions wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts"
     " power pwm duty load pressure temperature temperatures temp covariance quaternion quat std sd sigma var variance"
-    " error err errs yawspeed rollspeed pitchspeed"
+    " error err errs yawspeed rollspeed pitchspeed rpm rps mps kmh kpa psi pct percent"
 )
 _NO_POSITIONS = _QUANTITIES | words_in(
     "kp ki kd mode scaling bits quality confidence orientation rotation twist index id seq sequence count status valid"
@@ -166,6 +166,13 @@ def may_drive(columns: Iterable[str]) -> bool:
 def role_words(column: str) -> list[str]:
     """The words of a column's name that say whose it is, and whether it is filtered."""
     return [word for word in words(leaf(column)) if word.rstrip(_DIGITS) in _OF_ROLES | FILTERED]
+
+
+def bare(name: str) -> list[str]:
+    """The words of a column's name without those of roles and a d for desired: of ``q_cmd[0]``, ``q_d[0]``, ``q[0]``."""
+    match = _DESIRED.fullmatch(name)
+    name = f"{match[1]}{match[2]}" if match else name
+    return [word for word in words(name) if word not in role_words(name)]
 
 
 def column_role(column: str) -> Role | None:

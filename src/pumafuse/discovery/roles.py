@@ -610,12 +610,15 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not."""
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
-    relations = _relations(command, stream)
+    every = [signal for side in (command, stream) for axis in stream.axes for signal in side.axes[axis]]
+    is_told = all(signal.basis != "range" for signal in every)
+    relations = _relations(*(_ranged(side, {*side.axes}) for side in (command, stream)))  # one unit in each
     alike = [relation for relation in relations if relation.correlation >= SAME]
     behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
     gains, fewest = [relation.slope for relation in behind], len(relations) / 2
     fewest = 0.0 if _is_namesake(command, stream) else fewest
-    if len(behind) > fewest and max(gains) < _GAINS * min(gains):
+    as_far = not is_told or 1.0 / _GAINS < float(np.median(gains or 1.0)) < _GAINS
+    if len(behind) > fewest and as_far and max(gains) < _GAINS * min(gains):
         return f"{float(np.median([relation.lag for relation in behind])) * 1e3:.0f} ms late", ""
     speeds = speeds_follow(command.source, stream.source)
     if speeds is not None and speeds.correlation >= SAME and -_AT_ONCE < speeds.lag < LATEST:
@@ -640,12 +643,8 @@ def _rises_evenly(value: FloatArray) -> bool:
 
 def _is_namesake(command: Stream, stream: Stream) -> bool:
     """Whether columns are called as those of the commands without a word of these: ``q[0]`` beside ``q_cmd[0]``."""
-
-    def called(signals: Sequence[Signal]) -> list[str]:
-        return [word for word in names.words(signals[0].name) if word not in names.role_words(signals[0].name)]
-
     shared = stream.axes.keys() & command.axes.keys()
-    names_of = [(called(stream.axes[axis]), called(command.axes[axis])) for axis in shared]
+    names_of = [[names.bare(side.axes[axis][0].name) for side in (stream, command)] for axis in shared]
     return bool(names_of) and all(first == other and first[:1] != NAMELESS for first, other in names_of)
 
 
