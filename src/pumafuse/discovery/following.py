@@ -222,7 +222,8 @@ def isolated(time: FloatArray, value: FloatArray) -> BoolArray:
 
     The line is one over time, and one from row to row: of an even motion rows may be measured late, or stamped late.
     Of an encoder that rests in most rows the least third differences are those of one count, by which it flickers.
-    A value that is as the one before it is old, as of a driver that was read twice before it had a new one: no leap.
+    A value between those before and behind it was only taken sooner or later than it is stamped, as of a driver that
+    was read twice before it had a new one: no leap.
     """
     is_isolated = np.zeros(len(value), dtype=np.bool_)
     if len(value) < _FEWEST:
@@ -235,10 +236,11 @@ def isolated(time: FloatArray, value: FloatArray) -> BoolArray:
     for at in (time, np.arange(len(value), dtype=np.float64)):
         apart, off = _off_line(at, value)
         is_isolated[2:-2] &= apart > np.maximum(least, _APART * off)
-    is_isolated[1:] &= np.diff(value) != 0.0
     neighbours = is_isolated[:-2] & is_isolated[2:]  # every second value: they go there and back together
     is_isolated[:-2] &= ~neighbours
     is_isolated[2:] &= ~neighbours
+    from_both = np.stack([value[1:-1] - value[:-2], value[1:-1] - value[2:]])
+    is_isolated[1:-1] &= (from_both.min(axis=0) > least) | (from_both.max(axis=0) < -least)
     return is_isolated
 
 

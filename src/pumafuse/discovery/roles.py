@@ -22,8 +22,20 @@ from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
 from ..units import AN, DEG, GUESSED, KINDS, TURN, Kind, kind_of
 from . import names
-from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, period_of, unused, usual_size
-from .following import LATEST, Following, following
+from .contents import (
+    ARE_SPEEDS,
+    NAMELESS,
+    RANGES,
+    RESTS,
+    Part,
+    Signal,
+    is_nameless,
+    no_commands,
+    period_of,
+    unused,
+    usual_size,
+)
+from .following import ABOUT_ONE, LATEST, Following, following
 from .matching import far_shift
 from .names import Role
 from .orientations import Attitude, in_order
@@ -36,6 +48,7 @@ _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _EVEN, _MOSTLY = 0.05, 0.9  # of a step, by which those of a clock differ, as it has digits; of the steps
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _TO_AND_FRO = 10  # turns at rest, from which they are noise: an arm that settles turns a few times
+_AS_WELL = 1.5  # times what another explanation leaves: of a motion that swings, a lag of a quarter leaves noise, too
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
 _NEAR = -0.5, 1.5  # s, from and to which lag a sensor is on the commands' clock
 MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that hardly an arm is late; and that one is where its clock is shifted
@@ -160,7 +173,8 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     if (chosen := _command(streams)) is None:
         raise UndecidedError(log, f"which numbers are the commands? {_none_leads(parts, streams)}", parts)
     command, why = chosen
-    resting = {names.axis_of(column, []) for column, what in command.part.left_out.items() if what.startswith(RESTS)}
+    at_rest = [column for column, what in command.part.left_out.items() if what.startswith(RESTS)]
+    resting = {*(names.axis_of(column, []) for column in at_rest), *(tuple(names.bare(column)) for column in at_rest)}
     left_out, kept = list[tuple[Stream, str]](), list[Stream]()
     for stream in (stream for stream in streams if stream is not command):
         if stream.role == "command" or (stream.role is None and stream.why):
@@ -184,7 +198,11 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             others = {axis: some for axis, some in stream.axes.items() if id(some) not in used}
             for held in (True, False):
                 why_not = "its command never moves" if held else "no command is left that is called so or moves alike"
-                if some := {axis: columns for axis, columns in others.items() if (axis in resting) == held}:
+                if some := {
+                    axis: columns
+                    for axis, columns in others.items()
+                    if resting.isdisjoint([axis, tuple(names.bare(columns[0].name))]) != held
+                }:
                     left_out.append((replace(stream, axes=some), why_not))
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
@@ -202,6 +220,38 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     left_out += [(report, no_measurement) for report in reports]
     sensors = [sensor for sensor in sensors if sensor not in reports]
     return _with_units(Roles(command, sensors, references[0] if references else None, left_out))
+
+
+def told_as_speeds(roles: Roles) -> str:
+    """What to say where the commands are velocities, as they add up to what is measured; empty where they are not.
+
+    What is left out is asked only where nothing measures: an integral of a controller adds up, too.
+    """
+    others = [stream for stream, _ in roles.left_out if stream.role != "command"]
+    for stream in roles.measured.values() if roles.sensors else others:
+        shared = [axis for axis in roles.command.axes if axis in stream.axes]
+        if shared and all(_adds_up(roles.command, stream, axis) for axis in shared):
+            columns = ", ".join(roles.command.axes[axis][0].column for axis in shared[:_MOST_LISTED])
+            return f"{ARE_SPEEDS.format(columns)}: they add up to {stream.name}"
+    return ""
+
+
+def _adds_up(command: Stream, stream: Stream, axis: str) -> bool:
+    """Whether commands, added up by the clock, lead as far as a sensor goes, which they do not as they are."""
+    (stamp, speed), measured = (side.source.series(axis) for side in (command, stream))
+    steps = 0.5 * (speed[1:] + speed[:-1]) * np.diff(stamp) / 1e9
+    summed = following((stamp, np.concatenate(([0.0], np.cumsum(steps)))), measured)
+    if summed is None or summed.correlation < SAME or not -_AT_ONCE < summed.lag < MOST_LAG:
+        return False
+    leading = following((stamp, speed), measured)
+    if leading is None or leading.correlation < SAME:
+        return _as_far(summed)
+    leads = leading.lag < MOST_LAG and _as_far(leading)
+    return _as_far(summed) and not leads and summed.misfit < _AS_WELL * leading.misfit
+
+
+def _as_far(relation: Following) -> bool:
+    return 1.0 / ABOUT_ONE < relation.slope < ABOUT_ONE
 
 
 def _none_leads(parts: Sequence[Part], streams: Sequence[Stream]) -> str:

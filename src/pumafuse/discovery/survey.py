@@ -23,7 +23,7 @@ from .contents import Part, parts_of, period_of, unused
 from .following import LATEST, Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
-from .roles import GUESSED_LAG, SAME, Roles, UndecidedError, relations, roles_of
+from .roles import GUESSED_LAG, SAME, Roles, UndecidedError, relations, roles_of, told_as_speeds
 
 FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
@@ -87,6 +87,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         return replace(without_early, interpolation=interpolation(without_early))
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
+    if speeds := told_as_speeds(roles):
+        raise UndecidedError(str(log), speeds, parts, roles)
     _refuse_alone(log, parts, roles, "nothing that measures where they lead")
     run = without_strays(roles.run)
     framed = own_frames(run)
