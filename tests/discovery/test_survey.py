@@ -2225,3 +2225,14 @@ def test_a_speed_that_is_missed_is_no_error_to_add_to_a_position(tmp_path: Path)
     columns = {"t_s": t, "target_speed_mps": 1.0 + np.sin(t), "speed_mps": np.sin(t), "error_mps": np.cos(t)}
     text = refusal(tmp_path, columns)
     assert "is an error" not in text
+
+
+def test_points_of_one_body_that_nothing_names_are_no_commands_and_sensors(tmp_path: Path) -> None:
+    """Five on a car that turns: each seems to follow those in front of it, by 20 to 60 ms."""
+    t = 0.02 * np.arange(1000)
+    points = {"nose": 0.0, "roof": 0.02, "seat": 0.03, "boot": 0.045, "tail": 0.06}
+    columns = {
+        f"{name}_{axis}": path(t - late)[:, place] for name, late in points.items() for place, axis in enumerate("xy")
+    }
+    text = refusal(tmp_path, {"t": t} | columns)
+    assert "move alike, as points of one body do; say it in run.toml" in text

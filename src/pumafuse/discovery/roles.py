@@ -49,6 +49,8 @@ _EVEN, _MOSTLY = 0.05, 0.9  # of a step, by which those of a clock differ, as it
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _TO_AND_FRO = 10  # turns at rest, from which they are noise: an arm that settles turns a few times
 _AS_WELL = 1.5  # times what another explanation leaves: of a motion that swings, a lag of a quarter leaves noise, too
+_OF_BODY = 4  # followers that nothing names, from which all may be points of one body, and none be commanded
+_LEADS, _FOLLOWS, _SAY = "others follow it", "it follows the commands", "say it in run.toml"
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
 _NEAR = -0.5, 1.5  # s, from and to which lag a sensor is on the commands' clock
 MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that hardly an arm is late; and that one is where its clock is shifted
@@ -189,7 +191,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
         if stream.role is None and axes:
             late, otherwise = _follows(command, matched)
-            matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
+            matched = replace(matched, role="sensor" if late else None, why=f"{_FOLLOWS} {late}")
             says = f"neither its name nor its motion says what it is: {otherwise}"
             why_not = f"{says}; if it measures their axes, say so in run.toml"
         if axes and matched.role:
@@ -206,6 +208,10 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
                     left_out.append((replace(stream, axes=some), why_not))
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
+    unnamed = [stream.name for stream in kept if stream.why.startswith(_FOLLOWS)]
+    if why == _LEADS and len(unnamed) >= _OF_BODY:
+        alike = f"{command.name}, {', '.join(unnamed)} move alike, as points of one body do"
+        raise UndecidedError(log, f"which numbers are the commands? None is called so, and {alike}; {_SAY}", parts)
     may_measure = command.role != "reference"  # beside commands; another set point measures nothing
     command, *kept = _in_order([command, *_once(_raw(kept, left_out), left_out)], left_out)
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
@@ -266,7 +272,7 @@ def _none_leads(parts: Sequence[Part], streams: Sequence[Stream]) -> str:
     called = "None is called command, goal, target, desired, setpoint or action"
     called = f"What is called so never moves: {printable('; '.join(still[:3]), _LONGEST)}" if still else called
     listed = "; ".join([*what, *unused(part for part in parts if part.clock is None)[:_MOST_LISTED]])
-    return f"{called}, and none runs ahead of others ({listed}); {no_commands(parts)}say it in run.toml"
+    return f"{called}, and none runs ahead of others ({listed}); {no_commands(parts)}{_SAY}"
 
 
 def _raw(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
@@ -626,7 +632,7 @@ def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
         return None
     if called and len(driving) == len(called) and not followers[best.name][0]:
         return _command([stream for stream in streams if stream.role != "command"]) or (best, best.why)
-    return best, best.why or "others follow it"
+    return best, best.why or _LEADS
 
 
 def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float, float]:
