@@ -666,14 +666,13 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not."""
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
-    every = [signal for side in (command, stream) for axis in stream.axes for signal in side.axes[axis]]
-    is_told = all(signal.basis != "range" for signal in every)
-    relations = _relations(*(_ranged(side, {*side.axes}) for side in (command, stream)))  # one unit in each
+    command = _ranged(command, {*command.axes})
+    relations = _relations(command, _fitted(stream, command))
     alike = [relation for relation in relations if relation.correlation >= SAME]
     behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
     gains, fewest = [relation.slope for relation in behind], len(relations) / 2
     fewest = 0.0 if _is_namesake(command, stream) else fewest
-    as_far = not is_told or 1.0 / _GAINS < float(np.median(gains or 1.0)) < _GAINS
+    as_far = 1.0 / _GAINS < float(np.median(gains or 1.0)) < _GAINS
     if len(behind) > fewest and as_far and max(gains) < _GAINS * min(gains):
         return f"{float(np.median([relation.lag for relation in behind])) * 1e3:.0f} ms late", ""
     speeds = speeds_follow(command.source, stream.source)
