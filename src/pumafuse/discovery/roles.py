@@ -672,7 +672,10 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
     gains, fewest = [relation.slope for relation in behind], len(relations) / 2
     fewest = 0.0 if _is_namesake(command, stream) else fewest
-    as_far = 1.0 / _GAINS < float(np.median(gains or 1.0)) < _GAINS
+    called = [(axis, signal) for axis, some in stream.axes.items() for signal in some]
+    is_open = all(signal.axis == axis and signal.basis == "range" for axis, signal in called)  # a unit that nobody says
+    is_open = is_open and not any(names.words(signal.column)[:1] == NAMELESS for _, signal in called)
+    as_far = is_open or 1.0 / _GAINS < float(np.median(gains or 1.0)) < _GAINS
     if len(behind) > fewest and as_far and max(gains) < _GAINS * min(gains):
         return f"{float(np.median([relation.lag for relation in behind])) * 1e3:.0f} ms late", ""
     speeds = speeds_follow(command.source, stream.source)
