@@ -159,3 +159,13 @@ def test_of_a_run_that_mostly_rests_the_motion_tells_the_gain() -> None:
     assert found.slope == pytest.approx(0.92, abs=0.03)
     assert found.correlation > 0.98
     assert found.misfit > 10.0
+
+
+@pytest.mark.parametrize("wanders", [True, False])
+def test_a_lead_that_explains_no_more_is_none(wanders: bool) -> None:
+    """By 15 ms, of an arm that wanders by 30 mm; beside noise of 0.2 mm it is a clock that is off."""
+    t, draw = np.arange(0.0, 40.0, 0.02), np.random.default_rng(11)
+    beside = 0.03 * np.sin(4.1 * t + np.sin(0.3 * t)) if wanders else draw.normal(scale=2e-4, size=len(t))
+    found = following((stamped(t), path(t)), (stamped(t), path(t + 0.015) + beside))
+    assert found is not None
+    assert found.lag == pytest.approx(0.0 if wanders else -0.015, abs=2e-3)

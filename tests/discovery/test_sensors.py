@@ -211,5 +211,16 @@ def test_rows_that_go_there_and_back_together_are_no_outliers() -> None:
     value = 0.02 * speeding**2 + 0.04 * 0.5 * np.maximum(t - 4.5, 0.0) + rng.uniform(-3e-7, 3e-7, len(t))
     value += 1.2e-5 * ((speeding > 0.0) & (speeding < 0.5)) * np.where(np.arange(len(t)) % 2, 1.0, -1.0)
     assert not isolated(t, value).any()
-    value[[120, 330]] += 4e-5
+    value[[120, 330]] += 4e-5, 5e-4  # at rest, and beyond the row behind it
     assert np.flatnonzero(isolated(t, value)).tolist() == [120, 330]
+
+
+@pytest.mark.parametrize("late", [0.3, 1.0])
+def test_a_value_that_was_taken_late_or_is_repeated_is_no_outlier(late: float) -> None:
+    """Of a carriage at 0.2 m/s, read every 5 ms: by 0.3 of a row, 0.3 mm, or by a whole one; a leap goes beyond."""
+    t = np.arange(800) * 0.005
+    taken = t - np.where(np.arange(len(t)) % 40 == 7, late * 0.005, 0.0)
+    value = 0.2 * np.abs(taken - 2.0) + np.random.default_rng(8).normal(0.0, 1e-6, len(t))
+    assert not isolated(t, value).any()
+    value[[150, 600]] += 0.004
+    assert np.flatnonzero(isolated(t, value)).tolist() == [150, 600]

@@ -2108,3 +2108,96 @@ def test_what_is_asked_about_a_sensor_is_not_sure(late: float, tmp_path: Path) -
     (sure,) = [sure for what, _, sure in decisions(found) if what == "actual follows"]
     assert sure == ("sure" if late > 0.0 else "a question")
     assert any("ahead of the commands on x" in one for one in asked(found)) is (late < 0.0)
+
+
+def test_what_nothing_names_and_moves_nine_times_as_far_is_no_sensor(tmp_path: Path) -> None:
+    """In units that names tell: a spindle's turn follows the table's in time alone."""
+    t, u, _, _ = recorded()
+    columns = {"t_s": t, "goal_pan_deg": 10.0 * u[:, 0], "spindle_deg": 90.0 * np.interp(t - LAG, t, u[:, 0])}
+    assert "9 to 9 times as far" in refusal(tmp_path, columns)
+    found = surveyed(tmp_path, columns | {"pan_deg": 10.0 * np.interp(t - LAG, t, u[:, 0])})
+    assert {*found.run.sensors} == {"measured"}
+
+
+def test_an_axis_that_does_not_follow_is_left_out_beside_one_that_hardly_does(tmp_path: Path) -> None:
+    t, u, _, _ = recorded()
+    draw = np.random.default_rng(3)
+    loose = np.interp(t - 0.2, t, u[:, 0]) + 0.065 * np.interp(t, t[::60], draw.normal(size=len(t[::60])))
+    columns = {"t_s": t, "cmd_x_m": u[:, 0], "cmd_y_m": u[:, 1], "meas_x_m": loose, "meas_y_m": 0.1 * np.sin(9.0 * t)}
+    found = surveyed(tmp_path, columns)
+    assert 0.8 < found.relations["meas", "x"].correlation < 0.9
+    assert {*found.run.axes} == {"x"}
+    assert any("meas is not used on y: it does not follow the commands" in asked for asked in questions(found, {}))
+
+
+def test_a_place_that_is_called_p_is_x_y_z_and_follows_what_is_desired_of_it(tmp_path: Path) -> None:
+    """Also where a controller that knows the path is 8 ms ahead on one of two axes, and z stands still."""
+    t = 0.02 * np.arange(1000)
+    u, z = path(t), np.stack([path(t + 0.008)[:, 0], path(t - 0.012)[:, 1], path(t)[:, 2]], axis=1)
+    columns = {"t": t} | {f"p[{place}]": z[:, place] for place in range(3)}
+    columns |= {f"p_d[{place}]": u[:, place] if place < 2 else np.full(len(t), 1.2) for place in range(3)}
+    found = surveyed(tmp_path, columns)
+    assert found.run.axes == ("x", "y")
+    assert found.run.kinds == {"x": "length", "y": "length"}
+    assert "p is not used on z: its command never moves" in [*questions(found, {})]
+
+
+@pytest.mark.parametrize("tau", [0.05, 0.3])
+def test_commands_that_add_up_to_what_is_measured_are_velocities(tau: float, tmp_path: Path) -> None:
+    """Of a hovering drone that takes up a speed in 0.05 or 0.3 s."""
+    t = 0.02 * np.arange(1500)
+    speed = np.stack([0.5 * np.sin(2.0 * t), 0.4 * np.sin(0.9 * t + np.sin(0.2 * t))], axis=1)
+    taken, share = np.zeros_like(speed), 1.0 - np.exp(-0.02 / tau)
+    for row in range(1, len(t)):
+        taken[row] = taken[row - 1] + share * (speed[row - 1] - taken[row - 1])
+    columns = {"t": t, "cmd_x": speed[:, 0], "cmd_y": speed[:, 1]}
+    at = 0.02 * np.cumsum(taken, axis=0) + np.random.default_rng(2).normal(0.0, 1e-3, speed.shape)
+    text = refusal(tmp_path, columns | {"pos_x": at[:, 0], "pos_y": at[:, 1]})
+    assert "cmd_x" in text
+    assert "are velocities, and commands must be positions" in text
+
+
+@pytest.mark.parametrize("seen", ["meas_{}", "actual_traj_{}"])
+def test_a_trajectory_is_commanded_where_no_word_says_otherwise(seen: str, tmp_path: Path) -> None:
+    _, u, z = recorded_at_once()
+    found = surveyed(tmp_path, {"t_s": 0.02 * np.arange(1000), **xyz(u, "traj_{}"), **xyz(z, seen)})
+    assert found.roles is not None
+    assert found.roles.command.why == "its columns are called 'traj'"
+    assert found.relations[next(iter(found.run.sensors)), "y"].lag == pytest.approx(LAG, abs=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("told", "seen", "unit"),
+    [("x_cmd_in", "x_act_in", "inch"), ("x_target_in", "x_in", "inch"), ("x_in", "x_out", "m")],
+)
+def test_in_is_a_unit_beside_words_of_roles_and_an_input_beside_an_output(
+    told: str, seen: str, unit: str, tmp_path: Path
+) -> None:
+    _, u, z = recorded_at_once()
+    found = surveyed(tmp_path, {"t_s": 0.02 * np.arange(1000), told: u[:, 0], seen: z[:, 0]})
+    assert found.roles is not None
+    assert {some[0].unit for stream in found.roles.streams for some in stream.axes.values()} == {unit}
+    assert found.run.axes == ("x",)
+
+
+@pytest.mark.parametrize("unit", ["kPa", "rpm", "N.m", "mV"])
+def test_other_units_in_brackets_are_no_positions(unit: str) -> None:
+    assert names.no_position(f"P_ref_0 [{unit}]") == f"in {unit}"
+
+
+def test_a_speed_that_is_missed_is_no_error_to_add_to_a_position(tmp_path: Path) -> None:
+    t = 0.02 * np.arange(600)
+    columns = {"t_s": t, "target_speed_mps": 1.0 + np.sin(t), "speed_mps": np.sin(t), "error_mps": np.cos(t)}
+    text = refusal(tmp_path, columns)
+    assert "is an error" not in text
+
+
+def test_points_of_one_body_that_nothing_names_are_no_commands_and_sensors(tmp_path: Path) -> None:
+    """Five on a car that turns: each seems to follow those in front of it, by 20 to 60 ms."""
+    t = 0.02 * np.arange(1000)
+    points = {"nose": 0.0, "roof": 0.02, "seat": 0.03, "boot": 0.045, "tail": 0.06}
+    columns = {
+        f"{name}_{axis}": path(t - late)[:, place] for name, late in points.items() for place, axis in enumerate("xy")
+    }
+    text = refusal(tmp_path, {"t": t} | columns)
+    assert "move alike, as points of one body do; say it in run.toml" in text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -91,13 +92,17 @@ _OTHER_TYPES = names.words_in(
 )
 _VELOCITIES = names.words_in("Twist TwistStamped TwistWithCovariance TwistWithCovarianceStamped")
 RESTS = "always"  # what a column is that never changes
-_SPEEDS = names.words_in("velocity velocities vel speed twist")  # why columns are no positions
+_SPEEDS = names.words_in("velocity velocities vel speed twist rpm rps mps kmh")  # why columns are no positions
+ARE_SPEEDS = (
+    "{} are velocities, and commands must be positions: integrate them along the measured heading, as docs/own-log.md"
+    " does under 'Commands that are velocities'"
+)
 _ARE_VELOCITIES, _UNDECODED = "velocities, no positions", "its messages cannot be decoded"
 _OF_FRAME = ["header", "child_frame_id", "transform"]  # of a transform
 _PX4 = "PX4"  # whose numbers are in SI units; of its hundred topics those have positions that are called so:
 _PX4_TOPICS = names.words_in("position attitude odometry trajectory pose gimbal joint joints angle angles servo")
 _PX4_OTHERS = names.words_in("gps global estimator status rates triplet sensor selector")  # and by none of these
-_PX4_PLACE = re.compile(r"position\[([012])\]")
+_ELEMENT = re.compile(r"(.*)\[(\d+)\]")
 _TOLD = {"command", "reference"}  # roles in a table by which it is a run of its own, where others are beside them
 _CHILD = "child_frame_id"
 _BASES = names.words_in("base world map odom root origin")  # words of frames that stand still
@@ -289,7 +294,9 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
             signals.append(signal_or_why)
         elif signal_or_why:
             left_out[name] = signal_or_why
+    inches, points = names.with_inches(paths), _points(paths)
     signals = [_placed(signal, told) for signal in _without_quaternions(signals, left_out)]
+    signals = [_among_others(signal, inches, points) for signal in signals]
     called = [signal.column for signal in signals if not _is_nameless(signal.column)]
     if signals and (why := names.no_position_by_place(source.stem, called)):
         left_out |= {signal.name: f"{why}, as {source.label} is called" for signal in signals}
@@ -321,6 +328,20 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
         notes=(*why_none, *(() if clock is None else clock.notes), *source.notes, *table.notes, *notes),
         attitudes=tuple(attitude for attitude in attitudes if attitude.role_words in beside),
     )
+
+
+def _points(paths: Iterable[str]) -> set[str]:
+    """Lists of three that are called p, as control engineers call a place where q are joints: x, y and z."""
+    lists = Counter(match[1] for path in paths if (match := _ELEMENT.fullmatch(path)))
+    return {name for name, size in lists.items() if size == len(CARTESIAN) and names.words(name)[:1] == ["p"]}
+
+
+def _among_others(signal: Signal, inches: Mapping[str, str], points: Container[str]) -> Signal:
+    """A column as the unit and the axis that others beside it tell."""
+    if signal.column in inches:
+        return replace(signal, axis=names.axis_of(inches[signal.column], []), unit="inch", basis="name")
+    element = _ELEMENT.fullmatch(signal.column)
+    return replace(signal, axis=CARTESIAN[int(element[2])]) if element and element[1] in points else signal
 
 
 def is_nameless(signals: Iterable[Signal], clock: Clock) -> bool:
@@ -476,8 +497,8 @@ def _signal(
         called = called.replace(NAMELESS[0], "joint")
     axis = joint or names.axis_of(_called(called, where), labels)
     if kind == _PX4:
-        place_of = _PX4_PLACE.fullmatch(path)
-        axis = "xyz"[int(place_of[1])] if place_of else axis
+        element = _ELEMENT.fullmatch(path)
+        axis = CARTESIAN[int(element[2])] if element and element[1] == "position" else axis
         if axis not in CARTESIAN and not names.is_turning(axis):
             return "neither x, y, z nor an angle by its name"
         of_type, basis = "m" if axis in CARTESIAN else "rad", "name" if unit else "type"
@@ -593,7 +614,7 @@ def _counts(table: Table, name: str) -> float | None:
     """The usual step of a column of whole numbers that rise evenly, as a clock's or a counter's; None of any other."""
     with suppress(RunError):
         numbers = table.plain(name)[0]
-        if names.unit_of(name) or not (numbers % 1.0 == 0.0).all():
+        if names.unit_of(name) or not np.isfinite(numbers).all() or (numbers % 1.0).any():
             return None
         steps = np.diff(numbers)
         usual = float(np.median(steps)) if len(steps) >= _FEWEST_ROWS else 0.0
@@ -984,14 +1005,12 @@ def no_commands(parts: Iterable[Part]) -> str:
     told = any(names.column_role(signal.name) == "command" for part in parts for signal in part.signals)
     for part in parts:
         others = dict[str, str]() if told else part.left_out
-        speeds = [column for column, why in others.items() if why in _SPEEDS and names.column_role(column) == "command"]
+        called = [column for column, why in others.items() if why.partition(":")[0] in _SPEEDS]
+        speeds = [column for column in called if names.column_role(column) == "command"]
         if _ARE_VELOCITIES in part.notes or speeds:
             what = f"{', '.join(speeds[:3])} of {part.label}" if speeds else part.label
-            advice.append(
-                f"{what} are velocities, and commands must be positions: integrate them along the measured heading, as"
-                " docs/own-log.md does under 'Commands that are velocities'"
-            )
-        if error := next(filter(is_error, others), ""):
+            advice.append(ARE_SPEEDS.format(what))
+        if error := next((name for name in others if is_error(name) and not names.has_word(name, _SPEEDS)), ""):
             of_axis = f'AXIS = ["MEASURED", "{error}"]'
             advice.append(f"{error} of {part.label} is an error: {ERROR}: {of_axis} under [command] in run.toml")
         advice += [f"{part.label}: {note}" for note in part.notes if note.startswith(_UNDECODED)]

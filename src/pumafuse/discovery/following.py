@@ -31,6 +31,9 @@ _MOSTLY = 0.5  # share of the rows in motion, from which the median is one of th
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
 _KNEES = np.linspace(0.0, 1.0, 13)[1:-1]  # of the range that is commanded, where a curve bends
 ABOUT_ONE = 1.25  # factor by which one moves less or more than the other, where it moves as far
+# Of what is left at a lag before the other moves, as much as is left of it at once: then that lag means nothing. Where
+# it is hardly more than noise, also less does.
+_AS_WELL, _NOISE = 1.05, 3.0
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
 
 
@@ -77,6 +80,11 @@ def following(
     if is_moved and least.lag < -_COARSE and (later := _along_curve(t, u, s, z, least.lag)) > least.lag:
         led = np.interp(s - later, t, u)
         least = at(later, float(np.corrcoef(led, z)[0, 1]), float(np.polyfit(led, z, 1)[0]))[2]
+    if least.lag < 0.0:
+        led = np.interp(s, t, u)
+        at_once = at(0.0, least.correlation, float(np.polyfit(led, z, 1)[0]))[2]
+        is_noise = least.misfit < _NOISE * least.scatter
+        return least if is_noise or at_once.misfit > _AS_WELL * least.misfit else at_once
     return least
 
 
@@ -214,6 +222,8 @@ def isolated(time: FloatArray, value: FloatArray) -> BoolArray:
 
     The line is one over time, and one from row to row: of an even motion rows may be measured late, or stamped late.
     Of an encoder that rests in most rows the least third differences are those of one count, by which it flickers.
+    A value between those before and behind it was only taken sooner or later than it is stamped, as of a driver that
+    was read twice before it had a new one: no leap.
     """
     is_isolated = np.zeros(len(value), dtype=np.bool_)
     if len(value) < _FEWEST:
@@ -229,6 +239,8 @@ def isolated(time: FloatArray, value: FloatArray) -> BoolArray:
     neighbours = is_isolated[:-2] & is_isolated[2:]  # every second value: they go there and back together
     is_isolated[:-2] &= ~neighbours
     is_isolated[2:] &= ~neighbours
+    from_both = np.stack([value[1:-1] - value[:-2], value[1:-1] - value[2:]])
+    is_isolated[1:-1] &= (from_both.min(axis=0) > least) | (from_both.max(axis=0) < -least)
     return is_isolated
 
 

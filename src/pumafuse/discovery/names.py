@@ -38,6 +38,7 @@ _OF_COLUMNS = words_in("set sp pv process fb current cur curr present real contr
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
 _DRIVES = words_in("control ctrl input inputs")  # commands, or what a controller puts into motors or rotors
+_PATHS = words_in("traj trajectory")  # of columns, commands where no other word says what they are
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
 _OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in a column's
 FILTERED = words_in(
@@ -48,6 +49,7 @@ _SILENT = (
     _OF_ROLES
     | FILTERED
     | PARTS
+    | _PATHS
     | words_in(
         "raw pose poses position positions pos point points data translation transform value values scalar scalars"
         " joint jnt dof qpos controller robot arm tool tcp ee flange coordinates axis"
@@ -58,7 +60,7 @@ _QUANTITIES = words_in(
     " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tor tq tau moment moments force forces"
     " tension tensions wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts"
     " power pwm duty load pressure temperature temperatures temp covariance quaternion quat std sd sigma var variance"
-    " error err errs yawspeed rollspeed pitchspeed"
+    " error err errs yawspeed rollspeed pitchspeed rpm rps mps kmh kpa psi pct percent"
 )
 _NO_POSITIONS = _QUANTITIES | words_in(
     "kp ki kd mode scaling bits quality confidence orientation rotation twist index id seq sequence count status valid"
@@ -95,11 +97,13 @@ _DIGITS = "0123456789"
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|cm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
+_OTHER_UNIT = re.compile(r"[\[(] *([kM]?Pa|m?bar|psi|rpm|k?N|N[. *]?m|m[AV]|k?Hz|%) *[\])]$", re.IGNORECASE)
 _BRACKETED = re.compile(rf"[\[(] *(mm|cm|m|um|in|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 # Joints in metres, where others turn.
 SLIDING = words_in("slide slider prismatic linear rail gantry insertion telescope telescopic elevator")
 JOINTS = words_in("joint joints jnt dof")
+_IN = "in"  # inches, or an input
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
     **dict.fromkeys(words_in("cm centimeter centimeters centimetre centimetres"), "cm"),
@@ -165,12 +169,20 @@ def may_drive(columns: Iterable[str]) -> bool:
 
 def role_words(column: str) -> list[str]:
     """The words of a column's name that say whose it is, and whether it is filtered."""
-    return [word for word in words(leaf(column)) if word.rstrip(_DIGITS) in _OF_ROLES | FILTERED]
+    return [word for word in words(leaf(column)) if word.rstrip(_DIGITS) in _OF_ROLES | FILTERED | _PATHS]
+
+
+def bare(name: str) -> list[str]:
+    """The words of a column's name without those of roles: the same of ``q_cmd[0]``, ``q_d[0]`` and ``q[0]``."""
+    match = _DESIRED.fullmatch(name)
+    name = f"{match[1]}{match[2]}" if match else name
+    return [word for word in words(name) if word not in role_words(name)]
 
 
 def column_role(column: str) -> Role | None:
     """What the name of a column says its numbers are."""
-    return _role(words(leaf(column)), frozenset())
+    parts = words(leaf(column))
+    return _role(parts, frozenset()) or (None if _PATHS.isdisjoint(parts) else "command")
 
 
 def quantity(label: str, column: str) -> set[str]:
@@ -214,6 +226,8 @@ def no_position(column: str) -> str | None:
         return "relative: a change, no position"
     if _PER.search(column):
         return "a ratio"
+    if other := _OTHER_UNIT.search(column):
+        return f"in {other[1]}"
     is_told = kind is not None or _BRACKETED.search(column) is not None
     if not is_told and role_words(column) and any(word.rstrip(_DIGITS) == "qd" for word in parts):
         return "velocity"  # as UR calls it: target_qd_0 beside target_q_0
@@ -267,7 +281,17 @@ def unit_of(column: str) -> str:
     if _DEGREES.search(column):
         return "deg"
     *before, last = words(column) or [""]  # also that of `x [mm]`
-    return _UNITS.get(last, "") if before and (last != "in" or _BRACKETED.search(column)) else ""
+    return _UNITS.get(last, "") if before and (last != _IN or _BRACKETED.search(column)) else ""
+
+
+def with_inches(columns: Iterable[str]) -> dict[str, str]:
+    """Columns of which ``in`` at the end is a unit, under names that say so: ``x_cmd_in``, and ``x_in`` beside that.
+
+    Alone, or beside ``x_out``, this may be an input.
+    """
+    ends_so = [column for column in columns if words(column)[-1:] == [_IN]]
+    is_unit = any(role_words(column) for column in ends_so)
+    return {column: re.sub(rf"{_IN}$", "inch", column) for column in ends_so} if is_unit else {}
 
 
 def is_turning(axis: str) -> bool:

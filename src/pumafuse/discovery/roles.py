@@ -22,8 +22,20 @@ from ..logs.recordings import PATH_TIME
 from ..logs.run import REFERENCE, Run, Source
 from ..units import AN, DEG, GUESSED, KINDS, TURN, Kind, kind_of
 from . import names
-from .contents import NAMELESS, RANGES, RESTS, Part, Signal, is_nameless, no_commands, period_of, unused, usual_size
-from .following import LATEST, Following, following
+from .contents import (
+    ARE_SPEEDS,
+    NAMELESS,
+    RANGES,
+    RESTS,
+    Part,
+    Signal,
+    is_nameless,
+    no_commands,
+    period_of,
+    unused,
+    usual_size,
+)
+from .following import ABOUT_ONE, LATEST, Following, following
 from .matching import far_shift
 from .names import Role
 from .orientations import Attitude, in_order
@@ -36,6 +48,9 @@ _GAINS = 3.0  # ratio of the gains of the axes of one sensor, at the most
 _EVEN, _MOSTLY = 0.05, 0.9  # of a step, by which those of a clock differ, as it has digits; of the steps
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _TO_AND_FRO = 10  # turns at rest, from which they are noise: an arm that settles turns a few times
+_AS_WELL = 1.5  # times what another explanation leaves: of a motion that swings, a lag of a quarter leaves noise, too
+_OF_BODY = 4  # followers that nothing names, from which all may be points of one body, and none be commanded
+_LEADS, _FOLLOWS, _SAY = "others follow it", "it follows the commands", "say it in run.toml"
 _COPY = 0.9  # share of numbers that are the same, from which they are copies
 _NEAR = -0.5, 1.5  # s, from and to which lag a sensor is on the commands' clock
 MOST_LAG, GUESSED_LAG = 0.5, 0.1  # s, that hardly an arm is late; and that one is where its clock is shifted
@@ -160,7 +175,8 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     if (chosen := _command(streams)) is None:
         raise UndecidedError(log, f"which numbers are the commands? {_none_leads(parts, streams)}", parts)
     command, why = chosen
-    resting = {names.axis_of(column, []) for column, what in command.part.left_out.items() if what.startswith(RESTS)}
+    at_rest = [column for column, what in command.part.left_out.items() if what.startswith(RESTS)]
+    resting = {*(names.axis_of(column, []) for column in at_rest), *(tuple(names.bare(column)) for column in at_rest)}
     left_out, kept = list[tuple[Stream, str]](), list[Stream]()
     for stream in (stream for stream in streams if stream is not command):
         if stream.role == "command" or (stream.role is None and stream.why):
@@ -175,7 +191,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
         if stream.role is None and axes:
             late, otherwise = _follows(command, matched)
-            matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
+            matched = replace(matched, role="sensor" if late else None, why=f"{_FOLLOWS} {late}")
             says = f"neither its name nor its motion says what it is: {otherwise}"
             why_not = f"{says}; if it measures their axes, say so in run.toml"
         if axes and matched.role:
@@ -184,10 +200,18 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             others = {axis: some for axis, some in stream.axes.items() if id(some) not in used}
             for held in (True, False):
                 why_not = "its command never moves" if held else "no command is left that is called so or moves alike"
-                if some := {axis: columns for axis, columns in others.items() if (axis in resting) == held}:
+                if some := {
+                    axis: columns
+                    for axis, columns in others.items()
+                    if resting.isdisjoint([axis, tuple(names.bare(columns[0].name))]) != held
+                }:
                     left_out.append((replace(stream, axes=some), why_not))
         else:
             left_out.append((stream, another_clock(stream.source, command.source) or why_not))
+    unnamed = [stream.name for stream in kept if stream.why.startswith(_FOLLOWS)]
+    if why == _LEADS and len(unnamed) >= _OF_BODY:
+        alike = f"{command.name}, {', '.join(unnamed)} move alike, as points of one body do"
+        raise UndecidedError(log, f"which numbers are the commands? None is called so, and {alike}; {_SAY}", parts)
     may_measure = command.role != "reference"  # beside commands; another set point measures nothing
     command, *kept = _in_order([command, *_once(_raw(kept, left_out), left_out)], left_out)
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
@@ -204,6 +228,38 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     return _with_units(Roles(command, sensors, references[0] if references else None, left_out))
 
 
+def told_as_speeds(roles: Roles) -> str:
+    """What to say where the commands are velocities, as they add up to what is measured; empty where they are not.
+
+    What is left out is asked only where nothing measures: an integral of a controller adds up, too.
+    """
+    others = [stream for stream, _ in roles.left_out if stream.role != "command"]
+    for stream in roles.measured.values() if roles.sensors else others:
+        shared = [axis for axis in roles.command.axes if axis in stream.axes]
+        if shared and all(_adds_up(roles.command, stream, axis) for axis in shared):
+            columns = ", ".join(roles.command.axes[axis][0].column for axis in shared[:_MOST_LISTED])
+            return f"{ARE_SPEEDS.format(columns)}: they add up to {stream.name}"
+    return ""
+
+
+def _adds_up(command: Stream, stream: Stream, axis: str) -> bool:
+    """Whether commands, added up by the clock, lead as far as a sensor goes, which they do not as they are."""
+    (stamp, speed), measured = (side.source.series(axis) for side in (command, stream))
+    steps = 0.5 * (speed[1:] + speed[:-1]) * np.diff(stamp) / 1e9
+    summed = following((stamp, np.concatenate(([0.0], np.cumsum(steps)))), measured)
+    if summed is None or summed.correlation < SAME or not -_AT_ONCE < summed.lag < MOST_LAG:
+        return False
+    leading = following((stamp, speed), measured)
+    if leading is None or leading.correlation < SAME:
+        return _as_far(summed)
+    leads = leading.lag < MOST_LAG and _as_far(leading)
+    return _as_far(summed) and not leads and summed.misfit < _AS_WELL * leading.misfit
+
+
+def _as_far(relation: Following) -> bool:
+    return 1.0 / ABOUT_ONE < relation.slope < ABOUT_ONE
+
+
 def _none_leads(parts: Sequence[Part], streams: Sequence[Stream]) -> str:
     """Why none of the streams is the commands, and what to do."""
     what = [f"{printable(stream.part.label)}: {', '.join(list(stream.axes)[:_MOST_LISTED])}" for stream in streams]
@@ -216,7 +272,7 @@ def _none_leads(parts: Sequence[Part], streams: Sequence[Stream]) -> str:
     called = "None is called command, goal, target, desired, setpoint or action"
     called = f"What is called so never moves: {printable('; '.join(still[:3]), _LONGEST)}" if still else called
     listed = "; ".join([*what, *unused(part for part in parts if part.clock is None)[:_MOST_LISTED]])
-    return f"{called}, and none runs ahead of others ({listed}); {no_commands(parts)}say it in run.toml"
+    return f"{called}, and none runs ahead of others ({listed}); {no_commands(parts)}{_SAY}"
 
 
 def _raw(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
@@ -576,7 +632,7 @@ def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
         return None
     if called and len(driving) == len(called) and not followers[best.name][0]:
         return _command([stream for stream in streams if stream.role != "command"]) or (best, best.why)
-    return best, best.why or "others follow it"
+    return best, best.why or _LEADS
 
 
 def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float, float]:
@@ -610,12 +666,17 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not."""
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
-    relations = _relations(command, stream)
+    command = _ranged(command, {*command.axes})
+    relations = _relations(command, _fitted(stream, command))
     alike = [relation for relation in relations if relation.correlation >= SAME]
     behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
     gains, fewest = [relation.slope for relation in behind], len(relations) / 2
     fewest = 0.0 if _is_namesake(command, stream) else fewest
-    if len(behind) > fewest and max(gains) < _GAINS * min(gains):
+    called = [(axis, signal) for axis, some in stream.axes.items() for signal in some]
+    is_open = all(signal.axis == axis and signal.basis == "range" for axis, signal in called)  # a unit that nobody says
+    is_open = is_open and not any(names.words(signal.column)[:1] == NAMELESS for _, signal in called)
+    as_far = is_open or 1.0 / _GAINS < float(np.median(gains or 1.0)) < _GAINS
+    if len(behind) > fewest and as_far and max(gains) < _GAINS * min(gains):
         return f"{float(np.median([relation.lag for relation in behind])) * 1e3:.0f} ms late", ""
     speeds = speeds_follow(command.source, stream.source)
     if speeds is not None and speeds.correlation >= SAME and -_AT_ONCE < speeds.lag < LATEST:
@@ -640,12 +701,8 @@ def _rises_evenly(value: FloatArray) -> bool:
 
 def _is_namesake(command: Stream, stream: Stream) -> bool:
     """Whether columns are called as those of the commands without a word of these: ``q[0]`` beside ``q_cmd[0]``."""
-
-    def called(signals: Sequence[Signal]) -> list[str]:
-        return [word for word in names.words(signals[0].name) if word not in names.role_words(signals[0].name)]
-
     shared = stream.axes.keys() & command.axes.keys()
-    names_of = [(called(stream.axes[axis]), called(command.axes[axis])) for axis in shared]
+    names_of = [[names.bare(side.axes[axis][0].name) for side in (stream, command)] for axis in shared]
     return bool(names_of) and all(first == other and first[:1] != NAMELESS for first, other in names_of)
 
 

@@ -23,7 +23,7 @@ from .contents import Part, parts_of, period_of, unused
 from .following import LATEST, Following
 from .own_frames import FOLLOWS as TURNS
 from .own_frames import OwnFrame, own_frames
-from .roles import GUESSED_LAG, Roles, UndecidedError, relations, roles_of
+from .roles import GUESSED_LAG, SAME, Roles, UndecidedError, relations, roles_of, told_as_speeds
 
 FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
@@ -87,6 +87,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         return replace(without_early, interpolation=interpolation(without_early))
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
+    if speeds := told_as_speeds(roles):
+        raise UndecidedError(str(log), speeds, parts, roles)
     _refuse_alone(log, parts, roles, "nothing that measures where they lead")
     run = without_strays(roles.run)
     framed = own_frames(run)
@@ -95,11 +97,12 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     lags, least = [relation.lag for relation in related.values() if _is_sure(relation)], least_lag(run)
     all_ahead = max(lags, default=0.0) < least
     bad = dict[tuple[str, str], str]()
-    for key, relation in related.items() if lags else ():
+    others_follow = any(abs(relation.correlation) >= SAME for relation in related.values())
+    for key, relation in related.items():
         follows = f"correlation {relation.correlation:+.2f}"
-        if abs(relation.correlation) < FOLLOWS:
+        if abs(relation.correlation) < FOLLOWS and others_follow:
             bad[key] = f"it does not follow the commands ({follows}): are columns exchanged?"
-        elif relation.lag < least and not (all_ahead and _is_sure(relation)):
+        elif lags and relation.lag < least and not (all_ahead and _is_sure(relation)):
             bad[key] = _ahead(relation)
     bad |= {(name, axis): why for name, why in _without_lag(related).items() for axis in (*run.axes, *TURNING)}
     roles = roles.without({key: why for key, why in bad.items() if key[1] not in TURNING})
