@@ -67,16 +67,6 @@ def test_values_that_nobody_sent_are_not_used(name: str) -> None:
     assert est["slide"].position.tolist() == wanted["slide"].position.tolist()
 
 
-def test_of_few_steps_a_value_that_nobody_sent_is_known() -> None:
-    """One of ten times the largest step, among twelve steps of 1 to 5 cm that each last 4 s."""
-    command = np.cumsum(np.tile([0.01, 0.05, -0.03, 0.02, -0.04, 0.03], 3))[(TIME // 4.0).astype(int) % 13]
-    with_stray = command.copy()
-    with_stray[1000] = 0.5
-    est, notes = fused(with_stray, followed(command))
-    assert est.command_counts["stray"] == 1, notes
-    assert fused(command, followed(command))[1].count("stray") == 0
-
-
 def pulse(length: int) -> FloatArray:
     return np.where((np.arange(2400) >= 800) & (np.arange(2400) < 800 + length), PATH[795] + 0.5, PATH)
 

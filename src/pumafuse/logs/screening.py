@@ -18,7 +18,6 @@ FAR = 5.0  # usual steps from which a value leaps: where a motion begins or turn
 BACK = 0.5  # of a leap, up to which what comes after it is back where it began
 MOST_STRAY = 2  # values in a row; three are a motion
 FEWEST = 20  # changes, from which a usual step is known
-_FEWEST_STEPS = 8  # of commands, from which one that leaps away is told
 BRIEF = 2.5  # usual intervals between changes, up to which one value may last
 _FOLLOWED_NS, _FOLLOWED = 1_000_000_000, 3.0  # within 1 s an arm shows it: by steps so many times as large as before
 _BEGINNING = 200  # rows after zeros
@@ -113,11 +112,10 @@ def _stray(stamp: TimeArray, value: FloatArray, sensors: Sequence[tuple[TimeArra
     """Which of the commands of an axis, by stamp, are stray, (rows,)."""
     is_stray = np.zeros(len(value), dtype=np.bool_)
     begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)  # a table may say each several times
-    steps = np.abs(np.diff(value[begin]))
-    if len(steps) < _FEWEST_STEPS:
+    if len(begin) <= FEWEST:
         return is_stray
-    usual = usual_of(steps) if len(begin) > FEWEST else float(np.sort(steps)[-MOST_STRAY - 2])  # without those of one
-    interval = median(np.diff(stamp[begin]).astype(np.float64))
+    steps = np.abs(np.diff(value[begin]))
+    usual, interval = usual_of(steps), median(np.diff(stamp[begin]).astype(np.float64))
     u, t, end = value[begin].tolist(), stamp[begin].tolist(), [*begin[1:].tolist(), len(value)]
 
     def pace(row: int, way: int) -> float:
