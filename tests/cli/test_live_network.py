@@ -46,7 +46,7 @@ def test_datagrams_in_and_out_and_a_record_of_them(scan: list[bytes], tmp_path: 
         found = send(process, scan)
         log = process.end()
     expected: list[bytes] = []
-    Stream(pf.LiveEstimator(pf.FusionConfig.load(FUSION)), expected.extend, lambda _: None).take(scan)
+    Stream(pf.LiveEstimator(pf.FusionConfig.load(FUSION)), expected.extend, lambda _: None).add(scan)
     assert found == expected
     assert f"{len(scan)} datagrams taken in, 0 lost" in log
     assert f"{run}: {len(scan)} rows written" in log

