@@ -307,11 +307,11 @@ def test_commands_that_are_no_positions_are_refused() -> None:
     [
         ([(5, 1.0)], TICK, TICK),  # the last command
         ([(905, 1.0), (5, 1.0)], 900 * MS, 905 * MS),  # the last measurement, when it was true
-        ([(905, 1.0), (2000, nan)], 900 * MS, 905 * MS),  # not one that is left out
+        ([(905, 1.0), (2000, nan)], 900 * MS, 2000 * MS),  # not one that is left out, but a stream goes on until then
     ],
 )
 def test_the_end_is_the_last_event_of_the_filter(rows: list[tuple[float, float]], end: int, stamped: int) -> None:
-    """The grid of estimates ends with the last command or the last measurement that can be fused; live by its stamp."""
+    """The grid ends with the last command or the last measurement that can be fused; live with the last stamp."""
     segment = build_segment(recorded({"a": measurements(*rows)}), config(a=A))
     for as_live, last in ((False, end), (True, stamped)):
         assert segment.end(config(a=A), as_live) == ORIGIN + last

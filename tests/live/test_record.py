@@ -119,6 +119,21 @@ def test_a_record_of_any_late_rows_is_as_live(tmp_path_factory, drawn, rate) -> 
     record_says_what_live_said(tmp_path_factory.mktemp("live") / "record", config, start, arrivals, rate)
 
 
+def test_rows_that_tell_nothing_go_on_with_the_grid_as_in_their_record(tmp_path: Path) -> None:
+    """One that gives no axis waits for the next; the grid ends with the last row, even if that is not used."""
+    events = [
+        event
+        for step in range(20)
+        for event in (
+            Event(step * T, "", {"radial": 0.5 + 1e-3 * step}),
+            Event(step * T + 21_000_000, "tracker", {"noise": 4.0}),
+            Event(step * T + 2_000_000, "tracker", {"radial": 0.5}),
+        )
+    ]
+    events.append(Event(19 * T + 90_000_000, "tracker", {"radial": float("nan")}))
+    record_says_what_live_said(tmp_path / "record", TRACKED, {"radial": 0.5}, events, 100.0)
+
+
 def test_a_record_without_arrivals_is_read_as_before(tmp_path: Path) -> None:
     """Those of earlier versions: each row has come at its stamp, and where rows came in order nothing changes."""
     recorded = Recorded(tmp_path / "record")

@@ -177,12 +177,15 @@ class Segment:
     def end(self, config: FusionConfig, as_live: bool) -> int:
         """Where an even grid of estimates ends, int ns: with the last command or measurement.
 
-        A measurement counts by when it is valid; as live by its stamp, since a stream knows the time by stamps alone.
+        A measurement counts by when it is valid; as live by its stamp, fused or not, since a stream knows the time by
+        stamps alone.
         Measurements an hour after the last command are on another clock.
         """
         rows = self.measurement_rows
-        time = rows.stamp if as_live else _valid(rows.stamp, self._latency(config)[rows.source])
-        time = time[on_any_axis(rows.codes, Outcome.FUSED)]
+        if as_live:
+            time = rows.stamp
+        else:
+            time = _valid(rows.stamp, self._latency(config)[rows.source])[on_any_axis(rows.codes, Outcome.FUSED)]
         return int(time[time <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
     def asking_times(self, times: TimeArray, on_grid: bool) -> TimeArray | None:

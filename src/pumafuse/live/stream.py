@@ -12,6 +12,7 @@ from .estimator import LiveEstimator
 from .health import Health
 from .rate_limit import RateLimitedLog
 from .results import COMPARED, LiveEstimate, UpdateResult
+from .tool import NOISE
 from .wire import BadLine, Event, LineDecoder, encode
 
 _SHOWN = 60  # characters of a bad line in the log
@@ -87,7 +88,7 @@ class Stream:
         """Add one event."""
         live, (t, sensor, values) = self.live, event
         self._with_ns = isinstance(t, int)
-        if self._step is not None:
+        if self._step is not None and values.keys() - {NOISE}:  # what gives no axis is in no record
             self._on_grid(live.until(t, sensor or None))
         result = live.measurement(t, sensor, **values) if sensor else live.command(t, **values)
         if self._watchers and result.outcome in COMPARED:
