@@ -156,7 +156,7 @@ class Search:
 
         From little of it, beside noise that is not the best yet, it vanishes.
         """
-        calm = [axis for axis in self._may_be_disturbed(config) if config.process[axis].disturbance_sd == 0.0]
+        calm = [axis for axis in self.may_be_disturbed(config) if config.process[axis].disturbance_sd == 0.0]
         model = config
         for axis in calm:
             model = with_disturbance(model, axis, self.arms[axis].spread, _SLOW)
@@ -164,7 +164,7 @@ class Search:
 
     def _with_free_noise(self, config: FusionConfig, model: FusionConfig) -> FusionConfig:
         """The configuration with the noises of a model that are free."""
-        for axis in self._may_be_disturbed(config):
+        for axis in self.may_be_disturbed(config):
             new = model.process[axis]
             config = with_disturbance(config, axis, new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
         for parameter in self.free(config):
@@ -173,7 +173,7 @@ class Search:
                 config = parameter.put(config, 0.0 if none else parameter.clipped(parameter.get(model)))
         return config
 
-    def _may_be_disturbed(self, config: FusionConfig) -> list[str]:
+    def may_be_disturbed(self, config: FusionConfig) -> list[str]:
         """The axes of which a disturbance is free."""
         for axis in self.likelihood.sensors:
             config = with_disturbance(config, axis, 1.0, 1.0)
@@ -297,7 +297,7 @@ class Search:
 
         A recording of one motion hardly tells; real arms are livelier in others. What is not livelier is as tuned.
         """
-        with_adaptation, may = best.config, self._may_be_disturbed(best.config)
+        with_adaptation, may = best.config, self.may_be_disturbed(best.config)
         for axis in may:
             with_adaptation = adapting(with_adaptation, axis)
         gains = point(self.likelihood, with_adaptation, self.free(with_adaptation)).posteriors - best.posteriors

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..fusion.config import FusionConfig
+from ..fusion.config import FusionConfig, Process
 from ..fusion.score import Z95
 from ..logs.run import Run
 from ..units import SCREEN, Kind, as_length, of_kind
@@ -33,6 +33,7 @@ from .parameters import (
     is_fixed,
     parameters,
     smallest_sd,
+    with_disturbance,
     with_drifts,
     with_gates,
     with_own_delays,
@@ -48,6 +49,7 @@ _BIAS_GAIN = 3.0  # log-likelihood that a bias must gain; the width of its prior
 _BIAS_WIDTHS = (1e-3, 1e-2, 1e-1)  # m or rad, of the prior
 _FAR = 20.0  # times all that is uncertain, from which a gap is no noise
 _ROOM = 3.0  # width of the prior over the gap that was found
+_WIDTHS, _HALVINGS = (1e-4, 10.0), 16  # times the misfit of the arm
 _UNSEEN = 0.1  # log-likelihood that noise must be worth
 
 
@@ -78,6 +80,7 @@ class Stage:
     notes: Sequence[str]  # everything else noticed
     arms: Mapping[str, ArmSearch]  # the arms that were looked for, by axis
     adapts: Sequence[str]  # axes whose noise is to adapt; all numbers are fitted with noise that does not
+    hidden: Mapping[str, float]  # sd of the disturbance that axes on which none shows are to have [m or rad]; as above
 
 
 def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Notify = ignore) -> Stage:
@@ -132,7 +135,12 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
     ]
     notes += few_measurements(likelihood, free(best.config))
     notes += unseen_steps(likelihood, best.config)
-    return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched, search.adapts)
+    hidden = hidden_disturbances(likelihood, best, search.may_be_disturbed(best.config))
+    for axis, sd in hidden.items():
+        screen = best.config.arm.screen_of(axis)
+        why = f"disturbance: none shows, one of {sd * screen.scale:.2g} {screen.unit} may be hidden in the noise"
+        orders[axis] = "; ".join([*filter(None, [orders.get(axis)]), why])
+    return Stage(likelihood, best, free(best.config), fixed, orders, notes, searched, search.adapts, hidden)
 
 
 def refitted(stage: Stage, runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float) -> FusionConfig:
@@ -220,6 +228,27 @@ def without_unseen_noise(likelihood: Likelihood, best: Point, free: Sequence[Par
             without = noise.put(without, 0.0)
         best = point(likelihood, without, free) if unseen else best
     return best
+
+
+def hidden_disturbances(likelihood: Likelihood, best: Point, axes: Sequence[str]) -> dict[str, float]:
+    """By how much ``axes`` without a disturbance may have one that does not show: the sd [m or rad] that costs 1.
+
+    No arm is perfect. With the likeliest noise, which may be none, error bars count nothing of what measurements cannot
+    exclude.
+    """
+    hidden = dict[str, float]()
+    for axis in axes:
+        if best.config.process[axis].disturbance_sd:
+            continue
+        alone, number = likelihood.of_axis(axis), likelihood.axes.index(axis)
+        low, high = np.log(_WIDTHS) + np.log(likelihood.misfit(best.config)[axis])
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            disturbed = with_disturbance(best.config, axis, float(np.exp(middle)), Process().disturbance_time, "ou")
+            falls = best.axes[number] - alone.evaluate(disturbed).axes[number] > 1.0
+            low, high = (low, middle) if falls else (middle, high)
+        hidden[axis] = float(np.exp(low))
+    return hidden
 
 
 # ---- biases ---------------------------------------------------------------------------------------------------------

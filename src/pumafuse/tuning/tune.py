@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import NEVER, NO_STAMP
 from ..errors import ConfigError, PumafuseWarning
-from ..fusion.config import FusionConfig
+from ..fusion.config import FusionConfig, Process
 from ..fusion.faults import latency_questions
 from ..fusion.placing import add_tool
 from ..logs.clock import segments
@@ -22,7 +22,18 @@ from ..units import MS
 from .identifiability import FEWEST, TuneError, correlations, excited_axes, least_count
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, Point
-from .parameters import Fit, Parameter, adapting, changed, check_fixed, kinds_of, parameters, rounded, with_gates
+from .parameters import (
+    Fit,
+    Parameter,
+    adapting,
+    changed,
+    check_fixed,
+    kinds_of,
+    parameters,
+    rounded,
+    with_disturbance,
+    with_gates,
+)
 from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, refitted, run_stage
 from .summary import (
@@ -291,7 +302,7 @@ class Pipeline:
         config = self.best
         for plan, stage in zip(self.plans, self.stages, strict=False):  # none where the configuration as given is kept
             config = refitted(stage, self.runs, config, plan, until)
-        return self._written(config, rounded)
+        return self._for_use(self._written(config, rounded))
 
     @property
     def log_likelihood(self) -> float:
@@ -315,12 +326,23 @@ class Pipeline:
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
-        before, after = (_evaluated(self.whole, config).log_likelihood for config in (self.config, self.result()))
+        before, after = (_evaluated(self.whole, config).log_likelihood for config in (self.config, self._rounded()))
         if after < before - _NOTHING:
             self.best, self.stages = self.config, []
             self.notes.append("nothing more likely was found than the configuration as given, which is kept")
 
     def result(self) -> FusionConfig:
+        """The best configuration, with what the fit itself leaves out: disturbances that may be hidden, adaptation."""
+        return self._for_use(self._rounded())
+
+    def _for_use(self, config: FusionConfig) -> FusionConfig:
+        for axis, sd in (pair for stage in self.stages for pair in stage.hidden.items()):
+            config = with_disturbance(config, axis, rounded(sd), Process().disturbance_time, "ou")
+        for axis in (axis for stage in self.stages for axis in stage.adapts):
+            config = adapting(config, axis)
+        return config
+
+    def _rounded(self) -> FusionConfig:
         """The best configuration: gates as given, numbers rounded, and 0 for a noise at its lower bound.
 
         A maximum may lie where a gate just takes a row: numbers that leave it by being rounded keep their digits.
@@ -341,8 +363,6 @@ class Pipeline:
         ):
             none = parameter.vanishes and parameter.at_bound(best) == "lower"
             best = parameter.put(best, 0.0 if none else parameter.clipped(number(parameter.get(best))))
-        for axis in (axis for stage in self.stages for axis in stage.adapts):
-            best = adapting(best, axis)
         return best
 
 
