@@ -122,30 +122,31 @@ def test_no_disturbance_is_invented() -> None:
         assert invented <= 1
 
 
-@pytest.mark.parametrize("share", [0.13, later(0.2)])
-def test_error_bars_count_a_disturbance_that_does_not_show(share: float) -> None:
-    """One of this share of a camera's noise, over twelve runs: without what may be hidden 87 % hold for 0.13.
+def test_error_bars_count_a_disturbance_where_no_noise_shows() -> None:
+    """One of a tenth of a camera's noise: of 16 runs some have a likeliest noise of 0, and 6 of 10 errors in 95 % bars.
 
-    It is as large as one that costs the likelihood 1.
+    What those get costs the likelihood 1. Then 9 of 10 errors and more are within them.
     """
     config, command, path = moving()
-    left, covered = np.exp(-PERIOD / 0.5), list[float]()
-    for seed in range(12):
-        white = 3e-4 * share * np.random.default_rng(100 + seed).standard_normal(COUNT)
+    left, inside, without = np.exp(-PERIOD / 0.5), list[float](), list[float]()
+    for seed in range(16):
+        white = 3e-5 * np.random.default_rng(100 + seed).standard_normal(COUNT)
         true = path + lfilter([np.sqrt(1.0 - left**2)], [1.0, -left], white)
         run = measured(command, true, seed)
         found = quietly(lambda run=run: pf.tune(run, config))
-        tip = pf.fuse(run, found.config)["tip"]
-        covered.append(float(np.mean(np.abs(tip.position - true)[100:] < 1.96 * tip.position_sd[100:])))
-        if "may be hidden" in found.details.orders["tip"]:
-            steady = replaced(found.config.process["tip"], adaptation=0.0)
-            likelihood = Likelihood([run], found.config)
-            with_it, without = (
-                likelihood.evaluate(replaced(found.config, process={"tip": process})).log_likelihood
-                for process in (steady, replaced(steady, disturbance_sd=0.0))
-            )
-            assert without - with_it == pytest.approx(1.0, abs=0.05)  # a noise at its lower bound is written as 0
-    assert 0.93 < np.mean(covered) < 0.99
+        if "may be hidden" not in found.details.orders["tip"]:
+            continue
+        steady = replaced(found.config.process["tip"], adaptation=0.0)
+        likelihood, likelihoods = Likelihood([run], found.config), list[float]()
+        for process, covered in ((steady, inside), (replaced(steady, disturbance_sd=0.0), without)):
+            here = replaced(found.config, process={"tip": process})
+            likelihoods.append(likelihood.evaluate(here).log_likelihood)
+            tip = pf.fuse(run, here)["tip"]
+            covered.append(float(np.mean(np.abs(tip.position - true)[100:] < 1.96 * tip.position_sd[100:])))
+        assert likelihoods[1] - likelihoods[0] == pytest.approx(1.0, abs=0.1)  # noise at its bound is written as 0
+    assert len(inside) >= 3
+    assert np.mean(without) < 0.7
+    assert np.mean(inside) > 0.9
 
 
 def score_of(without: str = "", of_noise: float = 1.0, **changes: float) -> float:

@@ -49,6 +49,7 @@ _BIAS_GAIN = 3.0  # log-likelihood that a bias must gain; the width of its prior
 _BIAS_WIDTHS = (1e-3, 1e-2, 1e-1)  # m or rad, of the prior
 _FAR = 20.0  # times all that is uncertain, from which a gap is no noise
 _ROOM = 3.0  # width of the prior over the gap that was found
+_NOISES = {"input_noise", "drift", "maneuver_noise", "maneuver_drift", "disturbance_sd"}
 _WIDTHS, _HALVINGS = (1e-4, 10.0), 16  # times the misfit of the arm
 _UNSEEN = 0.1  # log-likelihood that noise must be worth
 
@@ -80,7 +81,7 @@ class Stage:
     notes: Sequence[str]  # everything else noticed
     arms: Mapping[str, ArmSearch]  # the arms that were looked for, by axis
     adapts: Sequence[str]  # axes whose noise is to adapt; all numbers are fitted with noise that does not
-    hidden: Mapping[str, float]  # sd of the disturbance that axes on which none shows are to have [m or rad]; as above
+    hidden: Mapping[str, float]  # sd of the disturbance that axes without any noise are to have [m or rad]; as above
 
 
 def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Notify = ignore) -> Stage:
@@ -135,7 +136,7 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
     ]
     notes += few_measurements(likelihood, free(best.config))
     notes += unseen_steps(likelihood, best.config)
-    hidden = hidden_disturbances(likelihood, best, search.may_be_disturbed(best.config))
+    hidden = hidden_disturbances(likelihood, best, free(best.config), search.may_be_disturbed(best.config))
     for axis, sd in hidden.items():
         screen = best.config.arm.screen_of(axis)
         why = f"disturbance: none shows, one of {sd * screen.scale:.2g} {screen.unit} may be hidden in the noise"
@@ -230,17 +231,19 @@ def without_unseen_noise(likelihood: Likelihood, best: Point, free: Sequence[Par
     return best
 
 
-def hidden_disturbances(likelihood: Likelihood, best: Point, axes: Sequence[str]) -> dict[str, float]:
-    """By how much ``axes`` without a disturbance may have one that does not show: the sd [m or rad] that costs 1.
+def hidden_disturbances(
+    likelihood: Likelihood, best: Point, free: Sequence[Parameter], axes: Sequence[str]
+) -> dict[str, float]:
+    """By how much ``axes`` without any process noise may stray without showing it: the sd [m or rad] that costs 1.
 
-    No arm is perfect. With the likeliest noise, which may be none, error bars count nothing of what measurements cannot
-    exclude.
+    No arm is perfect. At a likeliest noise of 0 error bars count none, though measurements exclude only what is larger.
     """
     hidden = dict[str, float]()
     for axis in axes:
-        if best.config.process[axis].disturbance_sd:
+        process, alone, number = best.config.process[axis], likelihood.of_axis(axis), likelihood.axes.index(axis)
+        least = {noise.path[-1] for noise in free if noise.axis == axis and noise.at_bound(best.config) == "lower"}
+        if any(getattr(process, field) for field in _NOISES - least):
             continue
-        alone, number = likelihood.of_axis(axis), likelihood.axes.index(axis)
         low, high = np.log(_WIDTHS) + np.log(likelihood.misfit(best.config)[axis])
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
