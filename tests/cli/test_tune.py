@@ -82,7 +82,7 @@ def test_worse_on_the_validation_run_is_code_3(place: Path, given: tuple[Path, P
     for name in (*FILES, "report.html"):
         (out / name).write_text("old")
     maneuver = ["maneuver_noise_mm_rtHz_per_m_s", "maneuver_drift_mm_rts_per_m_s"]
-    fit = ("--fit", "noise,delay", "--fix", "vertical.delay_ms", "--fix", ",".join(maneuver))
+    fit = ("--fit", "noise", "--fit", "delay", "--fix", "vertical.delay_ms", "--fix", ",".join(maneuver))
     done = pumafuse("tune", given[0], longer, "-c", config, "-o", out, *fit, "--validate", other, "--force", code=3)
     assert names(out) == FILES
     summary = msgspec.json.decode((out / "tuning.json").read_bytes(), type=TuningSummary)

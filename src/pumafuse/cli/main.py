@@ -90,7 +90,7 @@ def fuse(
     ],
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")],
     config: FoundConfig = None,
-    sensors: Annotated[str | None, Option(metavar="A,B", help="Which sensors to use; default: all configured.")] = None,
+    sensors: Annotated[list[str] | None, Option(metavar="A,B", help="Which to use; default: all configured.")] = None,
     rate: Rate = None,
     smooth: Annotated[bool, Option("--smooth", help="Use later measurements too; gives no velocity.")] = False,
     as_live: Annotated[bool, Option("--as-live", help="Use only measurements that had arrived by then.")] = False,
@@ -136,7 +136,7 @@ def register(
     runs: Runs,
     config: FoundConfig = None,
     sensor: Annotated[str | None, Option(metavar="NAME", help="Which one; default: each that gives x, y, z.")] = None,
-    fix: Annotated[str | None, Option(metavar="marker,latency", help="What stays as configured.")] = None,
+    fix: Annotated[list[str] | None, Option(metavar="marker,latency", help="What stays as it is.")] = None,
     output: Annotated[
         Path | None, Option("--output", "-o", metavar="DIR", help="Where fusion.toml and arm.toml go.")
     ] = None,
@@ -250,7 +250,7 @@ def latency(
 def verify(
     runs: Runs,
     arm: Annotated[str, Option("--arm", metavar="ARM", help="An arm.toml, or the name of a preset.")],
-    sensors: Annotated[str | None, Option(metavar="A,B", help="Default: the reference, else every sensor.")] = None,
+    sensors: Annotated[list[str] | None, Option(metavar="A,B", help="Default: the reference, or all.")] = None,
     start: Annotated[
         list[str] | None,
         Option(metavar="AXIS=VALUE", help="Start level, mm or degrees; default: the run's, else chosen by RMS."),
@@ -275,8 +275,9 @@ def tune(
     config: Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="What to start from.")],
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
     fit: Annotated[
-        str, Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency, scale, bias.")
-    ] = "noise",
+        list[str] | None,
+        Option(metavar="A,B", help="What to fit: noise (default), delay, plant, gain, latency, scale, bias."),
+    ] = None,
     fix: Annotated[
         list[str] | None, Option(metavar="KEY", help="Leave as it is: a name or part, as sensors.tracker; repeatable.")
     ] = None,
@@ -300,7 +301,7 @@ def tune(
     """
     from . import tune as command
 
-    kinds, fixed = _names(fit, "--fit") or [], _names(",".join(fix) if fix else None, "--fix") or []
+    kinds, fixed = _names(fit, "--fit") or ["noise"], _names(fix, "--fix") or []
     prior, part = not no_sd_prior, _part(since, until)
     command.run(runs, config, output, kinds, fixed, share, trust, validate, prior, report, json, force, part)
 
@@ -445,9 +446,9 @@ def _one_line(message: Warning | str, category: type[Warning], *_: object) -> No
     say(f"{name}: {message}", err=True)
 
 
-def _names(listed: str | None, option: str = "--sensors") -> list[str] | None:
-    """Names with commas between; None if the option is not given."""
-    names = None if listed is None else [name.strip() for name in listed.split(",") if name.strip()]
+def _names(listed: list[str] | None, option: str = "--sensors") -> list[str] | None:
+    """Names with commas between, of an option that may be given several times; None if it is not given."""
+    names = [name.strip() for name in ",".join(listed).split(",") if name.strip()] if listed else None
     if names == []:
         raise BadParameter("names nothing", param_hint=option)
     return names
