@@ -173,7 +173,8 @@ def test_zeros_that_nobody_had_set_yet_are_missing() -> None:
     """A sensor's before its first value, or those of commands: as if the rows had none, to the bit."""
     path, early = 0.9 + PATH, np.arange(len(TIME)) < 7
     value = followed(path)
-    for command, measured in ((path, np.where(early, 0.0, value)), (np.where(early, 0.0, path), value)):
+    unset, unseen = np.where(early, 0.0, path), np.where(early, 0.0, value)
+    for command, measured in ((path, unseen), (unset, value), (unset, unseen)):
         est, notes = fused(command, measured)
         missing = fused(np.where(command == 0.0, np.nan, command), np.where(measured == 0.0, np.nan, measured))[0]
         assert "7 rows have zeros before the first value" in notes

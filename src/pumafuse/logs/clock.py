@@ -136,17 +136,23 @@ def without_strays(run: Run) -> Run:
         return replace(source, stamp=np.where(apart == 0, source.stamp, NO_STAMP))
 
     screened_run = run.each(mended)
-    commanded, measured = screened_run.command, list(screened_run.sensors.values())
 
-    def begun(label: str, source: Source) -> Source:
-        zeros = first_zeros(source, measured if source is commanded else [commanded])
-        if not zeros:
+    def set_from(source: Source, label: str, others: Sequence[Source]) -> Source:
+        if not (zeros := first_zeros(source, others)):
             return source
         unset = np.arange(len(source.stamp)) < zeros
         note_rows(notes, label, unset, "zeros before the first value, far from it: taken as missing")
         return replace(source, values={axis: np.where(unset, np.nan, value) for axis, value in source.values.items()})
 
-    screened_run = screened_run.each(begun)
+    commanded = screened_run.command
+    sensors = {
+        name: set_from(source, source.label_for(name), [commanded]) for name, source in screened_run.sensors.items()
+    }
+    command = set_from(commanded, commanded.label, list(sensors.values()))
+    reference = screened_run.reference
+    if reference is not None:
+        reference = set_from(reference, reference.label, [commanded])
+    screened_run = replace(screened_run, command=command, sensors=sensors, reference=reference)
     command = without_stray_values(screened_run.command, list(screened_run.sensors.values()), notes)
     return replace(screened_run, command=command, notes=tuple(notes), without_strays=True)
 

@@ -42,7 +42,8 @@ def lost(position: FloatArray) -> BoolArray:
 def first_zeros(source: Source, others: Sequence[Source]) -> int:
     """How many rows at the beginning of a source are zeros of variables that nobody had set yet.
 
-    Then all that it tells leaps at once, farther than by any step soon after, to where one of the ``others`` was.
+    Then all that it tells leaps at once, farther than by any step soon after, to where one of the ``others`` was from
+    the first, or leapt in the same row.
     """
     if not source.values or not len(source.stamp) or any(value[0] != 0.0 for value in source.values.values()):
         return 0
@@ -55,12 +56,15 @@ def first_zeros(source: Source, others: Sequence[Source]) -> int:
     if (values[:, first][~leapt] != 0.0).any():
         return 0
 
-    since = int(source.stamp[first])
+    begin, last, leap = (int(source.stamp[row]) for row in (0, first - 1, first))
 
     def was_there(axis: str, level: float) -> bool:
-        for stamp, value in (other.series(axis) for other in others if axis in other.values):
-            before = max(int(np.searchsorted(stamp, since)) - 1, 0)
-            if len(stamp) and abs(float(value[before]) - level) < BACK * abs(level):
+        series = (other.series(axis) for other in others if axis in other.values)
+        for stamp, value in ((stamp, value) for stamp, value in series if len(stamp)):
+            then = max(int(np.searchsorted(stamp, begin, side="right")) - 1, 0)
+            set_at = int(np.argmax(value != 0.0))  # unset before, too: nothing follows within a row
+            rows = [then, set_at] if last < int(stamp[set_at]) <= leap else [then]
+            if any(abs(float(value[row]) - level) < BACK * abs(level) for row in rows):
                 return True
         return False
 

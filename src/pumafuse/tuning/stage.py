@@ -238,13 +238,13 @@ def hidden_disturbances(
 
     No arm is perfect. At a likeliest noise of 0 error bars count none, though measurements exclude only what is larger.
     """
-    hidden = dict[str, float]()
+    hidden, misfit = dict[str, float](), likelihood.misfit(best.config)
     for axis in axes:
         process, alone, number = best.config.process[axis], likelihood.of_axis(axis), likelihood.axes.index(axis)
         least = {noise.path[-1] for noise in free if noise.axis == axis and noise.at_bound(best.config) == "lower"}
         if any(getattr(process, field) for field in _NOISES - least):
             continue
-        low, high = np.log(_WIDTHS) + np.log(likelihood.misfit(best.config)[axis])
+        low, high = np.log(_WIDTHS) + np.log(misfit[axis])
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
             disturbed = with_disturbance(best.config, axis, float(np.exp(middle)), Process().disturbance_time, "ou")
