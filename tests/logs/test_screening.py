@@ -188,3 +188,21 @@ def test_zeros_of_an_arm_that_is_there_count(first: float) -> None:
     path = np.where(TIME < 3.0, 0.0, PATH - PATH[120]) + np.where(TIME < 2.0, 0.0, first)
     value = np.where(TIME < 2.0, 0.0, followed(path))
     assert fused(path, value)[0].counts["rule"] == {"fused": 2400}
+
+
+def test_the_first_step_of_a_coarse_sensor_is_no_leap() -> None:
+    """One of 2 mm that rounds down, of a slide at 1.5 mm: it says 0 until the slide has moved by 0.5 mm."""
+    path = 1.5e-3 + 0.02 * np.sin(0.2 * TIME)
+    value = 2e-3 * np.floor(followed(path, noise=0.0) / 2e-3)
+    assert value[0] == 0.0
+    est, notes = fused(path, value)
+    assert est.counts["rule"] == {"fused": 2400} and "zeros" not in notes
+
+
+def test_zeros_of_commands_and_measurements_of_one_stamp_are_missing() -> None:
+    """As in a table with both in each row."""
+    path, early = 0.9 + PATH, np.arange(len(TIME)) < 7
+    unset, unseen = np.where(early, 0.0, path), np.where(early, 0.0, followed(path))
+    run = pf.Run.from_arrays(TIME, {"slide": unset}, {"rule": (TIME, {"slide": unseen})})
+    notes = quietly(lambda: pf.fuse(run, CONFIG)).notes
+    assert sum("7 rows have zeros before the first value" in note for note in notes) == 2
