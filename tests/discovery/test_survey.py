@@ -319,6 +319,14 @@ def test_axes_and_sources_in_rows_of_their_own(kind: str, header: str, axes: Seq
     check_fuses(tmp_path / "log.csv", tmp_path / "out", tuple(axes))
 
 
+def test_a_signal_that_hardly_ever_speaks_is_in_nobody_elses_way(tmp_path: Path) -> None:
+    """A door that opened twice in a minute, among signals in rows of their own: these are told apart all the same."""
+    rows = [",".join(row) for row in long_rows("tags")]
+    rows[40:40], rows[900:900] = ["0.131,cell.door,1"], ["2.991,cell.door,0"]
+    (tmp_path / "log.csv").write_text("\n".join(["time_s,tag,value_m", *rows, ""]))
+    check_fuses(tmp_path / "log.csv", tmp_path / "out", ("root_x", "root_y", "root_z"))
+
+
 @pytest.mark.parametrize("kind", ["signals", "joints", "words behind, no header", "words in front, no header", "dates"])
 def test_signals_one_below_another(kind: str, tmp_path: Path) -> None:
     """As pandas melts a table: a column tells which signal a row is of, and the clock begins anew with each."""

@@ -437,13 +437,14 @@ def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
         if not (whose and pa.types.is_integer(column.type)) and not (words and (whose or not names.no_position(name))):
             continue
         counts = pc.value_counts(column.drop_null())
-        keys: list[Any] = counts.to_pylist() if len(counts) <= _MOST_KEYS else []
-        if len(keys) < 2 or min(key["counts"] for key in keys) < _FEWEST_ROWS:
+        several: list[Any] = counts.to_pylist() if len(counts) <= _MOST_KEYS else []
+        keys = [key for key in several if key["counts"] >= _FEWEST_ROWS]  # a limit switch changes once
+        if len(keys) < 2 or sum(key["counts"] for key in keys) < _IN_ORDER * table.rows:
             continue
         changed = pc.fill_null(pc.not_equal(column[1:], column[:-1]), True).cast(pa.uint8())
         changes = np.from_dlpack(changed.combine_chunks())
         others = [column for column in table.columns if column != name]
-        is_below = changes.sum() == len(keys) - 1 and (whose or not any(map(names.role_words, others)))
+        is_below = changes.sum() == len(several) - 1 and (whose or not any(map(names.role_words, others)))
         if changes.mean() > _IN_TURNS or (is_below and _begins_anew(table, others, np.flatnonzero(changes) + 1)):
             return [{name: key["values"]} for key in keys]
     return [{}]
