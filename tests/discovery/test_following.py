@@ -113,6 +113,20 @@ def test_of_a_periodic_motion_the_shortest_lag_counts() -> None:
     assert found.slope == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.parametrize("late", [0.25, 0.4, 0.5])
+def test_of_steps_that_are_held_long_no_shorter_lag_counts(late: float) -> None:
+    """Levels that are held for 20 s agree to 99 % at any lag; the one that leaves least is most of the arm's, not half.
+
+    Of an arm that is a dead time and as much of a first order later, levels are nearest after 0.85 of both.
+    """
+    draw = np.random.default_rng(3)
+    t, tau = np.arange(0.0, 180.0, 0.01), 0.5 * late
+    u = np.repeat([0.0, 0.75, 0.38, 1.1, 0.56, 1.3, 0.94, 1.5, 0.19], 2000)
+    z = lfilter([0.01 / tau], [1.0, 0.01 / tau - 1.0], np.pad(u, (round(tau / 0.01), 0))[: len(u)])
+    found = following((stamped(t), u), (stamped(t), z + draw.normal(scale=1e-4, size=len(t))))
+    assert 0.7 * late < found.lag < late
+
+
 def test_outliers_are_counted_and_jerks_are_not() -> None:
     """A value that both neighbours contradict is an outlier; a step of the motion is none."""
     draw = np.random.default_rng(1)

@@ -28,7 +28,7 @@ _ROUNDING = 1e-12  # of a value
 _MOST_OUTLYING = 0.05  # of the changes: each outlier is in two, and of few measurements some are more than a clip takes
 _SLOW, _FASTEST = 0.1, 0.99  # of the way that so many rows do not exceed: less is rest
 _MOSTLY = 0.5  # share of the rows in motion, from which the median is one of them
-_NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
+_NEARLY = 0.98  # of the highest correlation: of several such hills, as a periodic motion has, the nearest counts
 _KNEES = np.linspace(0.0, 1.0, 13)[1:-1]  # of the range that is commanded, where a curve bends
 ABOUT_ONE = 1.25  # factor by which one moves less or more than the other, where it moves as far
 # Of what is left at a lag before the other moves, as much as is left of it at once: then that lag means nothing. Where
@@ -166,9 +166,10 @@ def _at_span(
     if not np.abs(by_lag).any():
         return None
     sign = -1.0 if by_lag.max() <= 0.0 or -by_lag.min() > by_lag.max() + _MIRRORED else 1.0
-    by_lag = np.pad(sign * by_lag, 1, constant_values=-1.0)
-    peaks = (by_lag[1:-1] >= np.maximum(by_lag[:-2], by_lag[2:])) & (by_lag[1:-1] >= _NEARLY * by_lag.max())
-    best = min(coarse[peaks], key=abs)
+    by_lag *= sign
+    high = by_lag >= _NEARLY * by_lag.max()
+    hills = np.split(np.arange(len(coarse)), np.flatnonzero(np.diff(high)) + 1)[int(not high[0]) :: 2]
+    best = min((float(coarse[hill[np.argmax(by_lag[hill])]]) for hill in hills), key=abs)
     fine = np.arange(best - 1.5 * _COARSE, best + 1.5 * _COARSE, _FINE)
     lag = float(fine[np.argmax(sign * correlations(fine))])
     other = moves(np.array([lag]))[0]
