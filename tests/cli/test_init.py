@@ -289,6 +289,21 @@ def without_marks(text: str, table: str, *lines: str) -> str:
     return f"{head}{header}{mine}{rest}{others}"
 
 
+def test_of_a_loop_of_speeds_the_sketch_has_what_measures(tmp_path: Path) -> None:
+    """What is no position by its name is written down beside commands, too: named as a sensor, it is fused."""
+    log, _ = undecided(tmp_path, "setpoint", "wheel_speed", "battery")
+    made = tmp_path / "made"
+    refused("init", log, "-o", made)
+    text = (made / "run.toml").read_text()
+    assert '# wheel_speed = "wheel_speed"' in text
+    used = ['file = "../log.csv"', 'time = { column = "t", unit = "s" }']
+    used = ["[sensors.wheel]", *used, 'position = { column = "wheel_speed", unit = "mm" }', ""]
+    (made / "run.toml").write_text(text + "\n".join(used))
+    pumafuse("fuse", made, "-o", tmp_path / "fused")
+    tuned = pf.FusionConfig.load(tmp_path / "fused" / "fusion.toml").arm
+    assert tuned.lag_of("position") == pytest.approx(0.06, abs=3e-3)
+
+
 @pytest.mark.long
 def test_a_table_that_does_not_say_who_is_who_is_written_down_and_sorted(tmp_path: Path) -> None:
     """What is refused is fused when the advice is followed: two lines are taken, and axes are called the same."""

@@ -35,16 +35,25 @@ def drafts(survey: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess], fo
 
 def sketch(name: str, undecided: UndecidedError, folder: Path) -> str:
     """``run.toml`` of a log that does not say who is who: what is in it, in comments that its owner sorts."""
-    lines = ["# What is in the log. Lines that begin with # are not used: take the # from those that are meant."]
-    if undecided.roles is not None:
-        told = _source(["command"], undecided.roles.command, folder)
-        return "\n".join([*lines, _pair("name", name), *told, *_unused(undecided.roles, folder), ""])
-    lines += [
+    lines = [
+        "# What is in the log. Lines that begin with # are not used: take the # from those that are meant.",
         "# [command] is what the arm is told. Each [sensors.NAME] is what measures the same axes: they are called the",
         "# same there as in [command], on the left of the =.",
         _pair("name", name),
     ]
-    clocked = [part for part in undecided.parts if part.clock is not None]
+    if undecided.roles is not None:
+        lines += [*_source(["command"], undecided.roles.command, folder), *_unused(undecided.roles, folder)]
+    else:
+        lines += _either(undecided.parts, folder)
+    for part in undecided.parts:
+        lines += _other_columns(part)
+    return "\n".join([*lines, ""])
+
+
+def _either(parts: Sequence[Part], folder: Path) -> list[str]:
+    """Columns of which any may be the commands, or measure."""
+    lines = list[str]()
+    clocked = [part for part in parts if part.clock is not None]
     streams = [stream for part in clocked for stream in streams_of(part) or [Stream(part.stem, None, "", part, {})]]
     if len(streams) == 1:  # of a table that holds both, each column may be either
         for table in (["command"], ["sensors", "measured"]):
@@ -52,9 +61,7 @@ def sketch(name: str, undecided: UndecidedError, folder: Path) -> str:
     else:
         for stream in streams:
             lines += ["", *(f"# {line}" for line in _source(["sensors", stream.name], stream, folder)[1:])]
-    for part in undecided.parts:
-        lines += _other_columns(part)
-    return "\n".join([*lines, ""])
+    return lines
 
 
 def _other_columns(part: Part) -> list[str]:
