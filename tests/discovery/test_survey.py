@@ -1619,6 +1619,43 @@ def test_a_reference_beside_one_other_is_a_set_point(stem: str, tmp_path: Path) 
     assert found.relations[found.roles.sensors[0].name, "x"].lag == pytest.approx(LAG, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("told", "measured", "scale", "unit"),
+    [("setpoint", "pan_deg", 57.3, "deg"), ("demand", "lift_cm", 100.0, "cm"), ("goal", "tilt_rad", 1.0, "rad")],
+)
+def test_commands_without_a_unit_have_that_of_what_follows_them(
+    told: str, measured: str, scale: float, unit: str, tmp_path: Path
+) -> None:
+    """A column that says its unit, beside a set point that does not and goes as far, measures it in that unit."""
+    t, u, z = recorded_at_once()
+    found = surveyed(tmp_path, {"t_s": t, told: scale * u[:, 0], measured: scale * z[:, 0]})
+    (axis,) = found.run.axes
+    assert {stream.axes[axis][0].unit for stream in found.roles.streams} == {unit}
+    assert found.relations["measured", axis].lag == pytest.approx(LAG, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("clock", "told", "measured"),
+    [("tempo", "Referência", "Ângulo (deg)"), ("tiempo", "Consigna", "Posición"), ("Zeit", "Referenz", "Winkel_deg")],
+)
+def test_headers_in_other_languages(clock: str, told: str, measured: str, tmp_path: Path) -> None:
+    """Set points and clocks of Portuguese, Spanish and German tables are known by their names, also with accents."""
+    t, u, z = recorded_at_once()
+    found = surveyed(tmp_path, {clock: t, told: 50.0 * u[:, 0], measured: 50.0 * z[:, 0]})
+    (sensor,) = found.roles.sensors
+    assert found.roles.command.axes[found.run.axes[0]][0].column == told
+    assert found.relations[sensor.name, found.run.axes[0]].lag == pytest.approx(LAG, abs=0.01)
+
+
+def test_speeds_that_are_never_commanded_are_not_to_be_added_up(tmp_path: Path) -> None:
+    """Desired positions and speeds that stay 0: the refusal says so, and does not advise to integrate the speeds."""
+    t, _, z = recorded_at_once()
+    columns = {"t_s": t, "actual_x_m": z[:, 0], "desired_x_m": 0.0 * t, "desired_vel_x": 0.0 * t}
+    line = refusal(tmp_path, columns)
+    assert "What is called so never moves: desired_x_m, always 0; desired_vel_x, always 0" in line
+    assert "velocities" not in line
+
+
 def test_a_reference_that_runs_ahead_of_the_commands_is_no_truth(tmp_path: Path) -> None:
     """Steps that a controller shapes into commands: left out and named; nothing is scored against them."""
     t, u, _ = recorded_at_once()
@@ -1628,7 +1665,8 @@ def test_a_reference_that_runs_ahead_of_the_commands_is_no_truth(tmp_path: Path)
     measured = np.interp(t - LAG, t, shaped) + np.random.default_rng(5).normal(0.0, 1e-4, len(t))
     found = surveyed(tmp_path, {"t_s": t, "reference_x_m": ahead, "command_x_m": shaped, "actual_x_m": measured})
     assert found.run.reference is None
-    assert any(one.startswith("reference is not used on x: it does not follow the commands") for one in asked(found))
+    (line,) = (one for one in asked(found) if one.startswith("reference is not used on x: it moves "))
+    assert float(line.split()[8]) == pytest.approx(500.0, abs=20.0) and "ms before its commands" in line
 
 
 def test_of_two_clocks_that_were_counted_the_first_is_taken(tmp_path: Path) -> None:

@@ -287,7 +287,8 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
         elif path in counts:
             left_out[path] = "rises evenly: a count or a clock"
         elif why := names.no_position(name) or names.no_position(_labelled(path, listed)):
-            left_out[name] = why
+            still = _signal(table, path, where, source, listed, None) if names.column_role(name) == "command" else why
+            left_out[name] = still if isinstance(still, str) and still.startswith(RESTS) else why
         elif len(signals) == _MOST_COLUMNS:
             left_out[name] = f"more than {_MOST_COLUMNS} columns"
         elif isinstance(signal_or_why := _signal(table, path, where, source, listed, joints.get(path)), Signal):

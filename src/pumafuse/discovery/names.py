@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import Counter
 from collections.abc import Container, Iterable
 from typing import Literal, TypeAlias
@@ -21,23 +22,24 @@ def words_in(text: str) -> frozenset[str]:
 _DEVICES = words_in("tracker camera vision sensor range laser mocap vicon optitrack gps")  # of which there may be two
 # Where words of several roles meet, as in command_state, the first role wins.
 _ROLES: dict[Role, frozenset[str]] = {
-    "reference": words_in("truth reference ref ground gt groundtruth"),
+    "reference": words_in("truth reference ref ground gt groundtruth referencia referenz riferimento"),
     "command": words_in(
         "command commands commanded cmd goal goals target targets desired des demand demanded setpoint setpoints set sp"
         " soll sol sollwert planned action actions control ctrl input inputs com wanted reqd requested"
+        " consigna consigne comando deseado desejado controle"
     ),
     "sensor": _DEVICES
     | words_in(
         "state states measured measurement measurements meas msr actual present real ist istwert pv process current"
         " cur curr encoder encoders feedback fbk fb readback rbv observed observation estimate estimated recorded"
-        " reported odom"
+        " reported odom medida medido mesure messwert misura"
     ),
 }
 # In the name of a topic or file these are something else.
 _OF_COLUMNS = words_in("set sp pv process fb current cur curr present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
-_DRIVES = words_in("control ctrl input inputs")  # commands, or what a controller puts into motors or rotors
+_DRIVES = words_in("control ctrl input inputs controle")  # commands, or what a controller puts into motors or rotors
 _PATHS = words_in("traj trajectory")  # of columns, commands where no other word says what they are
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
 _OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in a column's
@@ -52,7 +54,7 @@ _SILENT = (
     | _PATHS
     | words_in(
         "raw pose poses position positions pos point points data translation transform value values scalar scalars"
-        " joint jnt dof qpos controller robot arm tool tcp ee flange coordinates axis"
+        " joint jnt dof qpos controller robot arm tool tcp ee flange coordinates axis posicion posicao posizione"
     )
 )
 _QUANTITIES = words_in(
@@ -86,7 +88,7 @@ _TIME_UNITS = {
     **dict.fromkeys(words_in("microseconds micros usecs usec us"), "us"),
 }
 _TIMES = frozenset(word for word in _TIME_UNITS if len(word) > 2) | words_in(
-    "t time times stamp stamps timestamp timestamps date datetime clock ts arrival arrived zeit"
+    "t time times stamp stamps timestamp timestamps date datetime clock ts arrival arrived zeit tempo tiempo"
 )
 COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
 WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")  # a row may be of one of many
@@ -116,10 +118,11 @@ _UNITS = {
 }
 _TURNING = re.compile(
     r"joint|jnt|dof|shoulder|elbow|wrist|waist|hip|knee|ankle|neck|angle|theta|yaw|pitch|roll|heading|azimuth|motor"
-    r"|servo|pan|tilt|lift|flex|gripper|^([amj](_?d)?_?\d+|q(_?d)?_?\d*)$",
+    r"|angulo|angolo|winkel|servo|pan|tilt|lift|flex|gripper|^([amj](_?d)?_?\d+|q(_?d)?_?\d*)$",
     re.IGNORECASE,
 )
 
+_ACCENT = re.compile("[\u0300-\u036f]")
 _HUMP = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[a-z]\d)(?=[A-Z])|(?<=[a-z]\d\d)(?=[A-Z])|(?<=[A-Z0-9])(?=[A-Z][a-z])")
 _KNOWN = _OF_ROLES | _SILENT | _NO_POSITIONS | _TELLING
 # Words of roles without a separator before or behind an axis or what is no position; com is a centre of mass, too.
@@ -132,9 +135,9 @@ def words(name: str) -> list[str]:
     """The words of a name in lower case: ``goalPose_x`` is goal, pose, x; ``QTarget2`` is q, target, 2.
 
     Numbers of devices stay with them: ``camera2`` is one word. ``refx`` is ref, x, and ``velcmd`` is vel, cmd. ``H2C``
-    is one, too.
+    is one, too. Accents are left out.
     """
-    apart = _HUMP.sub("_", name)
+    apart = _HUMP.sub("_", _ACCENT.sub("", unicodedata.normalize("NFD", name)))
     whole = [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
     glued = [None if word in _KNOWN else _GLUED.fullmatch(word) for word in whole]
     parts = [

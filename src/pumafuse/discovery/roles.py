@@ -666,7 +666,7 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not."""
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
-    command = _ranged(command, {*command.axes})
+    command = _ranged(command, {*command.axes}) if stream.guessed else _fitted(command, stream)
     relations = _relations(command, _fitted(stream, command))
     alike = [relation for relation in relations if relation.correlation >= SAME]
     behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
@@ -866,7 +866,8 @@ def _fitted(stream: Stream, anchor: Stream) -> Stream:
             ratios = [max(moved.travel(axis), 1e-12) / max(anchored.travel(axis), 1e-12) for axis in of_kind]
             return abs(float(np.median(np.log(ratios))))
 
-        unit = min(GUESSED[kind], key=misfit)
+        told = dict.fromkeys(f"_{signal.unit}" for axis in axes for signal in anchor.axes[axis])  # maybe cm
+        unit = min((*told, *GUESSED[kind]), key=misfit)
         made |= {axis: _in(made[axis], unit) for axis in axes}
     return replace(stream, axes=made)
 
