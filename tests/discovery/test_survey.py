@@ -2057,7 +2057,7 @@ def test_a_clock_of_zeros_at_first_does_not_begin_anew(tmp_path: Path) -> None:
 
 
 def test_commands_in_inches_and_a_sensor_in_centimetres_are_fused_in_metres(log: Path) -> None:
-    """Their names say it; no name says it of another sensor, whose unit is none that is guessed: it is asked."""
+    """Their names say it; another sensor has the unit in which it goes as far, and whether it has is asked."""
     t, u, s, z = recorded()
     write(log / "command.csv", {"t_s": t, "x(in)": u[:, 0] / 0.0254})
     for name, column, size in (("camera", "x [cm]", 0.01), ("gauge", "x", 0.0254)):
@@ -2065,8 +2065,9 @@ def test_commands_in_inches_and_a_sensor_in_centimetres_are_fused_in_metres(log:
     found = survey(log)
     run, _ = written(found, log.parent / "described")
     np.testing.assert_allclose(run.command.values["x"], u[:, 0], atol=1e-9)
-    np.testing.assert_allclose(run.sensors["camera"].values["x"], z[:, 0], atol=1e-9)
-    assert any("gauge moves 0.039" in question for question in asked(found))
+    for sensor in ("camera", "gauge"):
+        np.testing.assert_allclose(run.sensors[sensor].values["x"], z[:, 0], atol=1e-9)
+    assert "are the numbers of gauge.csv in inch? No name says it" in " ".join(asked(found))
 
 
 @pytest.mark.parametrize("name", ["ki07.txt", "delta_task2.csv", "good_mode_b.log"])
