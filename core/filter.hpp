@@ -180,31 +180,17 @@ class Filter {
     // Of the row at hand, whose axes pass the gate together: each is computed once.
     mutable std::vector<Innovation> innovations;
 
-    void command(AxisState<N, Real>& state, Time a, const Event& event, History* history) const {
-        const AxisModel<N, Real>& axis = axes[a];
-        const Instant<Real> acts{event.time, axis.delayed};
-        Residual<N, Real>& xi = state.residual;
-        if (axis.noise.maneuvers) xi.accumulate(axis.arm.plant, acts);
-        state.response.predict(axis.arm, acts);
-        const double maneuver = state.response.command(axis.arm, event.value[a]);
-        if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
-        if (history)
-            (*history)[a].push_back(
-                {event.time, value_of(xi.input()), value_of(xi.drifting()), value_of(xi.scale)});
-        xi.set_noise(axis.noise, maneuver);
-    }
-
-    // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row
-    // after.
-    template <class Rows>
-    Time predict_by_commands(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until,
-                Time stamped) const {
-        for (; next < end && rows[next].time <= until; ++next) {
-            const Event event = rows[next];
-            if (event.commands(a) && event.stamp <= stamped) command(state, a, event, nullptr);
-        }
-        predict(state, a, {until, 0.0});
-        return next;
+    // nu = z - H x and S = H P H^T + R here and now; an angle that is measured within a turn is the nearest of all
+    // turns.
+    Innovation innovation(const AxisState<N, Real>& state, const Event& event, Time a) const {
+        const Time at = event.source * size() + a;
+        const Residual<N, Real>& xi = state.residual;
+        const Real R = noise_of(state, event, a), scale = sensors[event.source].scale;
+        const Real r = state.response.position(axes[a].arm);
+        const Real expected = scale * state.response.start + scale * r + xi.along(H[at]);
+        return {nearest(event.value[a] - expected, value_of(views[at].turn)), R,
+                xi.left(axes[a].doubt(state.response), value_of(scale), H[at]),
+                {xi.P, H[at], R}};
     }
 
     // R = (spread sd)^2 + (scale speed latency_sd)^2 [m^2] here and now.
@@ -218,6 +204,41 @@ class Filter {
         Real speed = state.response.speed(arm) + (arm.plant.order == 1 ? -arm.plant.rate * x[PLANT] : x[RATE]);
         if (noise.smooth()) speed = speed + x[DISTURBANCE + 1];
         return square(sd) + square(sensor.scale * speed * sensor.latency_sd);
+    }
+
+    void update(State<N, Real>& state, const Event& event, Time a, const Fate& fate, History* history) const {
+        Residual<N, Real>& xi = state.axes[a].residual;
+        auto [nu, R, d_nu, along] = innovations[a];
+        const Vector<N, Real>& h = H[event.source * size() + a];
+        Real widened = 0.0;
+        if (fate.outcome[a] == PF_REACQUIRED) {  // the offset may have moved by nu
+            widened = square(nu / sensors[event.source].scale);
+            xi.P[OFFSET][OFFSET] = xi.P[OFFSET][OFFSET] + widened;
+            state.gates[a].reacquire(event.source, event.time);
+            along = {xi.P, h, R};
+            store(fate, a, nu, along.S);
+        }
+        const Vector<N, Real> K = xi.update(h, along, nu, d_nu, R);
+        state.gates[a].fuse(event.source, event.time);
+        if constexpr (std::is_same_v<Real, double>)
+            if (history)
+                (*history)[a].push_back(
+                    {event.time, xi.input(), xi.drifting(), xi.scale, event.source, nu, R, widened, d_nu, K});
+        if (fate.outcome[a] != PF_REACQUIRED) xi.learn(axes[a].noise, nu, along.S, R);
+    }
+
+    void command(AxisState<N, Real>& state, Time a, const Event& event, History* history) const {
+        const AxisModel<N, Real>& axis = axes[a];
+        const Instant<Real> acts{event.time, axis.delayed};
+        Residual<N, Real>& xi = state.residual;
+        if (axis.noise.maneuvers) xi.accumulate(axis.arm.plant, acts);
+        state.response.predict(axis.arm, acts);
+        const double maneuver = state.response.command(axis.arm, event.value[a]);
+        if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
+        if (history)
+            (*history)[a].push_back(
+                {event.time, value_of(xi.input()), value_of(xi.drifting()), value_of(xi.scale)});
+        xi.set_noise(axis.noise, maneuver);
     }
 
     // Axes first to end of one row, which pass the gate together or not at all.
@@ -241,40 +262,6 @@ class Filter {
             if (beyond && !given) fate.outcome[a] = !reacquires ? PF_REJECTED : far(a) ? PF_REACQUIRED : PF_FUSED;
             if (fate.outcome[a] != PF_REJECTED) update(state, event, a, fate, history);
         }
-    }
-
-    // nu = z - H x and S = H P H^T + R here and now; an angle that is measured within a turn is the nearest of all
-    // turns.
-    Innovation innovation(const AxisState<N, Real>& state, const Event& event, Time a) const {
-        const Time at = event.source * size() + a;
-        const Residual<N, Real>& xi = state.residual;
-        const Real R = noise_of(state, event, a), scale = sensors[event.source].scale;
-        const Real r = state.response.position(axes[a].arm);
-        const Real expected = scale * state.response.start + scale * r + xi.along(H[at]);
-        return {nearest(event.value[a] - expected, value_of(views[at].turn)), R,
-                xi.left(axes[a].doubt(state.response), value_of(scale), H[at]),
-                {xi.P, H[at], R}};
-    }
-
-    void update(State<N, Real>& state, const Event& event, Time a, const Fate& fate, History* history) const {
-        Residual<N, Real>& xi = state.axes[a].residual;
-        auto [nu, R, d_nu, along] = innovations[a];
-        const Vector<N, Real>& h = H[event.source * size() + a];
-        Real widened = 0.0;
-        if (fate.outcome[a] == PF_REACQUIRED) {  // the offset may have moved by nu
-            widened = square(nu / sensors[event.source].scale);
-            xi.P[OFFSET][OFFSET] = xi.P[OFFSET][OFFSET] + widened;
-            state.gates[a].reacquire(event.source, event.time);
-            along = {xi.P, h, R};
-            store(fate, a, nu, along.S);
-        }
-        const Vector<N, Real> K = xi.update(h, along, nu, d_nu, R);
-        state.gates[a].fuse(event.source, event.time);
-        if constexpr (std::is_same_v<Real, double>)
-            if (history)
-                (*history)[a].push_back(
-                    {event.time, xi.input(), xi.drifting(), xi.scale, event.source, nu, R, widened, d_nu, K});
-        if (fate.outcome[a] != PF_REACQUIRED) xi.learn(axes[a].noise, nu, along.S, R);
     }
 
     // Whether a row beyond its gate re-acquires; if not, it is remembered, and whom it contradicts noted.
@@ -315,6 +302,19 @@ class Filter {
         const double variance = value_of(before.R + innovations[a].R + square(sensor.scale) * motion);
         const double apart = nearest(nu - before.nu, value_of(views[event.source * size() + a].turn));
         return std::fabs(apart) <= value_of(sensor.gate) * std::sqrt(variance) ? Agreement::yes : Agreement::no;
+    }
+
+    // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row
+    // after.
+    template <class Rows>
+    Time predict_by_commands(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until,
+                Time stamped) const {
+        for (; next < end && rows[next].time <= until; ++next) {
+            const Event event = rows[next];
+            if (event.commands(a) && event.stamp <= stamped) command(state, a, event, nullptr);
+        }
+        predict(state, a, {until, 0.0});
+        return next;
     }
 };
 

@@ -13,65 +13,6 @@ namespace pumafuse {
 enum { PLANT, RATE, OFFSET, DISTURBANCE };      // of x; where there is no disturbance, biases follow
 enum class Smoothness { none, rough, smooth };  // no state, d alone, d and its rate
 
-// M <- F M F^T where F moves the states i and i + 1.
-template <int N, class Real>
-void move_pair(Matrix<N, Real>& M, int i, Real f11, Real f12, Real f21, Real f22) {
-    const int k = i + 1;
-    const Real a = M[i][i], b = M[i][k], c = M[k][k], d = f11 * a + f12 * b, e = f11 * b + f12 * c;
-    M[i][i] = d * f11 + e * f12;
-    M[i][k] = M[k][i] = d * f21 + e * f22;
-    M[k][k] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22;
-    for (int j = 0; j < N; ++j) {
-        if (j == i || j == k) continue;
-        const Real p = M[i][j], v = M[k][j];
-        M[i][j] = M[j][i] = f11 * p + f12 * v;
-        M[k][j] = M[j][k] = f21 * p + f22 * v;
-    }
-}
-
-// M H^T and S = H M H^T + R. S cannot be known to be smaller than what rounding leaves of what it is made of.
-template <int N, class Real>
-struct Along {
-    Vector<N, Real> MH{};
-    Real S = 0.0;
-
-    Along() = default;
-
-    Along(const Matrix<N, Real>& M, const Vector<N, Real>& H, Real R) : S(R) {
-        constexpr double ROUNDING = 1e-15;
-        Real own = 0.0;
-        for (int j = 0; j < N; ++j) {
-            if (is_zero(H[j])) continue;
-            for (int i = 0; i < N; ++i) MH[i] = MH[i] + M[j][i] * H[j];
-        }
-        for (int i = 0; i < N; ++i) own = own + H[i] * H[i] * M[i][i], S = S + H[i] * MH[i];
-        if (value_of(S) < value_of(R)) S = R;
-        if (value_of(S) < ROUNDING * value_of(own)) S = ROUNDING * own;
-    }
-};
-
-// K = M H^T / S, and M <- (I - K H) M (I - K H)^T + K R K^T. Returns K.
-//
-// The smoother uses it for its dual, too. A state that H does not see and that shares nothing with the others changes
-// no bit of theirs. A quotient is exactly 1 where a prior is all there is to S; a product with 1/S would leave a
-// variance below 0.
-template <int N, class Real>
-Vector<N, Real> joseph(Matrix<N, Real>& M, const Vector<N, Real>& H, const Along<N, Real>& along, Real R) {
-    Vector<N, Real> K, WH{};
-    for (int i = 0; i < N; ++i) K[i] = along.MH[i] / along.S;
-    for (int i = 0; i < N; ++i)  // W = (I - K H) M, and W H^T
-        for (int j = 0; j < N; ++j) M[i][j] = M[i][j] - K[i] * along.MH[j], WH[i] = WH[i] + M[i][j] * H[j];
-    for (int i = 0; i < N; ++i)  // W - W H^T K^T + K R K^T; the last apart, or a wide prior would round it away
-        for (int j = 0; j <= i; ++j) {
-            const Real left = M[i][j] - WH[i] * K[j] + M[j][i] - WH[j] * K[i];
-            M[i][j] = M[j][i] = 0.5 * left + K[i] * R * K[j];
-        }
-    for (int i = 0; i < N; ++i)  // rounding beside a prior 1e16 times as wide: known, as far as doubles go
-        if (value_of(M[i][i]) < 0.0)
-            for (int j = 0; j < N; ++j) M[i][j] = M[j][i] = 0.0;
-    return K;
-}
-
 // What is known of the residual of one axis.
 template <int N, class Real>
 struct Noise {
@@ -132,6 +73,65 @@ struct Noise {
     }
 };
 
+// M <- F M F^T where F moves the states i and i + 1.
+template <int N, class Real>
+void move_pair(Matrix<N, Real>& M, int i, Real f11, Real f12, Real f21, Real f22) {
+    const int k = i + 1;
+    const Real a = M[i][i], b = M[i][k], c = M[k][k], d = f11 * a + f12 * b, e = f11 * b + f12 * c;
+    M[i][i] = d * f11 + e * f12;
+    M[i][k] = M[k][i] = d * f21 + e * f22;
+    M[k][k] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22;
+    for (int j = 0; j < N; ++j) {
+        if (j == i || j == k) continue;
+        const Real p = M[i][j], v = M[k][j];
+        M[i][j] = M[j][i] = f11 * p + f12 * v;
+        M[k][j] = M[j][k] = f21 * p + f22 * v;
+    }
+}
+
+// M H^T and S = H M H^T + R. S cannot be known to be smaller than what rounding leaves of what it is made of.
+template <int N, class Real>
+struct Along {
+    Vector<N, Real> MH{};
+    Real S = 0.0;
+
+    Along() = default;
+
+    Along(const Matrix<N, Real>& M, const Vector<N, Real>& H, Real R) : S(R) {
+        constexpr double ROUNDING = 1e-15;
+        Real own = 0.0;
+        for (int j = 0; j < N; ++j) {
+            if (is_zero(H[j])) continue;
+            for (int i = 0; i < N; ++i) MH[i] = MH[i] + M[j][i] * H[j];
+        }
+        for (int i = 0; i < N; ++i) own = own + H[i] * H[i] * M[i][i], S = S + H[i] * MH[i];
+        if (value_of(S) < value_of(R)) S = R;
+        if (value_of(S) < ROUNDING * value_of(own)) S = ROUNDING * own;
+    }
+};
+
+// K = M H^T / S, and M <- (I - K H) M (I - K H)^T + K R K^T. Returns K.
+//
+// The smoother uses it for its dual, too. A state that H does not see and that shares nothing with the others changes
+// no bit of theirs. A quotient is exactly 1 where a prior is all there is to S; a product with 1/S would leave a
+// variance below 0.
+template <int N, class Real>
+Vector<N, Real> joseph(Matrix<N, Real>& M, const Vector<N, Real>& H, const Along<N, Real>& along, Real R) {
+    Vector<N, Real> K, WH{};
+    for (int i = 0; i < N; ++i) K[i] = along.MH[i] / along.S;
+    for (int i = 0; i < N; ++i)  // W = (I - K H) M, and W H^T
+        for (int j = 0; j < N; ++j) M[i][j] = M[i][j] - K[i] * along.MH[j], WH[i] = WH[i] + M[i][j] * H[j];
+    for (int i = 0; i < N; ++i)  // W - W H^T K^T + K R K^T; the last apart, or a wide prior would round it away
+        for (int j = 0; j <= i; ++j) {
+            const Real left = M[i][j] - WH[i] * K[j] + M[j][i] - WH[j] * K[i];
+            M[i][j] = M[j][i] = 0.5 * left + K[i] * R * K[j];
+        }
+    for (int i = 0; i < N; ++i)  // rounding beside a prior 1e16 times as wide: known, as far as doubles go
+        if (value_of(M[i][i]) < 0.0)
+            for (int j = 0; j < N; ++j) M[i][j] = M[j][i] = 0.0;
+    return K;
+}
+
 template <int N, class Real>
 struct Residual {
     Instant<Real> time;  // of x and P
@@ -151,6 +151,79 @@ struct Residual {
     Residual(const Noise<N, Real>& noise, const Instant<Real>& origin) : time(origin), until(origin) {
         doubted = noise.doubted, set_noise(noise, 0.0);
         for (int i = 0; i < N; ++i) P[i][i] = noise.variance[i];
+    }
+
+    // x <- F x and P <- F P F^T + Q.
+    void predict(const Plant<Real>& plant, const Noise<N, Real>& noise, const Instant<Real>& to) {
+        using std::expm1;
+        accumulate(plant, to);
+        const Real dt = seconds(time, to);
+        if (is_zero(dt)) return;
+        if (plant.order == 1) fade(PLANT, since.f11);
+        else move(PLANT, since);
+        add(PLANT, since.q11, since.q12, since.q22);
+        P[OFFSET][OFFSET] = P[OFFSET][OFFSET] + drifted, drifted = 0.0;
+        int i = DISTURBANCE;
+        if (noise.smooth()) {
+            const Driven<Real>& d = noise.disturbance.driven_over(dt);
+            const Real density = scale * noise.density;
+            move(i, d), add(i, density * d.q11, density * d.q12, density * d.q22);
+            i += 2;
+        }
+        for (; i < noise.size; ++i) {
+            if (value_of(noise.reverting[i]) == 0.0) continue;
+            const Real lost = expm1(-noise.reverting[i] * dt);
+            fade(i, 1.0 + lost);
+            P[i][i] = P[i][i] - noise.variance_of(i, scale) * lost * (2.0 + lost);
+        }
+        time = to;
+    }
+
+    // x <- x + K nu and P <- (I - K H) P (I - K H)^T + K R K^T, and `by` likewise. Returns K.
+    Vector<N, Real> update(const Vector<N, Real>& H, const Along<N, Real>& along, Real nu, const ByDoubt<>& d_nu,
+                           Real R) {
+        Vector<N, Real> K;
+        if constexpr (std::is_same_v<Real, double>) K = joseph<N, double>(P, H, along, R);
+        else K = joseph_tangent(P, H, along, R);  // likelihood.hpp
+        for (int i = 0; i < N; ++i) x[i] = x[i] + K[i] * nu;
+        each_doubt([&](auto& one, int k) {
+            for (int i = 0; i < N; ++i) one[i] += K[i] * d_nu[k];
+        });
+        return K;
+    }
+
+    Real along(const Vector<N, Real>& h) const {  // h x
+        Real sum = 0.0;
+        for (int i = 0; i < N; ++i) sum = sum + h[i] * x[i];
+        return sum;
+    }
+
+    Real variance(const Vector<N, Real>& h) const {  // h P h^T
+        Real sum = 0.0;
+        for (int i = 0; i < N; ++i)
+            for (int j = 0; j < N; ++j) sum = sum + h[i] * P[i][j] * h[j];
+        return value_of(sum) > 0.0 ? sum : Real(0.0);
+    }
+
+    // How a position or a measurement changes, less what h x makes of it: of the response it sees `scale` times.
+    ByDoubt<> left(const ByDoubt<>& by_response, double scale, const Vector<N, Real>& h) const {
+        ByDoubt<> found{};
+        for (int k = 0; doubted && k < DOUBTS; ++k) {
+            found[k] = scale * by_response[k];
+            for (int i = 0; i < N; ++i) found[k] -= value_of(h[i]) * by[k][i];
+        }
+        return found;
+    }
+
+    // Towards what a measurement says of the noise before it, by the score of its likelihood. (Creal, Koopman & Lucas,
+    // "Generalized autoregressive score models with applications", J. Appl. Econometrics 28(5), 2013.)
+    void learn(const Noise<N, Real>& noise, const Real& nu, const Real& S, const Real& R) {
+        using std::exp;
+        if (!noise.adapts) return;
+        const Real score = (1.0 - R / S) * (square(nu) / S - 1.0);
+        unrest = unrest + noise.adaptation * (value_of(score) < MOST ? score : Real(MOST));
+        if (value_of(unrest) < 0.0) unrest = 0.0;
+        scale = exp(unrest);
     }
 
     void set_noise(const Noise<N, Real>& noise, double maneuver) {
@@ -184,79 +257,6 @@ struct Residual {
 
     Real input() const { return scale * q; }         // densities squared as they are now
     Real drifting() const { return scale * drift; }
-
-    // x <- F x and P <- F P F^T + Q.
-    void predict(const Plant<Real>& plant, const Noise<N, Real>& noise, const Instant<Real>& to) {
-        using std::expm1;
-        accumulate(plant, to);
-        const Real dt = seconds(time, to);
-        if (is_zero(dt)) return;
-        if (plant.order == 1) fade(PLANT, since.f11);
-        else move(PLANT, since);
-        add(PLANT, since.q11, since.q12, since.q22);
-        P[OFFSET][OFFSET] = P[OFFSET][OFFSET] + drifted, drifted = 0.0;
-        int i = DISTURBANCE;
-        if (noise.smooth()) {
-            const Driven<Real>& d = noise.disturbance.driven_over(dt);
-            const Real density = scale * noise.density;
-            move(i, d), add(i, density * d.q11, density * d.q12, density * d.q22);
-            i += 2;
-        }
-        for (; i < noise.size; ++i) {
-            if (value_of(noise.reverting[i]) == 0.0) continue;
-            const Real lost = expm1(-noise.reverting[i] * dt);
-            fade(i, 1.0 + lost);
-            P[i][i] = P[i][i] - noise.variance_of(i, scale) * lost * (2.0 + lost);
-        }
-        time = to;
-    }
-
-    Real along(const Vector<N, Real>& h) const {  // h x
-        Real sum = 0.0;
-        for (int i = 0; i < N; ++i) sum = sum + h[i] * x[i];
-        return sum;
-    }
-
-    // How a position or a measurement changes, less what h x makes of it: of the response it sees `scale` times.
-    ByDoubt<> left(const ByDoubt<>& by_response, double scale, const Vector<N, Real>& h) const {
-        ByDoubt<> found{};
-        for (int k = 0; doubted && k < DOUBTS; ++k) {
-            found[k] = scale * by_response[k];
-            for (int i = 0; i < N; ++i) found[k] -= value_of(h[i]) * by[k][i];
-        }
-        return found;
-    }
-
-    Real variance(const Vector<N, Real>& h) const {  // h P h^T
-        Real sum = 0.0;
-        for (int i = 0; i < N; ++i)
-            for (int j = 0; j < N; ++j) sum = sum + h[i] * P[i][j] * h[j];
-        return value_of(sum) > 0.0 ? sum : Real(0.0);
-    }
-
-    // x <- x + K nu and P <- (I - K H) P (I - K H)^T + K R K^T, and `by` likewise. Returns K.
-    Vector<N, Real> update(const Vector<N, Real>& H, const Along<N, Real>& along, Real nu, const ByDoubt<>& d_nu,
-                           Real R) {
-        Vector<N, Real> K;
-        if constexpr (std::is_same_v<Real, double>) K = joseph<N, double>(P, H, along, R);
-        else K = joseph_tangent(P, H, along, R);  // likelihood.hpp
-        for (int i = 0; i < N; ++i) x[i] = x[i] + K[i] * nu;
-        each_doubt([&](auto& one, int k) {
-            for (int i = 0; i < N; ++i) one[i] += K[i] * d_nu[k];
-        });
-        return K;
-    }
-
-    // Towards what a measurement says of the noise before it, by the score of its likelihood. (Creal, Koopman & Lucas,
-    // "Generalized autoregressive score models with applications", J. Appl. Econometrics 28(5), 2013.)
-    void learn(const Noise<N, Real>& noise, const Real& nu, const Real& S, const Real& R) {
-        using std::exp;
-        if (!noise.adapts) return;
-        const Real score = (1.0 - R / S) * (square(nu) / S - 1.0);
-        unrest = unrest + noise.adaptation * (value_of(score) < MOST ? score : Real(MOST));
-        if (value_of(unrest) < 0.0) unrest = 0.0;
-        scale = exp(unrest);
-    }
 
   private:
     static constexpr double MOST = 10.0;  // of a score: an outlier that passed the gate is no unrest
