@@ -26,7 +26,7 @@ struct State {
 };
 
 // A standard deviation. It is never 0, whatever a model without noise says: no arm, sensor or log resolves less.
-inline double bar(double variance) { return std::max(std::sqrt(variance), PF_FINEST); }
+inline double error_bar(double variance) { return std::max(std::sqrt(variance), PF_FINEST); }
 
 // What is known of one axis.
 template <int N, class Real>
@@ -47,9 +47,9 @@ struct AxisModel {
     // What lag and gain add to the variance of what changes so with them.
     double variance(const ByDoubt<>& by) const { return square(by[LAG] * sd[LAG]) + square(by[GAIN] * sd[GAIN]); }
 
-    // Of a state.
+    // The error bar of a state.
     double sd_of(const Residual<N, Real>& xi, int i) const {
-        return bar(std::max(value_of(xi.P[i][i]), 0.0) + variance({xi.by[LAG][i], xi.by[GAIN][i]}));
+        return error_bar(std::max(value_of(xi.P[i][i]), 0.0) + variance({xi.dx[LAG][i], xi.dx[GAIN][i]}));
     }
 
     // How the response changes with lag and gain, where these are doubted.
@@ -115,13 +115,13 @@ class Filter {
         return state;
     }
 
-    // One event: a command of some axes, or a measurement. `given`: its outcomes are repeated.
-    void step(State<N, Real>& state, const Event& event, const Fate& fate, bool given = false,
+    // One event: a command of some axes, or a measurement. `repeat`: its outcomes stay as they are.
+    void step(State<N, Real>& state, const Event& event, const Fate& fate, bool repeat = false,
               History* history = nullptr) const {
         *fate.contradicts = NOBODY;
         const Time together = !event.is_command() && value_of(sensors[event.source].gate_rows) != 0.0 ? size() : 1;
         for (Time a = 0; a < size(); a += together) {
-            if (!event.is_command()) measurement(state, event, a, a + together, fate, given, history);
+            if (!event.is_command()) measurement(state, event, a, a + together, fate, repeat, history);
             else if (event.commands(a)) command(state.axes[a], a, event, history);
         }
     }
@@ -141,11 +141,12 @@ class Filter {
             const double moving = now.residual.variance(axis.motion);
             now.residual.P = {};  // what comes is noise alone
             predict_by_commands(now, a, rows, next, end, time + axis.ahead, stamped);
-            const double later = now.response.position(axis.arm) + now.residual.along(axis.noise.position);
+            const double later = now.response.position(axis.arm) + now.residual.mean(axis.noise.position);
             numbers[PF_VELOCITY] = (later - numbers[PF_POSITION]) / axis.arm.period;
-            const ByDoubt<> then = now.residual.left(axis.doubt(now.response), 1.0, axis.noise.position);
+            const ByDoubt<> then = now.residual.error_by_doubt(axis.doubt(now.response), 1.0, axis.noise.position);
             const double doubted = axis.variance({then[LAG] - left[LAG], then[GAIN] - left[GAIN]});
-            numbers[PF_VELOCITY_SD] = bar(moving + now.residual.variance(axis.noise.position) + doubted) / axis.arm.period;
+            const double variance = moving + now.residual.variance(axis.noise.position) + doubted;
+            numbers[PF_VELOCITY_SD] = error_bar(variance) / axis.arm.period;
             for (int k = 0; k < PF_OUTPUTS; ++k) outputs[(k * size() + a) * count + n] = numbers[k];
         }
     }
@@ -154,10 +155,10 @@ class Filter {
     // the position changes with lag and gain, as the response does by `doubt`.
     static ByDoubt<> describe(const AxisModel<N, Real>& axis, double r, const ByDoubt<>& doubt,
                               const Residual<N, double>& xi, double (&numbers)[PF_OUTPUTS]) {
-        const ByDoubt<> left = xi.left(doubt, 1.0, axis.noise.position);
+        const ByDoubt<> left = xi.error_by_doubt(doubt, 1.0, axis.noise.position);
         const bool disturbed = axis.noise.smoothness != Smoothness::none;
-        numbers[PF_POSITION] = r + xi.along(axis.noise.position);
-        numbers[PF_POSITION_SD] = bar(xi.variance(axis.noise.position) + axis.variance(left));
+        numbers[PF_POSITION] = r + xi.mean(axis.noise.position);
+        numbers[PF_POSITION_SD] = error_bar(xi.variance(axis.noise.position) + axis.variance(left));
         numbers[PF_VELOCITY] = numbers[PF_VELOCITY_SD] = std::numeric_limits<double>::quiet_NaN();
         numbers[PF_OFFSET] = xi.x[OFFSET], numbers[PF_OFFSET_SD] = axis.sd_of(xi, OFFSET);
         numbers[PF_DISTURBANCE] = disturbed ? xi.x[DISTURBANCE] : 0.0;
@@ -175,22 +176,20 @@ class Filter {
     struct Innovation {
         Real nu, R;
         ByDoubt<> d_nu;
-        Along<N, Real> along;
+        Projection<N, Real> projection;
     };
-    // Of the row at hand, whose axes pass the gate together: each is computed once.
+    // Innovations of the row at hand, whose axes pass the gate together: each is computed once.
     mutable std::vector<Innovation> innovations;
 
-    // nu = z - H x and S = H P H^T + R here and now; an angle that is measured within a turn is the nearest of all
-    // turns.
+    // nu = z - H x and S = H P H^T + R here and now; of an angle that is measured within a turn the nearest nu.
     Innovation innovation(const AxisState<N, Real>& state, const Event& event, Time a) const {
         const Time at = event.source * size() + a;
         const Residual<N, Real>& xi = state.residual;
         const Real R = noise_of(state, event, a), scale = sensors[event.source].scale;
         const Real r = state.response.position(axes[a].arm);
-        const Real expected = scale * state.response.start + scale * r + xi.along(H[at]);
+        const Real expected = scale * state.response.start + scale * r + xi.mean(H[at]);
         return {nearest(event.value[a] - expected, value_of(views[at].turn)), R,
-                xi.left(axes[a].doubt(state.response), value_of(scale), H[at]),
-                {xi.P, H[at], R}};
+                xi.error_by_doubt(axes[a].doubt(state.response), value_of(scale), H[at]), {xi.P, H[at], R}};
     }
 
     // R = (spread sd)^2 + (scale speed latency_sd)^2 [m^2] here and now.
@@ -206,27 +205,29 @@ class Filter {
         return square(sd) + square(sensor.scale * speed * sensor.latency_sd);
     }
 
+    // x <- x + K nu and P in Joseph's form; a measurement that re-acquires widens the offset first.
     void update(State<N, Real>& state, const Event& event, Time a, const Fate& fate, History* history) const {
         Residual<N, Real>& xi = state.axes[a].residual;
-        auto [nu, R, d_nu, along] = innovations[a];
+        auto [nu, R, d_nu, projection] = innovations[a];
         const Vector<N, Real>& h = H[event.source * size() + a];
         Real widened = 0.0;
         if (fate.outcome[a] == PF_REACQUIRED) {  // the offset may have moved by nu
             widened = square(nu / sensors[event.source].scale);
             xi.P[OFFSET][OFFSET] = xi.P[OFFSET][OFFSET] + widened;
             state.gates[a].reacquire(event.source, event.time);
-            along = {xi.P, h, R};
-            store(fate, a, nu, along.S);
+            projection = {xi.P, h, R};
+            store(fate, a, nu, projection.S);
         }
-        const Vector<N, Real> K = xi.update(h, along, nu, d_nu, R);
+        const Vector<N, Real> K = xi.update(h, projection, nu, d_nu, R);
         state.gates[a].fuse(event.source, event.time);
         if constexpr (std::is_same_v<Real, double>)
             if (history)
                 (*history)[a].push_back(
                     {event.time, xi.input(), xi.drifting(), xi.scale, event.source, nu, R, widened, d_nu, K});
-        if (fate.outcome[a] != PF_REACQUIRED) xi.learn(axes[a].noise, nu, along.S, R);
+        if (fate.outcome[a] != PF_REACQUIRED) xi.learn(axes[a].noise, nu, projection.S, R);
     }
 
+    // The response takes the command; the residual only its noise, where that grows with maneuvers.
     void command(AxisState<N, Real>& state, Time a, const Event& event, History* history) const {
         const AxisModel<N, Real>& axis = axes[a];
         const Instant<Real> acts{event.time, axis.delayed};
@@ -236,30 +237,29 @@ class Filter {
         const double maneuver = state.response.command(axis.arm, event.value[a]);
         if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
         if (history)
-            (*history)[a].push_back(
-                {event.time, value_of(xi.input()), value_of(xi.drifting()), value_of(xi.scale)});
+            (*history)[a].push_back({event.time, value_of(xi.input()), value_of(xi.drifting()), value_of(xi.scale)});
         xi.set_noise(axis.noise, maneuver);
     }
 
     // Axes first to end of one row, which pass the gate together or not at all.
-    void measurement(State<N, Real>& state, const Event& event, Time first, Time end, const Fate& fate, bool given,
+    void measurement(State<N, Real>& state, const Event& event, Time first, Time end, const Fate& fate, bool repeat,
                      History* history) const {
         const Sensor<Real>& sensor = sensors[event.source];
         const double gate = value_of(sensor.gate);
         const auto far = [&](Time a) { return std::fabs(fate.innovation[a]) > gate * fate.innovation_sd[a]; };
         bool beyond = false;
         for (Time a = first; a < end; ++a) {
-            if (!given) fate.outcome[a] = event.known[a];
+            if (!repeat) fate.outcome[a] = event.known[a];
             if (event.known[a] != PF_FUSED) continue;
             predict(state.axes[a], a, {event.time, value_of(sensor.latency) - sensor.latency});
             const Innovation& now = innovations[a] = innovation(state.axes[a], event, a);
-            store(fate, a, now.nu, now.along.S), fate.noise_scale[a] = value_of(state.axes[a].residual.scale);
+            store(fate, a, now.nu, now.projection.S), fate.noise_scale[a] = value_of(state.axes[a].residual.scale);
             beyond |= gate > 0.0 && far(a);
         }
-        const bool reacquires = beyond && !given && this->reacquires(state, event, first, end, fate);
+        const bool reacquires = beyond && !repeat && this->reacquires(state, event, first, end, fate);
         for (Time a = first; a < end; ++a) {
             if (event.known[a] != PF_FUSED) continue;
-            if (beyond && !given) fate.outcome[a] = !reacquires ? PF_REJECTED : far(a) ? PF_REACQUIRED : PF_FUSED;
+            if (beyond && !repeat) fate.outcome[a] = !reacquires ? PF_REJECTED : far(a) ? PF_REACQUIRED : PF_FUSED;
             if (fate.outcome[a] != PF_REJECTED) update(state, event, a, fate, history);
         }
     }
@@ -304,11 +304,11 @@ class Filter {
         return std::fabs(apart) <= value_of(sensor.gate) * std::sqrt(variance) ? Agreement::yes : Agreement::no;
     }
 
-    // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row
-    // after.
+    // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`. Returns the
+    // row after them.
     template <class Rows>
     Time predict_by_commands(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until,
-                Time stamped) const {
+                             Time stamped) const {
         for (; next < end && rows[next].time <= until; ++next) {
             const Event event = rows[next];
             if (event.commands(a) && event.stamp <= stamped) command(state, a, event, nullptr);
@@ -320,12 +320,12 @@ class Filter {
 
 // Events begin to end, and an estimate at each of n times by the events until then.
 template <int N>
-void run(const Filter<N>& filter, State<N, double>& state, const Table& rows, Time begin, Time end, bool given, Time n,
+void run(const Filter<N>& filter, State<N, double>& state, const Table& rows, Time begin, Time end, bool repeat, Time n,
          const Time* times, double* outputs) {
     for (Time k = 0; k <= n; ++k) {
         const Time until = k < n ? times[k] : PF_NEVER;
         for (; begin < end && rows.events.time[begin] <= until; ++begin)
-            filter.step(state, rows[begin], rows.fate(begin), given);
+            filter.step(state, rows[begin], rows.fate(begin), repeat);
         if (k < n) filter.estimate(state, rows, begin, rows.events.count, until, until, outputs, n, k);
     }
 }

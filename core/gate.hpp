@@ -35,28 +35,28 @@ struct Gates {
     std::vector<Gate> sensor;     // (S,)
     Time unsettled = PF_ALWAYS;   // when sensors last disagreed while re-acquisitions were counted; else never
 
-    // The sensor that stands for what is believed and contradicts `mine`; NOBODY for none.
-    int contradicted(int mine, Time time) const {
+    // The sensor that stands for what is believed and contradicts `source`; NOBODY for none.
+    int contradicted(int source, Time time) const {
         for (int other = 0; other < int(sensor.size()); ++other) {
             const Gate& gate = sensor[other];
             const bool recently = gate.fused_at > PF_ALWAYS && time - gate.fused_at <= RECENT;
-            if (other != mine && recently && gate.reacquired <= sensor[mine].reacquired) return other;
+            if (other != source && recently && gate.reacquired <= sensor[source].reacquired) return other;
         }
         return NOBODY;
     }
 
-    void reject(int mine, double nu, double R, Time time, bool too_soon) {
-        sensor[mine].reject(nu, R, time, too_soon);
-        if (sensor[mine].in_a_row > 1 && unsettled > PF_ALWAYS) unsettled = time;
+    void reject(int source, double nu, double R, Time time, bool too_soon) {
+        sensor[source].reject(nu, R, time, too_soon);
+        if (sensor[source].in_a_row > 1 && unsettled > PF_ALWAYS) unsettled = time;
     }
 
-    void reacquire(int mine, Time time) {
-        ++sensor[mine].reacquired;
+    void reacquire(int source, Time time) {
+        ++sensor[source].reacquired;
         unsettled = time;
     }
 
-    void fuse(int mine, Time time) {
-        sensor[mine].in_a_row = 0, sensor[mine].fused_at = time;
+    void fuse(int source, Time time) {
+        sensor[source].in_a_row = 0, sensor[source].fused_at = time;
         if (unsettled == PF_ALWAYS || time - unsettled < SETTLED) return;
         for (const Gate& other : sensor)
             if (other.fused_at > PF_ALWAYS && time - other.fused_at > SETTLED) return;

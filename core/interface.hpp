@@ -33,8 +33,8 @@ Model<Real> model_of(const pf_model& model, const pf_model* tangents = nullptr, 
     std::vector<const pf_axis*> axes;
     std::vector<const pf_sensor*> sensors;
     std::vector<const pf_view*> views;
-    for (const pf_model* one = tangents; one < tangents + lanes; ++one)
-        axes.push_back(one->axis), sensors.push_back(one->sensor), views.push_back(one->view);
+    for (const pf_model* tangent = tangents; tangent < tangents + lanes; ++tangent)
+        axes.push_back(tangent->axis), sensors.push_back(tangent->sensor), views.push_back(tangent->view);
     return {lift<Axis, Real>(model.axis, model.axes, axes),
             lift<Sensor, Real>(model.sensor, model.sensors, sensors),
             lift<View, Real>(model.view, model.sensors * model.axes, views)};

@@ -87,32 +87,32 @@ struct Dual {
 
 // At its best K the covariance does not change with K:
 //     d(P+) = (I - K H) dP (I - K H)' + K dR K' - K dH P+ - (K dH P+)'
-// with (I - K H) dP (I - K H)' = dP - K H dP - (K H dP)' + K H dP H' K'. `along` has H dP + dH P and what S changes by.
+// with (I - K H) dP (I - K H)' = dP - K H dP - (K H dP)' + K H dP H' K'. `projection` has H dP + dH P and dS.
 template <int N, int L>
-Vector<N, Dual<L>> joseph_tangent(auto& M, const auto& H, const Along<N, Dual<L>>& along, const Dual<L>& R) {
+Vector<N, Dual<L>> joseph_tangent(auto& M, const auto& H, const Projection<N, Dual<L>>& projection, const Dual<L>& R) {
     constexpr int PAIRS = Dual<L>::PAIRS;
     Vector<N, Dual<L>> K;
     Vector<N, double> h;
     Matrix<N, double> P;
     std::array<Pair, PAIRS> moved{};  // dH K
     for (int i = 0; i < N; ++i) {
-        K[i] = along.MH[i] / along.S, h[i] = H[i].value;
+        K[i] = projection.MH[i] / projection.S, h[i] = H[i].value;
         for (int j = 0; j < N; ++j) P[i][j] = M[i][j].value;
         for (int k = 0; k < PAIRS; ++k) moved[k] += H[i].d[k] * K[i].value;
     }
     joseph<N, double>(P, h, {P, h, R.value}, R.value);
     std::array<Pair, PAIRS> along_h;               // H dP H' + dR
     std::array<std::array<Pair, PAIRS>, N> across; // H dP + dH P+, less half of K along_h
-    for (int k = 0; k < PAIRS; ++k) along_h[k] = along.S.d[k] - 2.0 * along.S.value * moved[k];
+    for (int k = 0; k < PAIRS; ++k) along_h[k] = projection.S.d[k] - 2.0 * projection.S.value * moved[k];
     for (int i = 0; i < N; ++i)
         for (int k = 0; k < PAIRS; ++k)
-            across[i][k] = along.MH[i].d[k] - along.MH[i].value * moved[k] - 0.5 * K[i].value * along_h[k];
+            across[i][k] = projection.MH[i].d[k] - projection.MH[i].value * moved[k] - 0.5 * K[i].value * along_h[k];
     for (int i = 0; i < N; ++i)
         for (int j = 0; j <= i; ++j) {
-            Dual<L>& there = M[i][j];
-            there.value = P[i][j];
-            for (int k = 0; k < PAIRS; ++k) there.d[k] -= K[i].value * across[j][k] + K[j].value * across[i][k];
-            M[j][i] = there;
+            Dual<L>& entry = M[i][j];
+            entry.value = P[i][j];
+            for (int k = 0; k < PAIRS; ++k) entry.d[k] -= K[i].value * across[j][k] + K[j].value * across[i][k];
+            M[j][i] = entry;
         }
     return K;
 }

@@ -45,14 +45,14 @@ struct Noise {
         disturbance = {lambda, 1.0, 0.0}, density = 4.0 * square(axis.disturbance_sd) / lambda;
     }
 
-    // Of what a state reverts to: biases are the sensors', and do not change with an arm's unrest.
+    // The variance that a state reverts to: biases are the sensors', and do not change with an arm's unrest.
     Real variance_of(int i, const Real& scale) const {
         return i == DISTURBANCE && smoothness == Smoothness::rough ? scale * variance[i] : variance[i];
     }
 
     bool smooth() const { return DISTURBANCE + 1 < N && smoothness == Smoothness::smooth; }
 
-    // One more state; returns which.
+    // Add a state; returns which.
     int add(Real rate, Real at_first) {
         if (size == N) throw std::length_error("an axis has more than 64 states: too many sensors have biases");
         reverting[size] = rate, variance[size] = at_first;
@@ -91,22 +91,22 @@ void move_pair(Matrix<N, Real>& M, int i, Real f11, Real f12, Real f21, Real f22
 
 // M H^T and S = H M H^T + R. S cannot be known to be smaller than what rounding leaves of what it is made of.
 template <int N, class Real>
-struct Along {
+struct Projection {
     Vector<N, Real> MH{};
     Real S = 0.0;
 
-    Along() = default;
+    Projection() = default;
 
-    Along(const Matrix<N, Real>& M, const Vector<N, Real>& H, Real R) : S(R) {
+    Projection(const Matrix<N, Real>& M, const Vector<N, Real>& H, Real R) : S(R) {
         constexpr double ROUNDING = 1e-15;
-        Real own = 0.0;
+        Real diagonal = 0.0;
         for (int j = 0; j < N; ++j) {
             if (is_zero(H[j])) continue;
             for (int i = 0; i < N; ++i) MH[i] = MH[i] + M[j][i] * H[j];
         }
-        for (int i = 0; i < N; ++i) own = own + H[i] * H[i] * M[i][i], S = S + H[i] * MH[i];
+        for (int i = 0; i < N; ++i) diagonal = diagonal + H[i] * H[i] * M[i][i], S = S + H[i] * MH[i];
         if (value_of(S) < value_of(R)) S = R;
-        if (value_of(S) < ROUNDING * value_of(own)) S = ROUNDING * own;
+        if (value_of(S) < ROUNDING * value_of(diagonal)) S = ROUNDING * diagonal;
     }
 };
 
@@ -116,11 +116,11 @@ struct Along {
 // no bit of theirs. A quotient is exactly 1 where a prior is all there is to S; a product with 1/S would leave a
 // variance below 0.
 template <int N, class Real>
-Vector<N, Real> joseph(Matrix<N, Real>& M, const Vector<N, Real>& H, const Along<N, Real>& along, Real R) {
+Vector<N, Real> joseph(Matrix<N, Real>& M, const Vector<N, Real>& H, const Projection<N, Real>& projection, Real R) {
     Vector<N, Real> K, WH{};
-    for (int i = 0; i < N; ++i) K[i] = along.MH[i] / along.S;
+    for (int i = 0; i < N; ++i) K[i] = projection.MH[i] / projection.S;
     for (int i = 0; i < N; ++i)  // W = (I - K H) M, and W H^T
-        for (int j = 0; j < N; ++j) M[i][j] = M[i][j] - K[i] * along.MH[j], WH[i] = WH[i] + M[i][j] * H[j];
+        for (int j = 0; j < N; ++j) M[i][j] = M[i][j] - K[i] * projection.MH[j], WH[i] = WH[i] + M[i][j] * H[j];
     for (int i = 0; i < N; ++i)  // W - W H^T K^T + K R K^T; the last apart, or a wide prior would round it away
         for (int j = 0; j <= i; ++j) {
             const Real left = M[i][j] - WH[i] * K[j] + M[j][i] - WH[j] * K[i];
@@ -137,7 +137,7 @@ struct Residual {
     Instant<Real> time;  // of x and P
     Vector<N, Real> x{};
     Matrix<N, Real> P{};
-    ByDoubt<Vector<N, double>> by{};  // how x changes with lag and gain of the response, by way of measurements
+    ByDoubt<Vector<N, double>> dx{};  // how x changes with lag and gain of the response, by way of measurements
     bool doubted = false;             // whether these are; a likelihood never asks
     Real q = 0.0, drift = 0.0;  // densities squared in force: input noise [m^2 s] and the offset's drift [m^2/s]
     Instant<Real> until;        // commands that change these have been taken into account until then:
@@ -179,20 +179,20 @@ struct Residual {
         time = to;
     }
 
-    // x <- x + K nu and P <- (I - K H) P (I - K H)^T + K R K^T, and `by` likewise. Returns K.
-    Vector<N, Real> update(const Vector<N, Real>& H, const Along<N, Real>& along, Real nu, const ByDoubt<>& d_nu,
-                           Real R) {
+    // x <- x + K nu and P <- (I - K H) P (I - K H)^T + K R K^T, and dx <- dx + K d_nu. Returns K.
+    Vector<N, Real> update(const Vector<N, Real>& H, const Projection<N, Real>& projection, Real nu,
+                           const ByDoubt<>& d_nu, Real R) {
         Vector<N, Real> K;
-        if constexpr (std::is_same_v<Real, double>) K = joseph<N, double>(P, H, along, R);
-        else K = joseph_tangent(P, H, along, R);  // likelihood.hpp
+        if constexpr (std::is_same_v<Real, double>) K = joseph<N, double>(P, H, projection, R);
+        else K = joseph_tangent(P, H, projection, R);  // likelihood.hpp
         for (int i = 0; i < N; ++i) x[i] = x[i] + K[i] * nu;
-        each_doubt([&](auto& one, int k) {
-            for (int i = 0; i < N; ++i) one[i] += K[i] * d_nu[k];
+        each_doubt([&](auto& column, int k) {
+            for (int i = 0; i < N; ++i) column[i] += K[i] * d_nu[k];
         });
         return K;
     }
 
-    Real along(const Vector<N, Real>& h) const {  // h x
+    Real mean(const Vector<N, Real>& h) const {  // h x
         Real sum = 0.0;
         for (int i = 0; i < N; ++i) sum = sum + h[i] * x[i];
         return sum;
@@ -205,14 +205,14 @@ struct Residual {
         return value_of(sum) > 0.0 ? sum : Real(0.0);
     }
 
-    // How a position or a measurement changes, less what h x makes of it: of the response it sees `scale` times.
-    ByDoubt<> left(const ByDoubt<>& by_response, double scale, const Vector<N, Real>& h) const {
-        ByDoubt<> found{};
+    // How far h x errs for each unit of a doubt: by what that changes of `scale` responses, less what x has followed.
+    ByDoubt<> error_by_doubt(const ByDoubt<>& by_response, double scale, const Vector<N, Real>& h) const {
+        ByDoubt<> error{};
         for (int k = 0; doubted && k < DOUBTS; ++k) {
-            found[k] = scale * by_response[k];
-            for (int i = 0; i < N; ++i) found[k] -= value_of(h[i]) * by[k][i];
+            error[k] = scale * by_response[k];
+            for (int i = 0; i < N; ++i) error[k] -= value_of(h[i]) * dx[k][i];
         }
-        return found;
+        return error;
     }
 
     // Towards what a measurement says of the noise before it, by the score of its likelihood. (Creal, Koopman & Lucas,
@@ -263,18 +263,18 @@ struct Residual {
 
     void each_doubt(auto work) {
         if constexpr (std::is_same_v<Real, double>)
-            for (int k = 0; doubted && k < DOUBTS; ++k) work(by[k], k);
+            for (int k = 0; doubted && k < DOUBTS; ++k) work(dx[k], k);
     }
 
     void fade(int i, Real left) {
         x[i] = x[i] * left;
-        each_doubt([&](auto& one, int) { one[i] *= left; });
+        each_doubt([&](auto& column, int) { column[i] *= left; });
         for (int j = 0; j < N; ++j) P[i][j] = P[i][j] * left, P[j][i] = P[j][i] * left;
     }
 
     void move(int i, const Transition<Real>& f) {
         move(x, i, f);
-        each_doubt([&](auto& one, int) { move(one, i, f); });
+        each_doubt([&](auto& column, int) { move(column, i, f); });
         move_pair<N, Real>(P, i, f.f11, f.f12, f.f21, f.f22);
     }
 

@@ -79,10 +79,10 @@ class Whitening {
 // Where an axis goes without noise, relative to its start level, at n instants, with each of some dead times [ns]: those
 // of one arm have its way through the commands in common. Each position follows from the last command. (delays, n).
 inline void respond(const Arm<double>& arm, double start, const std::vector<Time>& delays, Time commands,
-                    const Time* given, const double* command, Time n, const Time* time, double* position) {
+                    const Time* told_at, const double* command, Time n, const Time* time, double* position) {
     Response<double> response;
     response.start = start;
-    if (commands > 0) response.time.ns = given[0];
+    if (commands > 0) response.time.ns = told_at[0];
     constexpr Time NEVER = std::numeric_limits<Time>::max();
     std::vector<Time> next(delays.size(), 0);
     Time due = -NEVER;  // the first instant of a position that is still asked for
@@ -100,8 +100,8 @@ inline void respond(const Arm<double>& arm, double start, const std::vector<Time
         }
     };
     for (Time c = 0; c < commands; ++c) {
-        if (due < given[c]) ask(given[c], c > 0);
-        response.predict(arm, {given[c], 0.0});
+        if (due < told_at[c]) ask(told_at[c], c > 0);
+        response.predict(arm, {told_at[c], 0.0});
         response.command(arm, command[c]);
     }
     ask(NEVER, commands > 0);
@@ -109,7 +109,7 @@ inline void respond(const Arm<double>& arm, double start, const std::vector<Time
 
 // Calls `work` with the first of each arms in a row that differ in their dead times alone, and with these [ns].
 inline void by_delays(Time count, const pf_axis* axis, auto work) {
-    const auto drop_delay = [](pf_axis one) { return one.delay = 0.0, one; };
+    const auto drop_delay = [](pf_axis shape) { return shape.delay = 0.0, shape; };
     for (Time i = 0, end = 0; i < count; i = end) {
         const pf_axis shape = drop_delay(axis[i]);
         std::vector<Time> delays;
@@ -125,17 +125,17 @@ inline void by_delays(Time count, const pf_axis* axis, auto work) {
 // The response at a gain of 1 and what each 1 of gain adds to it, whitened, times one another and times c columns that
 // are, with each of some dead times: products (delays, 2, 2 + c).
 inline void weigh(const pf_axis& axis, const std::vector<Time>& delays, const Whitening& whitening, Time commands,
-                  const Time* given, const double* command, Time n, const Time* time, Time c, const double* whitened,
+                  const Time* told_at, const double* command, Time n, const Time* time, Time c, const double* whitened,
                   double* products) {
     const bool straight = axis.max_speed == 0.0 && axis.play == 0.0 && axis.sag_offset == 0.0 &&
                           axis.sag_slope == 0.0 && axis.sag_slope_beyond == 0.0 && axis.sag_slope_below == 0.0 &&
                           axis.slope == 0.0 && axis.recovery == 0.0;
     std::vector<double> raw[2], plain(n), more(n);
     for (int i = 0; i < (straight ? 1 : 2); ++i) {
-        Axis<double> one = lift<Axis, double>(&axis, 1, {})[0];
-        one.intercept = 1.0 + i;
+        Axis<double> shape = lift<Axis, double>(&axis, 1, {})[0];
+        shape.intercept = 1.0 + i;
         raw[i].resize(delays.size() * n);
-        respond(Arm<double>(one), axis.start, delays, commands, given, command, n, time, raw[i].data());
+        respond(Arm<double>(shape), axis.start, delays, commands, told_at, command, n, time, raw[i].data());
     }
     for (std::size_t d = 0; d < delays.size(); ++d, products += 2 * (2 + c)) {
         whitening(raw[0].data() + d * n, plain.data());

@@ -101,8 +101,8 @@ struct Later {
     // their differences, and in another order a pivot of rounding would be divided by.
     Root root() const {
         constexpr double NOTHING = 1e-15;  // of a pivot, below which it is rounding
-        Root found;
-        auto& [L, y, rank] = found;
+        Root result;
+        auto& [L, y, rank] = result;
         Vector<N, double> left;
         for (int i = 0; i < N; ++i) left[i] = M[i][i];
         for (int& k = rank; k < N; ++k) {
@@ -124,7 +124,7 @@ struct Later {
                 L[k][i] /= L[k][pivot], left[i] -= L[k][i] * L[k][i];
             }
         }
-        return found;
+        return result;
     }
 };
 
@@ -145,19 +145,19 @@ void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& h
     Later<N, COLUMNS> later;
     Time k = n - 1;
     const auto smooth_back = [&] {  // estimate k, and on to the one before
-        double found[PF_OUTPUTS];
+        double numbers[PF_OUTPUTS];
         auto& [r, doubt, residual] = at[k * A + a];
         later.smooth(residual);
-        Filter<N>::describe(axis, r, doubt, residual, found);
-        for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = found[i];
+        Filter<N>::describe(axis, r, doubt, residual, numbers);
+        for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = numbers[i];
         --k;
     };
     while (k >= 0 && (history.empty() || times[k] >= history.back().time)) smooth_back();  // nothing is later
     for (auto entry = history.rbegin(); entry != history.rend(); ++entry) {
         if (entry->sensor != NOBODY) later.over_update(filter.H[entry->sensor * A + a], *entry);
-        Time here = entry->time;
-        const auto back_to = [&](Time there) {
-            const double dt = double(std::exchange(here, there) - there) / 1e9;
+        Time from = entry->time;
+        const auto back_to = [&](Time to) {
+            const double dt = double(std::exchange(from, to) - to) / 1e9;
             if (dt > 0.0) later.over_interval(axis.arm, axis.noise, dt, entry->q, entry->drift, entry->scale);
         };
         const Time before = entry + 1 != history.rend() ? entry[1].time : origin;

@@ -12,7 +12,7 @@ struct pf_live {
     pf_port port{};
 
     virtual ~pf_live() = default;
-    virtual bool add(std::int64_t stamp, int source, std::uint64_t given, std::int64_t oldest) = 0;
+    virtual bool add(std::int64_t stamp, int source, std::uint64_t bits, std::int64_t oldest) = 0;
     virtual void estimate(std::int64_t time, std::int64_t after, double* outputs, std::int64_t* fused) = 0;
     virtual void read(std::int64_t begin, std::int64_t end, std::int64_t* stamp, std::int16_t* source,
                       const pf_results& results) const = 0;
@@ -38,10 +38,10 @@ class Window final : public pf_live {
                 rows.room(), 0, 0};
     }
 
-    bool add(Time stamp, int source, std::uint64_t given, Time oldest) override {
+    bool add(Time stamp, int source, std::uint64_t bits, Time oldest) override {
         port.contradicts = NOBODY;
         const bool taken = has_room(source == PF_COMMAND ? size() : 1, stamp, oldest);
-        if (taken) source == PF_COMMAND ? add_command(stamp, given) : add_measurement(stamp, source, given);
+        if (taken) source == PF_COMMAND ? add_command(stamp, bits) : add_measurement(stamp, source, bits);
         run(target);
         port.room = rows.room(), port.begin = begin, port.end = end;
         return taken;
@@ -208,8 +208,8 @@ class Window final : public pf_live {
         return true;
     }
 
-    void add_measurement(Time stamp, int sensor, std::uint64_t given) {
-        const Time row = insert(stamp - nanoseconds(model.sensors[sensor].latency), sensor, stamp, given);
+    void add_measurement(Time stamp, int sensor, std::uint64_t bits) {
+        const Time row = insert(stamp - nanoseconds(model.sensors[sensor].latency), sensor, stamp, bits);
         const bool duplicate = repeats_earlier(rows, row, begin, int(size()));
         for (Time a = 0; a < size(); ++a)
             port.outcome[a] = rows[row].known[a] = classify(row, a, duplicate ? PF_DUPLICATE : PF_FUSED);
@@ -223,13 +223,13 @@ class Window final : public pf_live {
     }
 
     // A row for each delay of the axes that a command moves.
-    void add_command(Time stamp, std::uint64_t given) {
+    void add_command(Time stamp, std::uint64_t bits) {
         std::fill_n(port.outcome, size(), Code(PF_ABSENT));
         for (Time a = 0; a < size(); ++a) {
-            if (!(given >> a & 1)) continue;
+            if (!(bits >> a & 1)) continue;
             std::uint64_t together = 0;
-            for (Time b = a; b < size(); ++b) together |= delay(b) == delay(a) ? given & std::uint64_t(1) << b : 0;
-            given &= ~together;
+            for (Time b = a; b < size(); ++b) together |= delay(b) == delay(a) ? bits & std::uint64_t(1) << b : 0;
+            bits &= ~together;
             const Time time = stamp + delay(a), row = insert(time, PF_COMMAND, stamp, together);
             const bool duplicate = repeats_earlier(rows, row, begin, int(size()));
             if (duplicate) remove(row);
@@ -273,9 +273,9 @@ class Window final : public pf_live {
         }
     }
 
-    // Put the axes of the port that are bits of `given` in their place: by time, then source, then stamp; of those
-    // alike the new one is the last. Returns the row.
-    Time insert(Time time, int source, Time stamp, std::uint64_t given) {
+    // Insert a row with the axes of the port that are in `bits`: by time, then source, then stamp; of equals the new
+    // one is the last. Returns the row.
+    Time insert(Time time, int source, Time stamp, std::uint64_t bits) {
         Time row = end;
         for (; row > begin; --row) {
             const Event other = rows[row - 1];
@@ -287,7 +287,7 @@ class Window final : public pf_live {
         Row& entry = rows.at(row);
         entry.time = time, entry.stamp = stamp, entry.source = source;
         std::copy_n(numbers.begin(), 2 * size(), entry.numbers.begin());
-        for (Time a = 0; a < size(); ++a) entry.codes[a] = given >> a & 1 ? PF_FUSED : PF_ABSENT;
+        for (Time a = 0; a < size(); ++a) entry.codes[a] = bits >> a & 1 ? PF_FUSED : PF_ABSENT;
         return row;
     }
 
