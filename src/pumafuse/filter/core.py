@@ -101,27 +101,27 @@ _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double
 
 
 def _load() -> ctypes.CDLL:
-    """The library, of this version."""
-    again = "install pumafuse again (in a checkout: make .venv/.ready)"
+    """The library, if it is of this version."""
+    fix = "install pumafuse again (in a checkout: make .venv/.ready)"
     try:
-        library, held = ctypes.CDLL(str(LIBRARY)), ctypes.PyDLL(str(LIBRARY))
+        library, with_interpreter = ctypes.CDLL(str(LIBRARY)), ctypes.PyDLL(str(LIBRARY))
         if (version := library.pf_version()) != VERSION:
-            raise PumafuseError(f"{LIBRARY}: the filter's core has interface {version}, this is for {VERSION}: {again}")
+            raise PumafuseError(f"{LIBRARY}: the filter's core has interface {version}, this is for {VERSION}: {fix}")
         library.pf_error.restype = ctypes.c_char_p
         for name, (result, *arguments) in _FUNCTIONS.items():
-            function = getattr(held if name.startswith("live_") else library, f"pf_{name}")
+            function = getattr(with_interpreter if name.startswith("live_") else library, f"pf_{name}")
             function.restype, function.argtypes = _KINDS.get(result), [_KINDS[argument] for argument in arguments]
             setattr(library, f"pf_{name}", function)
     except (OSError, AttributeError) as error:
-        raise PumafuseError(f"{LIBRARY}: the filter's core does not load ({error}): {again}") from None
+        raise PumafuseError(f"{LIBRARY}: the filter's core does not load ({error}): {fix}") from None
     return library
 
 
 library = _load()
 
 
-def at(array: np.ndarray) -> int:
-    """Where an array begins in memory; it must lie there as a whole, and have a name for as long as that is used."""
+def ptr(array: np.ndarray) -> int:
+    """Where a contiguous array is in memory; the array must have a name for as long as the core uses it."""
     assert array.flags.c_contiguous
     return array.ctypes.data
 
@@ -134,25 +134,25 @@ def check(result: Any) -> Any:
 
 
 def struct_of(model: Model) -> ctypes.Structure:
-    """A model as the core takes it, whose arrays must live as long."""
-    return _Model(len(model.axis), len(model.sensor), *map(at, model))
+    """A model as the core takes it; its arrays must live as long."""
+    return _Model(len(model.axis), len(model.sensor), *map(ptr, model))
 
 
-def fates(results: Results) -> Any:
-    """Results as the core fills them, whose arrays must live as long."""
-    return ctypes.byref(_Results(*map(at, results)))
+def struct_of_results(results: Results) -> Any:
+    """Results as the core fills them; their arrays must live as long."""
+    return ctypes.byref(_Results(*map(ptr, results)))
 
 
 def _tables(events: Events, results: Results) -> tuple[Any, Any]:
-    return ctypes.byref(_events_of(events)), fates(results)
+    return ctypes.byref(_struct_of_events(events)), struct_of_results(results)
 
 
-def _events_of(events: Events) -> ctypes.Structure:
-    return _Events(len(events.time), *(at(part) * (len(part) > 0) for part in events))
+def _struct_of_events(events: Events) -> ctypes.Structure:
+    return _Events(len(events.time), *(ptr(part) * (len(part) > 0) for part in events))
 
 
 class Handle:
-    """What the core has made; freed with this. It is no copy's."""
+    """Owner of an object of the core, which is freed with it; it cannot be copied."""
 
     _free: Any
 
@@ -197,8 +197,8 @@ class Filter(Handle):
             Outputs by :class:`Output`, axis and time, (8, A, n).
         """
         outputs, (table, rows) = np.zeros((len(Output), self._axes, len(times))), _tables(events, results)
-        ends, when = span or (0, len(events.time)), None if asked is None else at(asked)
-        wanted = len(times), at(times), when, at(outputs)
+        ends, when = span or (0, len(events.time)), None if asked is None else ptr(asked)
+        wanted = len(times), ptr(times), when, ptr(outputs)
         check(library.pf_filter_run(self._core, _MODES.index(mode), table, *ends, rows, *wanted))
         return outputs
 
@@ -221,7 +221,7 @@ def linearise(
     """
     d_nu, d_s = np.zeros((2, len(tangents), *events.codes.shape))
     models = struct_of(model), (_Model * len(tangents))(*map(struct_of, tangents))
-    tables = *_tables(events, results), at(d_nu), at(d_s)
+    tables = *_tables(events, results), ptr(d_nu), ptr(d_s)
     check(library.pf_linearise(*map(ctypes.byref, models), len(tangents), origin, *tables))
     return d_nu, d_s
 
@@ -232,15 +232,15 @@ def classify(model: Model, events: Events, origin: int, too_late: BoolArray) -> 
     ``origin`` is the first command's stamp [ns]; rows that are ``too_late``, (n,), come far behind earlier ones.
     """
     codes = np.empty_like(events.codes)
-    structs = ctypes.byref(struct_of(model)), ctypes.byref(_events_of(events))
-    check(library.pf_classify(*structs, origin, at(too_late), at(codes)))
+    structs = ctypes.byref(struct_of(model)), ctypes.byref(_struct_of_events(events))
+    check(library.pf_classify(*structs, origin, ptr(too_late), ptr(codes)))
     return codes
 
 
 def transition(axis: Record, dt: float) -> FloatArray:
     """What an axis (1,) does over ``dt`` [s]: see ``pf_transition``, (17,)."""
     numbers = np.empty(17)
-    library.pf_transition(at(axis), dt, at(numbers))
+    library.pf_transition(ptr(axis), dt, ptr(numbers))
     return numbers
 
 
@@ -248,5 +248,5 @@ def constant_velocity(
     time: FloatArray, value: FloatArray, density: FloatArray, square: FloatArray, innovation: FloatArray | None = None
 ) -> None:
     """Constant-velocity filters with R = 1 on measurements (n,): see ``pf_constant_velocity``."""
-    kept = None if innovation is None else at(innovation)
-    library.pf_constant_velocity(len(time), at(time), at(value), len(density), at(density), at(square), kept)
+    kept = None if innovation is None else ptr(innovation)
+    library.pf_constant_velocity(len(time), ptr(time), ptr(value), len(density), ptr(density), ptr(square), kept)

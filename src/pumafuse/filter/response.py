@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import ALWAYS, FloatArray, TimeArray
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
-from .core import AXIS, MOTION, Record, at, check, library
+from .core import AXIS, MOTION, Record, check, library, ptr
 
 
 def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Record:
@@ -39,8 +39,8 @@ def response(
     position = np.empty(len(time))
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
     record = record_of(axis, period, delay, start)
-    commands, asked = (len(told_at), at(told_at), at(command)), (len(time), at(time), at(position))
-    check(library.pf_response(1, at(record), *commands, *asked))
+    commands, asked = (len(told_at), ptr(told_at), ptr(command)), (len(time), ptr(time), ptr(position))
+    check(library.pf_response(1, ptr(record), *commands, *asked))
     return position
 
 
@@ -59,5 +59,6 @@ def follow(axis: Record, motion: Record, told_at: TimeArray, command: FloatArray
     [m] relative to the level of its rest is ``told_at`` at int64 ns, ascending, (k,); ``time`` likewise, (n,).
     """
     position = np.empty(len(time))
-    library.pf_follow(at(axis), at(motion), len(told_at), at(told_at), at(command), len(time), at(time), at(position))
+    commands, asked = (len(told_at), ptr(told_at), ptr(command)), (len(time), ptr(time), ptr(position))
+    library.pf_follow(ptr(axis), ptr(motion), *commands, *asked)
     return position

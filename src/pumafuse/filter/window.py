@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from ..arrays import NEVER, FloatArray, IndexArray, TimeArray
-from .core import Handle, Model, Output, at, check, fates, library, struct_of
+from .core import Handle, Model, Output, check, library, ptr, struct_of, struct_of_results
 from .events import Results
 
 MOST_ROWS = 65_536  # places for events
@@ -61,7 +61,7 @@ class Window(Handle):
         self.outcome = codes.from_address(port.outcome)
         self.innovation = numbers.from_address(port.innovation)
         self._outputs, self._fused = np.zeros((len(Output), len(model.axis))), np.zeros(len(model.axis), dtype=np.int64)
-        self._answer = at(self._outputs), at(self._fused)
+        self._answer = ptr(self._outputs), ptr(self._fused)
 
     @property
     def origin(self) -> int | None:
@@ -93,7 +93,7 @@ class Window(Handle):
         """Stamps [ns], sources and what became of some rows; those before the window's stay for ``room`` / 16 more."""
         stamp, source = np.empty(end - begin, dtype=np.int64), np.empty(end - begin, dtype=np.int16)
         results = Results.room(end - begin, len(self.value))
-        library.pf_live_read(self._core, begin, end, at(stamp), at(source), fates(results))
+        library.pf_live_read(self._core, begin, end, ptr(stamp), ptr(source), struct_of_results(results))
         return stamp, source, results
 
     def forget(self, after: int) -> None:
@@ -105,4 +105,4 @@ class Window(Handle):
 
         Their values and spreads as put in and as they are ``now`` are (n, 2 A); what had others stays as it is.
         """
-        library.pf_live_amend(self._core, sensor, len(stamp), at(stamp), at(before), at(now))
+        library.pf_live_amend(self._core, sensor, len(stamp), ptr(stamp), ptr(before), ptr(now))

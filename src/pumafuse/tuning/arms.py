@@ -18,7 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
-from ..filter.core import AXIS, Record, at, check, library
+from ..filter.core import AXIS, Record, check, library, ptr
 from ..filter.response import record_of
 from ..model.arm import AxisModel, Gain, Sag
 from ..model.plants import FirstOrder, SecondOrder
@@ -382,9 +382,9 @@ class Measured:
             products_here, record = np.empty_like(products), self._noise_record(noise)
             variance = self._variance(recording, noise)
             records["start"] = recording.start
-            rows = len(recording.time), at(recording.time), at(variance), c, at(white)
-            commands = len(recording.told), at(recording.told), at(recording.command)
-            check(library.pf_weigh(at(record), *rows, *commands, len(arms), at(records), at(products_here)))
+            rows = len(recording.time), ptr(recording.time), ptr(variance), c, ptr(white)
+            commands = len(recording.told), ptr(recording.told), ptr(recording.command)
+            check(library.pf_weigh(ptr(record), *rows, *commands, len(arms), ptr(records), ptr(products_here)))
             products += products_here
         every = np.zeros((len(arms), 2 + c, 2 + c))  # products of plain response, gain, measurements and biases
         every[:, :2], every[:, :, :2], every[:, 2:, 2:] = products, products.swapaxes(1, 2), columns_alone
@@ -547,9 +547,9 @@ class Measured:
         for recording in self.recordings:
             records["start"] = recording.start
             moved = np.empty((len(arms), len(recording.time)))
-            commands = len(recording.told), at(recording.told), at(recording.command)
-            asked = len(recording.time), at(recording.time), at(moved)
-            check(library.pf_response(len(arms), at(records), *commands, *asked))
+            commands = len(recording.told), ptr(recording.told), ptr(recording.command)
+            asked = len(recording.time), ptr(recording.time), ptr(moved)
+            check(library.pf_response(len(arms), ptr(records), *commands, *asked))
             responses.append(moved)
         return responses
 
@@ -581,8 +581,8 @@ class Measured:
         record, variance, white, log = (
             self._noise_record(noise), self._variance(recording, noise), np.empty_like(columns), np.empty(1)
         )  # fmt: skip
-        rows = len(recording.time), at(recording.time), at(variance)
-        check(library.pf_whiten(at(record), *rows, len(columns), at(columns), at(white), at(log)))
+        rows = len(recording.time), ptr(recording.time), ptr(variance)
+        check(library.pf_whiten(ptr(record), *rows, len(columns), ptr(columns), ptr(white), ptr(log)))
         return white, float(log[0])
 
 
