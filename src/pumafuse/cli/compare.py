@@ -97,7 +97,7 @@ def run(paths: Sequence[Path], reference: Path | None, json: bool, tum: Path | N
 
 
 def _differences(first: Result, other: Result) -> dict[str, Difference]:
-    """By axis of both; none of the first itself, nor of another run."""
+    """Differences by axis of both; none of the first itself, nor of another run."""
     same = first.summary.run == other.summary.run and first.summary.origin_ns == other.summary.origin_ns
     if other is first or not same or first.segment.any() or other.segment.any():
         return {}
@@ -164,7 +164,7 @@ def _shared_means(each: Sequence[Mapping[str, float]]) -> list[float] | None:
 
 
 def _count_measured(result: Result) -> dict[tuple[str, str], tuple[int, float | None]]:
-    """By axis and sensor how many components were fused or rejected, and by which gate."""
+    """How many components were fused or rejected, and by which gate, by axis and sensor."""
     gates = {name: sensor.gate for name, sensor in result.config.sensors.items()}
     return {
         (axis, name): (

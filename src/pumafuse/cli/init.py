@@ -112,7 +112,7 @@ def _part_row(part: Part) -> list[str]:
 
 
 def _described_rows(survey: Survey) -> list[list[str]]:
-    """Of a log whose run.toml says what is where."""
+    """Rows of a log whose run.toml says what is where."""
     sources = {"command": survey.run.command, **survey.run.measured}
     return [
         [printable(source.label_for(name)), "", str(len(source.stamp)), *_rate(source.stamp), "run.toml", ""]

@@ -144,7 +144,7 @@ def outcome_table(summary: Summary, kind: Kind) -> Table:
 
 
 def left_out_words(summary: Summary) -> str:
-    """In words how many rows of which source the filter was not given, and why; empty where it was given all."""
+    """How many rows of which source the filter was not given, and why, in words; empty where it was given all."""
     sources = [("commands", summary.commands), *summary.rows.items()]
     return "; ".join(
         f"{', '.join(f'{count} {word}' for word, count in without.items())} of {sum(counts.values())} {name}"

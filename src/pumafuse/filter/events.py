@@ -49,7 +49,7 @@ class Events(NamedTuple):
         return Events(time, np.zeros(events, dtype=np.int16), time.copy(), table, np.zeros((0, axes)), codes)
 
     def rows(self, chosen: IntArray | slice) -> Events:
-        """Some of the events, in the order of ``chosen``."""
+        """The events that are ``chosen``, in that order."""
 
         def of(part: np.ndarray) -> np.ndarray:
             return part[chosen] if isinstance(chosen, slice) else part.take(chosen, axis=0)  # twice as fast

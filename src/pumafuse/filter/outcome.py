@@ -24,5 +24,5 @@ class Outcome(enum.IntEnum):
 
     @property
     def word(self) -> str:
-        """As files and screens have it."""
+        """The word for it in files and on screens."""
         return self.name.lower()

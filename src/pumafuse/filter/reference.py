@@ -67,7 +67,7 @@ class Bent:
         self.follows = 2.0 * float(axis["damping"] * axis["natural_frequency"])  # how fast the speed does [1/s]
 
     def speed(self, state: FloatArray, goal: float) -> float:
-        """Of the drive: a plant of first order has the speed that it is asked for."""
+        """Speed of the drive: a plant of first order has the speed that it is asked for."""
         asked = min(max((goal - state[0]) / self.lag, -self.fastest), self.fastest)
         return float(asked if len(state) == 1 else state[1])
 
@@ -193,7 +193,7 @@ class Axis:
         self.step = step
 
     def innovation(self, s: int, z: float, spread: float) -> Innovation:
-        """Of a measurement [m] of sensor ``s``, whose noise is scaled by ``spread``."""
+        """ν and S of a measurement [m] of sensor ``s``, whose noise is scaled by ``spread``."""
         sensor, view, H, x, P = self.sensors[s], self.views[s], self.H[s], self.kf.x, self.kf.P
         position, speed = self.bend()
         R = (spread * view["sd"]) ** 2 + (sensor["scale"] * (self.speed @ x + speed) * sensor["latency_sd"]) ** 2
@@ -226,7 +226,7 @@ class Axis:
         return np.array((-(self.speed @ self.path + speed), self.h @ self.path + position))
 
     def bend(self) -> FloatArray:
-        """By how much position and speed are not what the path says, (2,)."""
+        """How far position and speed are from what the path says, (2,)."""
         if self.bent is None:
             return np.zeros(2)
         goal = float(self.path[self.u] + self.path[self.e])
@@ -244,7 +244,7 @@ class Axis:
         return apart <= sensor["gate"] * math.sqrt(before.R + now.R + sensor["scale"] ** 2 * motion)
 
     def variance_of_motion(self, F: FloatArray, Q: FloatArray) -> float:
-        """Of how far the position moves over an interval [m²]."""
+        """Variance of the way that the position moves over an interval [m²]."""
         row = self.h @ (F - self.unit)
         return float(row @ self.kf.P @ row + self.h @ Q @ self.h)
 

@@ -292,14 +292,14 @@ class _Part:
 
     @cached_property
     def speed(self) -> FloatArray:
-        """Of where commands lead, over two update periods [m/s or rad/s], (m,)."""
+        """Speed of where commands lead, over two update periods [m/s or rad/s], (m,)."""
         ns = round(self.config.arm.update_period * 1e9)
         late, early = (self.position(self.config.arm.axes[self.axis], self.time + by) for by in (ns, -ns))
         return 0.5e9 / ns * (late - early)
 
     @property
     def sensors(self) -> list[int]:
-        """Those that measure."""
+        """The sensors that measure."""
         return np.flatnonzero(np.bincount(self.measured.sensor)).tolist()  # numpy's unique imports masked arrays
 
     def position(self, model: AxisModel, time: TimeArray) -> FloatArray:
@@ -441,7 +441,7 @@ def _sensors(part: _Part, base: Model) -> Iterator[tuple[Tried, Model]]:
 
 
 def _jitters(part: _Part, base: Model) -> Iterator[tuple[Tried, FloatArray]]:
-    """By what the noise of each component is scaled if the latency of a sensor scatters, (m,)."""
+    """Factors on the noise of each component, (m,), if the latency of one sensor scatters by one size."""
     moved = np.abs(part.scale * part.speed)
     for number in part.sensors:
         noise = moved * (part.measured.sensor == number) / (part.measured.spread * base.view["sd"][number, 0])

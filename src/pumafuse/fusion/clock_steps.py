@@ -53,12 +53,12 @@ class ClockStep(NamedTuple):
 
     @property
     def change(self) -> float:
-        """By how much later the sensor follows the commands [s]."""
+        """How much later the sensor follows the commands [s]."""
         return self.after - self.before
 
     @property
     def by(self) -> float:
-        """By how much the clock was set ahead [s]: what stamps leap by, less the rows that were lost meanwhile."""
+        """How far the clock was set ahead [s]: what stamps leap by, less the rows that were lost meanwhile."""
         lost = round((self.leap.by - self.change) / self.leap.usual)
         return self.leap.by - lost * self.leap.usual
 
@@ -170,7 +170,7 @@ def _is_following(unexplained: FloatArray) -> bool:
 
 
 def _gain(unexplained: FloatArray, shift_here: float, other: float) -> float:
-    """By how much more is left about another lateness than at its own [s], log.
+    """How much more is left about another lateness [s] than at the best, as a logarithm.
 
     About: within a third of the way, as a motion that repeats itself looks alike at another lateness.
     """

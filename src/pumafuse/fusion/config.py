@@ -59,7 +59,7 @@ class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return default if self.offset_sd is None else of_axis(self.offset_sd, axis, default)
 
     def of_arm(self, arm: ArmModel) -> Start:
-        """The same with a number for every axis: one, where it is the same for all."""
+        """The start with a number for every axis: one, where it is the same for all."""
         each = {axis: self.offset_sd_of(axis, axis_model.kind) for axis, axis_model in arm.axes.items()}
         return Start(offset_sd=each if len(set(each.values())) > 1 else next(iter(each.values())))
 

@@ -92,7 +92,7 @@ def innovation_derivatives(
     outcome: CodeArray,
     beside: Sequence[tuple[FusionConfig, float]],
 ) -> tuple[Results, FloatArray, FloatArray]:
-    """The same, with derivatives of ν and of S by k parameters, (k, m, A) each.
+    """Innovations as of :func:`innovations`, and derivatives of ν and of S by k parameters, (k, m, A) each.
 
     ``beside`` has, for each, a configuration with another value of it, and by how much that is more: the numbers of a
     model are linear in it.
@@ -120,7 +120,7 @@ def model_of(segment: Segment, config: FusionConfig) -> Model:
 
 
 def _drop_doubts(model: Model) -> Model:
-    """The same without error bars of lag and gain, which depend on the numbers that are fitted and change no ν."""
+    """The model without error bars of lag and gain, which depend on the numbers that are fitted and change no ν."""
     model.axis["lag_sd"] = model.axis["gain_sd"] = 0.0
     return model
 
@@ -141,7 +141,7 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
 
 
 def _allocate_results(events: Events) -> Results:
-    """Room for what becomes of events: until a filter decides what was known of them."""
+    """Room for what becomes of events, which begins with their codes."""
     results = Results.room(*events.codes.shape)
     results.outcome[:] = events.codes
     return results

@@ -207,7 +207,7 @@ class Estimates:
 
     @property
     def positions(self) -> dict[str, FloatArray]:
-        """Of each axis [m or rad], (n,)."""
+        """Positions of each axis [m or rad], (n,)."""
         return {axis: estimate.position for axis, estimate in self.axes.items()}
 
     @property

@@ -92,7 +92,7 @@ def check_sensors(segment: Segment, config: FusionConfig) -> list[Fault]:
 
 
 def by_axis(faults: Iterable[Fault]) -> dict[tuple[str, str], str]:
-    """By sensor and axis why measurements are not where the commands lead; a constant by which they are off apart."""
+    """Why measurements are not where the commands lead, by sensor and axis; a constant by which they are off apart."""
     return {
         (name, axis): fault.cause
         for fault in faults
@@ -558,7 +558,7 @@ def _find_turned_frames(
 def _find_turned_frame(
     segment: Segment, config: FusionConfig, positions: Mapping[str, Rows], axes: Sequence[str]
 ) -> tuple[float, float, float] | None:
-    """By how much a sensor is turned [rad], and how far its moves are from the response's as it is and turned back [m].
+    """How far a sensor is turned [rad], and how far its moves are from the response's as it is and turned back [m].
 
     None where it is not turned surely. Moves of a second are compared, as noise that wanders is no turn. Where the
     response is late is none either: its speed and a constant are fitted beside it.

@@ -13,7 +13,7 @@ from .segments import WHOLE, Segment, owned_rows
 
 
 class Overrun(NamedTuple):
-    """Those among the commands of an axis."""
+    """Commands of an axis that ask for more than the fastest speed that it goes."""
 
     commands: int  # how many commands there are
     beyond: int  # how many of them ask for more
@@ -23,7 +23,7 @@ class Overrun(NamedTuple):
 
 
 def overruns(segment: Segment, arm: ArmModel, span: tuple[int, int] = WHOLE) -> dict[str, Overrun]:
-    """Of each axis with a fastest speed, among its commands after and until the instants ``span`` [int ns]."""
+    """Overruns of each axis with a fastest speed, by its commands after and until the instants ``span`` [int ns]."""
     by_axis = dict[str, Overrun]()
     for axis in segment.axes:
         if (limit := arm.axes[axis].max_speed) is not None:

@@ -85,7 +85,7 @@ class Placing:
         return rotations.product(rotations.product(self._turn, measured), self._back)
 
     def lever(self, tool: FloatArray) -> FloatArray:
-        """From the tool point to what it sees [m], by the tool's orientation, (n, 4) → (n, 3)."""
+        """The way from the tool point to what it sees [m], by the tool's orientation, (n, 4) → (n, 3)."""
         return rotations.rotate(tool, self._marker)
 
     def spread(self, lever: FloatArray) -> dict[str, FloatArray]:

@@ -56,7 +56,7 @@ class Result:
     reference: ReferenceTrack | None  # its ``reference.parquet``, if there is one
 
     def positions(self, config: FusionConfig) -> dict[str, FloatArray]:
-        """Of each axis [m or rad], (n,); rx, ry, rz relative to the orientation at which they are 0 by ``config``."""
+        """Positions by axis [m or rad], (n,); rx, ry, rz relative to the reference orientation of ``config``."""
         position = {axis: estimate.position for axis, estimate in self.axes.items()}
         turned = orientation(position, self.config) if config.tool != self.config.tool else None
         return position if turned is None else position | relative_to(turned, config)

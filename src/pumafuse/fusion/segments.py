@@ -105,7 +105,7 @@ class Segment:
         return self._order(config)[0]
 
     def _order(self, config: FusionConfig) -> tuple[Events, IntArray]:
-        """Events in their order, and that: of commands one for each group of axes that share a delay."""
+        """The events by time, a command once for each delay of its axes; and the order that sorts them."""
         delay, rows, measured = self._delay(config), self.command_rows, self.measurement_rows
         parts, shift = list[Events](), list[IntArray]()
         for group in sorted(set(delay.tolist())):
@@ -119,8 +119,13 @@ class Segment:
         return unordered._replace(time=time).rows(order), order
 
     def _delay(self, config: FusionConfig) -> IntArray:
-        """Of each axis, int ns."""
+        """Dead time of each axis, int ns."""
         return np.array([round(config.arm.delay_of(axis) * 1e9) for axis in self.axes])
+
+    def _latency(self, config: FusionConfig) -> IntArray:
+        """Latency of each sensor, int ns."""
+        latency = [config.sensors[name].latency if name in config.sensors else 0.0 for name in self.sensors]
+        return np.rint(np.array(latency) * 1e9).astype(np.int64)
 
     def commands_of(self, axis: str) -> tuple[TimeArray, FloatArray]:
         """Stamps [int64 ns] and values [m] of the commands of one axis, (n,)."""
@@ -201,11 +206,6 @@ class Segment:
         order = np.argsort(rows.stamp)
         first = np.minimum.accumulate(np.append(rows.arrival[order], NEVER)[::-1])[::-1]
         return first.take(np.searchsorted(rows.stamp[order], times, side="right")) - 1
-
-    def _latency(self, config: FusionConfig) -> IntArray:
-        """Of each sensor, int ns."""
-        latency = [config.sensors[name].latency if name in config.sensors else 0.0 for name in self.sensors]
-        return np.rint(np.array(latency) * 1e9).astype(np.int64)
 
 
 def build_segment(
@@ -338,7 +338,7 @@ def _check_axes(run: Run, arm: ArmModel) -> None:
 
 
 def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -> Model:
-    """What decides on values before the filter does; every axis has begun."""
+    """The model by which values are classified before the filter runs; every axis has a start level."""
     return filter_model(config, axes, sensors, dict.fromkeys(axes, 0.0))
 
 
@@ -520,7 +520,7 @@ def _build_table(
 
 
 def best_of(codes: CodeArray) -> CodeArray:
-    """Of each row the outcome of the value that got farthest, (n,)."""
+    """The outcome of each row that got farthest, (n,)."""
     return reduce(np.minimum, codes.T)
 
 

@@ -52,7 +52,7 @@ def _axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, flo
 def _sensors_of(
     config: FusionConfig, axes: Sequence[str], names: Sequence[str], biased: Sequence[Sequence[str]] | None
 ) -> tuple[Record, Record]:
-    """What it knows of sensors, (S,), and of what each sees of axes, (S, A), with biases as in :func:`filter_model`."""
+    """What the filter knows of sensors, (S,), and of what each sees of axes, (S, A); biases as :func:`filter_model`."""
     sensor, view = np.zeros(len(names), SENSOR), np.zeros((len(names), len(axes)), VIEW)
     view["sd"], view["bias_time"], sensor["scale"] = np.nan, 1.0, 1.0
     for row, name in enumerate(names):
@@ -81,7 +81,7 @@ def _sd_of(ci95: Interval | None, value: float) -> float:
 
 
 def _gain_sd_of(axis: AxisModel) -> float:
-    """That of the gain, of 1: a share of the distance. A gain that recovers makes no distance, but a lag."""
+    """The standard deviation of the gain as a share of it; 0 of one that recovers: it makes a lag, no distance."""
     intercept = axis.gain.intercept
     if axis.gain_recovery is not None or intercept == 0.0:
         return 0.0

@@ -57,7 +57,7 @@ class Skill(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def best_other(self) -> tuple[str, float]:
-        """Of the simpler ways the one with the smallest RMS error, in words, and that error [m or rad]."""
+        """The simpler way with the smallest RMS error, in words, and that error [m or rad]."""
         ways = {
             "the last measurement": self.last_held,
             "a constant velocity": self.constant_velocity,

@@ -106,7 +106,7 @@ class ScoreSummary(Score, frozen=True, kw_only=True):
 
     @property
     def nees_mean(self) -> float | None:
-        """As the file calls it."""
+        """The mean NEES, as the file calls it."""
         return self.nees
 
 

@@ -168,7 +168,7 @@ def in_words(suspect: Suspect, consistency: Consistency) -> str:
 
 
 def _factor(size: float) -> str:
-    """By what a noise is to be multiplied."""
+    """How far a noise is off that is to be multiplied by ``size``, in words."""
     small, times = ("small", size) if size > 1.0 else ("large", 1.0 / size if size else math.inf)
     return f"too {small}" + ("" if math.isinf(times) else f" by a factor of {times:.2g}")
 

@@ -71,7 +71,7 @@ class Batch:
         return Batch(time, position, weight, np.array(count, dtype=np.float64))
 
     def take(self, rows: IntArray) -> Batch:
-        """Some of the rows, repeated where an index is repeated."""
+        """The trials of ``rows``, repeated where these repeat one."""
         return Batch(self.time[rows], self.position[rows], self.weight[rows], self.count[rows])
 
     def project(self, values: FloatArray) -> FloatArray:

@@ -89,7 +89,7 @@ class StepFit:
 
     @property
     def lag_ci95(self) -> Interval:
-        """Its 95 % interval [s], by the covariance of both; they are known much better together than each."""
+        """The 95 % interval of the lag [s], by the covariance of its parts: the sum is known much better than each."""
         half = self._t * float(np.sqrt(self.covariance[:2, :2].sum()))
         return self.lag - half, self.lag + half
 

@@ -313,7 +313,7 @@ def _recovers(model: ModelFit, recovering: ModelFit, recovery: float, kind: Kind
 
 
 def speeds(measured: Measured) -> FloatArray:
-    """Of the commands of a run that move [m/s or rad/s]."""
+    """Speeds of the commands of a run that move [m/s or rad/s]."""
     steps = np.diff(measured.recordings[0].command)
     return commanded_speed(steps[steps != 0.0], measured.period)
 

@@ -225,7 +225,7 @@ class SetBack:
         return self._sources[-1].in_a_row
 
     def of_all(self) -> float:
-        """By how much all clocks were set back [ns], once that shows; else 0."""
+        """How far all clocks were set back [ns], once that shows; else 0."""
         *sensors, commands = self._sources
         went_on = any(sensor.has_gone_on(commands.since) and commands.back > sensor.usual > 0.0 for sensor in sensors)
         went_back = any(sensor.has_gone_back(commands.since) for sensor in sensors)
@@ -233,7 +233,7 @@ class SetBack:
         return commands.back if shows else 0.0
 
     def of_sensor(self, sensor: int) -> float:
-        """By how much the clock of a sensor alone was set back [ns], once, when that shows; else 0."""
+        """How far the clock of a sensor alone was set back [ns], once, when that shows; else 0."""
         clock, commands = self._sources[sensor], self._sources[-1]
         if clock.in_a_row < _ROWS or clock.told == clock.since or not commands.has_gone_on(clock.since):
             return 0.0

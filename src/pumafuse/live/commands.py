@@ -58,7 +58,7 @@ class Commands:
         return max(high - low, 0.0)
 
     def latest(self) -> list[tuple[int, float, float] | None]:
-        """Of each axis stamp [ns], value and step [m] of its latest command; None before any."""
+        """Stamp [ns], value and step [m] of the latest command of each axis; None before any."""
         return [self._latest(axis, told) if told else None for axis, told in enumerate(self._told)]
 
     def forget(self, after: int) -> None:

@@ -272,7 +272,7 @@ class LiveEstimator:
         return self._tool.to_tool(sensor, stamp_of(t), parsed).values
 
     def _estimate(self, at: Time | None, after: int) -> LiveEstimate:
-        """The same by nothing that is stamped after ``after`` [ns]."""
+        """Where the tool is, by nothing that is stamped after ``after`` [ns]."""
         newest = self._clock.newest
         now = 0 if newest is None else self._clock.now
         try:

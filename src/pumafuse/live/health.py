@@ -81,7 +81,7 @@ def by_word(outcomes: IntArray) -> dict[str, int]:
 
 @dataclass(slots=True)
 class _Intervals:
-    """Of the rows of a sensor that have left the window."""
+    """Intervals between the rows of a sensor that have left the window."""
 
     last: int | None = None  # stamp [ns]
     usual: float = 0.0  # [s]

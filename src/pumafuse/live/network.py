@@ -130,7 +130,7 @@ class _Merged:
         self._pieces.put(items)
 
     def get(self) -> Items:
-        """Some of one thread; none after a tenth of a second without any."""
+        """Items of one thread; none after a tenth of a second without any."""
         try:
             return self._pieces.get(timeout=QUIET)
         except queue.Empty:
@@ -361,7 +361,7 @@ class Remote(Protocol):
         ...
 
     def stop(self) -> Items:
-        """Those that have come and were not given yet."""
+        """The items that have come and were not given yet."""
         ...
 
     def summary(self) -> str:
@@ -384,13 +384,13 @@ class Several(_Merged):
         self._threads = [_in_a_thread(self._ask, source) for source in self._sources]
 
     def get(self) -> Items:
-        """Some of one source; none after a tenth of a second without any. What a source has raised is raised."""
+        """Items of one source; none after a tenth of a second without any. What a source has raised is raised."""
         if self._error is not None:
             raise self._error
         return super().get()
 
     def stop(self) -> Items:
-        """Those that have come and were not given yet."""
+        """The items that have come and were not given yet."""
         self._ended.set()
         left = list[bytes | Event]()
         while any(thread.is_alive() for thread in self._threads) or not self._pieces.empty():

@@ -79,7 +79,7 @@ def _quaternion(pose: list[float]) -> tuple[float, ...] | None:
 
 
 def _messages(stream: BinaryIO) -> Iterator[tuple[int, bool, _Poses]]:
-    """Of messages of poses, until the connection ends: stamp [ns], whether all is seen, poses. Others are passed over.
+    """Messages of poses, until the connection ends: stamp [ns], whether all is seen, poses. Others are passed over.
 
     Such are images.
     """

@@ -190,14 +190,14 @@ class CommandScreen:
         return [*told, Screened(stamp, dict(values), {})]
 
     def release(self) -> list[Screened]:
-        """Those that wait, as nothing has shown that they are stray."""
+        """The commands that wait, as nothing has shown that they are stray."""
         told, self._waiting, self.until = self._waiting, [], NEVER
         for _, values in told:
             self._learn(values, True)
         return [Screened(stamp, values, {}) for stamp, values in told]
 
     def _judge_waiting(self, now: Mapping[str, Any]) -> list[Screened]:
-        """Those that wait, without what is stray, if each axis that has leapt is back now; else none."""
+        """The commands that wait, without what is stray, if each axis that has leapt is back now; else none."""
         told = list[Screened]()
         for stamp, values in self._waiting:
             out = {name: number(value) for name, value in values.items() if self._leaps(name, value)}

@@ -43,7 +43,7 @@ def axes_of(values: Iterable[str]) -> list[str]:
 
 
 def parse_noise(values: Mapping[str, Any]) -> float:
-    """By what a row's noise is scaled; 1 where it does not tell a positive number."""
+    """The factor on a row's noise; 1 where it does not tell a positive number."""
     told = number(values.get(NOISE))
     return told if 0.0 < told < math.inf else 1.0
 
@@ -156,7 +156,7 @@ class Tool:
         return Told(of_axes, {axis: float(factor[0]) for axis, factor in spread.items()}, seen)
 
     def _lever(self, sensor: str, stamp: TimeArray) -> FloatArray:
-        """From the tool point to what a sensor sees [m], by the commands, (n, 3); NaN as long as there is none."""
+        """The way from the tool point to what a sensor sees [m], by the commands, (n, 3); NaN before any."""
         if self._turn is None or self._reference is None:
             return np.full((len(stamp), 3), np.nan)
         turn = self._turn.at(stamp - self._latency[sensor])

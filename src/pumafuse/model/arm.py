@@ -156,7 +156,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
     @property
     def bends(self) -> list[str]:
-        """Its play, fastest speed and sag, with intervals, and of which motion its lag is; of a linear axis nothing."""
+        """Play, fastest speed and sag, with intervals, and of which motion the lag is; nothing of a linear axis."""
         screen, phrases = SCREEN[self.kind], list[str]()
         if self.play:
             size = f"{_scale(self.play, self.play_ci95, screen.scale)} {screen.unit}"
@@ -342,7 +342,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def later(self) -> dict[str, float]:
-        """By how much each joint answers later than the first [s]."""
+        """How much later than the first each joint answers [s]."""
         return {name: joint.later for name, joint in self.joints.items()}
 
     def joint_doubts(self) -> list[str]:

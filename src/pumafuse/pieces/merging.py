@@ -42,7 +42,7 @@ _NUMBER = re.compile(r"\d[\d.,]*(e[+-]?\d+)?")
 
 
 class Innovations(NamedTuple):
-    """Of a sensor on an axis: the mean of ν/√S; and what the axis tells of causes."""
+    """The mean of ν/√S of a sensor on an axis, and what the axis tells of causes."""
 
     mean: float
     evidence: Evidence

@@ -41,7 +41,7 @@ class _Step(NamedTuple):
 def joint_lags(
     told: Told, joints: Sequence[str], sensor: Sequence[Motion], register: Callable[[Sequence[Motion]], Registration]
 ) -> dict[str, Quantity]:
-    """By how much each joint answers later than the first [s]; nothing where all answer alike, as far as is told.
+    """How much later than the first each joint answers [s]; nothing where all answer alike, as far as is told.
 
     ``told`` gives the commands, beside which ``register`` registers what the sensor told in its own frame, one entry a
     run. A joint of which the motion does not tell is as late as the others are on average, its interval infinite.

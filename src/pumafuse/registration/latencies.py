@@ -99,7 +99,7 @@ def _sum(quantity: Quantity, by: float, *unsure: Quantity) -> Quantity:
 
 
 def later(first: Sequence[Motion], other: Sequence[Motion], about: float = 0.0) -> Quantity | None:
-    """By how much the stamps of one sensor's rows are later than those of another's [s], ``about`` so much.
+    """How much later the stamps of one sensor's rows are than those of another's [s], ``about`` so much.
 
     The first one tells in the base's frame of the point that the other one sees there, and, where it is known, how the
     tool is turned; one entry a run. None where both have too little in common, or it is not known to 50 ms.

@@ -113,7 +113,7 @@ class Answer:
         return (self._rotate(rotation) * self._reference).as_quat()
 
     def _rotate(self, rotation: Plant) -> Rotation:
-        """From the mean of the orientations."""
+        """The rotations from the mean of the orientations, under a plant."""
         return Rotation.from_rotvec(self._through(self._angle, rotation))
 
     def slopes(self, position: Plant, rotation: Plant, here: Poses) -> tuple[list[FloatArray], list[FloatArray]]:

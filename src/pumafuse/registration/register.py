@@ -351,7 +351,7 @@ def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, 
 
 
 def _unit_of(fit: Fit, ahead: float, loosely: bool) -> tuple[float, list[Found]]:
-    """By what to multiply a sensor's lengths, and that they need it; they are multiplied ``ahead`` already."""
+    """The factor on a sensor's lengths, and the finding that they need it; they are multiplied ``ahead`` already."""
     scale = fit.state.scale * ahead
     wide = float(fit.half_widths(np.eye(SIZE)[SCALE])[0])
     if abs(np.log(scale)) < max(_OTHER, wide):
@@ -361,7 +361,7 @@ def _unit_of(fit: Fit, ahead: float, loosely: bool) -> tuple[float, list[Found]]
 
 
 def _unit_finding(scale: float, within: float = _UNIT) -> list[Found]:
-    """That lengths are of another unit, where a scale is that of two units."""
+    """A finding that lengths are of another unit, where a scale is that of two units."""
     if not scale > 0.0:
         return []
     names = [(name, read_as) for name, read_as in product(_UNITS, repeat=2) if name != read_as]
@@ -501,14 +501,14 @@ def _turning_anew(begin: _Begin, free: FloatArray) -> State:
 
 
 def _unexplained_finding(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, share: float) -> Found:
-    """That no frame explains a share of the motion, and whether it may be as the commands tell no orientation."""
+    """The finding that no frame explains a share of the motion, and whether commands without orientation may be why."""
     told_less = command[0].quaternion is None and sensor[0].quaternion is not None
     unit = _angle_unit_finding(command, sensor, lag)
     return Found(finding=Finding.UNEXPLAINED, size=share, source="command" if told_less else None, unit=unit)
 
 
 def _angle_unit_finding(command: Sequence[Motion], sensor: Sequence[Motion], lag: float) -> str | None:
-    """That angles are of another unit, where the tool is told to turn as many times as far as deg are of rad."""
+    """A question about the unit of angles, where the tool is told to turn as many times as far as deg are of rad."""
     turns = ratio(command, sensor, lag, turns=True)
     if turns > 0.0 and abs(abs(np.log(turns)) - np.log(DEG)) < _ANGLES:
         told, seen = ("deg read as rad", "rad read as deg")[:: 1 if turns > 1.0 else -1]
@@ -576,7 +576,7 @@ def is_here(at: Vector | FloatArray, rotation: Vector | FloatArray) -> bool:
 
 
 def _of_numbers(told: Sequence[Quantity]) -> Registered:
-    """From six numbers."""
+    """A place and an orientation of six numbers."""
     x, y, z, a, b, c = told
     return Registered(
         at=(x.value, y.value, z.value),

@@ -284,7 +284,7 @@ def _register_sensor(runs: Sequence[Run], name: str, config: FusionConfig | None
 
 
 def _drop_frame(registration: Registration) -> Registration:
-    """The same of a sensor that needs no frame, nor a marker where that is the tool point."""
+    """The registration without its frame, and without its marker where that is the tool point."""
     marker = registration.marker
     seen = marker if marker and not is_here(marker.at, marker.rotation) else None
     return msgspec.structs.replace(registration, frame=None, marker=seen)

@@ -86,11 +86,11 @@ class Off(NamedTuple):
         return np.array([max(median(_length(block)) / MEDIAN, _LEAST) for block in self.blocks])
 
     def whitening(self) -> list[FloatArray]:
-        """By what to multiply each block for standard deviations of 1 along all directions, (3, 3)."""
+        """The matrix that gives each block standard deviations of 1 along all directions, (3, 3)."""
         return [_whitening(block) for block in self.blocks]
 
     def rms(self) -> list[float]:
-        """Of each block, over rows that are within ten medians."""
+        """RMS of each block, over rows that are within ten medians."""
         lengths = [_length(block) for block in self.blocks]
         kept = [length[length <= 10.0 * median(length) + _LEAST] for length in lengths]
         return [float(np.sqrt(np.mean(length**2))) for length in kept]
@@ -200,12 +200,12 @@ def information_of(
 
 
 def weights(length: FloatArray, sd: float) -> FloatArray:
-    """By how much rows count that are so far off, by Cauchy's distribution, (n,)."""
+    """Weights of rows that are so far off, by Cauchy's distribution, (n,)."""
     return 1.0 / (1.0 + (length / (CAUCHY * sd)) ** 2)
 
 
 def curvature(weight: FloatArray) -> FloatArray:
-    """By how much rows count for the curvature: the mean over the directions in which they may be off, (n,)."""
+    """Weights of rows for the curvature: the mean over the directions in which they may be off, (n,)."""
     return weight * (1.0 + 2.0 * weight) / 3.0
 
 

@@ -120,7 +120,7 @@ def ratio(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, *, tu
 
 
 def _correlation(first: FloatArray, other: FloatArray) -> float:
-    """Of two speeds; 0 where one is constant."""
+    """Correlation of two speeds; 0 where one is constant."""
     if len(first) < _FEWEST:
         return 0.0
     a, b = first - first.mean(), other - other.mean()

@@ -195,7 +195,7 @@ class ArmSearch:
         return fits
 
     def _likely(self, fits: Mapping[Model, Fit]) -> dict[Model, Fit]:
-        """Those models that a better noise could still bring near the best."""
+        """The models that a better noise could still bring near the best."""
         evidence = {model: self._evidence(model, fit) for model, fit in fits.items()}
         least = max(evidence.values()) - _NEARLY
         return {model: fit for model, fit in fits.items() if evidence[model] > least}

@@ -137,14 +137,14 @@ class Arm(NamedTuple):
         )
 
     def sag_beside(self, sag: Sag) -> Sag:
-        """Its knees, beside those of ``sag`` that it does not have."""
+        """A ``sag`` with the knees that the arm has in the place of its own."""
         if self.beyond:
             sag = replace(sag, knee=self.knee, slope_beyond=self.beyond)
         return replace(sag, knee_below=self.knee_below, slope_below=self.below) if self.below else sag
 
     @classmethod
     def of(cls, axis: AxisModel, delay: float) -> Arm:
-        """That of an axis's model and its dead time [s]."""
+        """The arm of an axis's model and its dead time [s]."""
         damping = axis.plant.damping if isinstance(axis.plant, SecondOrder) else 0.0
         gain, bends = axis.gain, (axis.play or 0.0, axis.max_speed or 0.0)
         sag = axis.sag or Sag()
@@ -202,7 +202,7 @@ class Measured:
     def __init__(
         self, recordings: Sequence[Recording], period: float, sensors: Sequence[str], model: AxisModel | None = None
     ) -> None:
-        """By these ``sensors``, of an axis of update period ``period`` [s], which sags as the ``model`` does."""
+        """Measurements by ``sensors`` of an axis with the update ``period`` [s] that sags as the ``model`` does."""
         self.recordings, self.period, self.sensors, self._model = recordings, period, sensors, model
         self.count = int(sum(recording.weight.sum() for recording in recordings))
         self.range = max(

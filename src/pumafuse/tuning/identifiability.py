@@ -36,7 +36,7 @@ class LostError(TuneError):
     """A sensor that does not follow the commands at all on some axes."""
 
     def __init__(self, fault: Fault) -> None:
-        """Of what was found of it."""
+        """The error of the sensor that has a ``fault``."""
         super().__init__(fault.sentence)
         self.fault = fault
 

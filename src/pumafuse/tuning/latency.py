@@ -448,7 +448,7 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
     arm, model, mixture, shared, _ = chosen
 
     def interval(quantity: Quantity, value: float, margin: float = _MARGIN) -> Interval:
-        """Of the models like the chosen one; of a logarithm in the number itself."""
+        """The interval by the models like the chosen one, also of what they have as a logarithm."""
         log = quantity not in ("lag", "delay", "gain")
 
         def alike(other: Model) -> bool:
@@ -567,7 +567,7 @@ class _Course(NamedTuple):
 
     @property
     def variance(self) -> FloatArray:
-        """Of the shifts [s²], (n,): what all have in common was fitted away."""
+        """Variances of the shifts [s²], (n,): what all have in common was fitted away."""
         inverse = np.asarray(np.linalg.pinv(self.information, 1e-6, hermitian=True), dtype=np.float64)
         return np.diag(inverse)
 
@@ -624,7 +624,7 @@ def _trend(course: _Course) -> _Trend:
 
 
 def _clock(courses: Sequence[_Course]) -> tuple[float | None, float | None]:
-    """By how much all axes drift and wander together; None where they do not, or each for itself."""
+    """How much all axes drift and wander together; None where they do not, or each for itself."""
     if len(courses) < 2:
         return None, None
     information: FloatArray = np.sum([course.information for course in courses], axis=0)

@@ -77,7 +77,7 @@ class Point:
 
     @property
     def log_likelihood(self) -> float:
-        """Of all axes."""
+        """The log-likelihood of all axes."""
         return float(self.axes.sum())
 
     @property
@@ -206,7 +206,7 @@ class Likelihood:
         return likelihood
 
     def outcomes_of(self, axis: str, outcomes: Sequence[CodeArray]) -> list[CodeArray]:
-        """Those outcomes that are of one axis's measurements, for each segment of :meth:`of_axis`."""
+        """The outcomes of one axis's measurements, for each segment of :meth:`of_axis`."""
         return [outcomes[part.whole][part.rows, part.column, None] for part in self._of(axis)]
 
     def _of(self, axis: str) -> list[_Part]:

@@ -42,7 +42,7 @@ _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "ga
 
 
 class LagStep(NamedTuple):
-    """That an axis is as late until an instant [s after the first command] as ``before``, and then as ``after`` [s]."""
+    """A step of the lag: ``before`` until an instant [s after the first command], then ``after`` [s]."""
 
     time: float
     before: float

@@ -68,12 +68,12 @@ class Branch:
 
     @property
     def delays(self) -> FloatArray:
-        """Of the entries [s], (n,)."""
+        """Delays of the entries [s], (n,)."""
         return np.array([entry.arm.delay for entry in self.entries])
 
     @property
     def log_density(self) -> FloatArray:
-        """Of the entries, (n,)."""
+        """Log-densities of the entries, (n,)."""
         return np.array([entry.log_density for entry in self.entries])
 
     def at(self, delays: FloatArray) -> FloatArray:

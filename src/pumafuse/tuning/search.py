@@ -68,7 +68,7 @@ class Search:
     """The search for the most likely configuration of a likelihood with some free parameters."""
 
     def __init__(self, likelihood: Likelihood, free: FreeOf, arms: Mapping[str, ArmSearch], notify: Notify) -> None:
-        """Of ``arms`` that were looked for; what is ``free`` depends on the order of the plants."""
+        """A search from ``arms`` that were looked for; what is ``free`` depends on the order of the plants."""
         self.likelihood, self.free, self.arms, self.notify = likelihood, free, arms, notify
         # for the order of the plant of an axis, its gain, its disturbance and whether it shares a delay
         self.reasons: dict[str, list[str]] = {axis: [] for axis in likelihood.sensors}
@@ -360,7 +360,7 @@ def _why(freedom: Freedom, mixture: Mixture, model: Model) -> list[str]:
 
 
 def _narrower(config: FusionConfig) -> float:
-    """By how much gates may be narrower without being too narrow."""
+    """The factor by which gates may be narrower without being too narrow."""
     gates = [sensor.gate for sensor in config.sensors.values() if sensor.gate > 0.0]
     return min(max(_NARROWER, _NARROWEST / min(gates, default=_NARROWEST)), 1.0)
 

@@ -234,7 +234,7 @@ def without_unseen_noise(likelihood: Likelihood, best: Point, free: Sequence[Par
 def hidden_disturbances(
     likelihood: Likelihood, best: Point, free: Sequence[Parameter], axes: Sequence[str]
 ) -> dict[str, float]:
-    """By how much ``axes`` without any process noise may stray without showing it: the sd [m or rad] that costs 1.
+    """How far ``axes`` without any process noise may stray without showing it: the sd [m or rad] that costs 1.
 
     No arm is perfect. At a likeliest noise of 0 error bars count none, though measurements exclude only what is larger.
     """

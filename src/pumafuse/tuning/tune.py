@@ -306,11 +306,11 @@ class Pipeline:
 
     @property
     def log_likelihood(self) -> float:
-        """Of the best configuration."""
+        """The log-likelihood of the best configuration."""
         return _evaluated(self.whole, self.best).log_likelihood
 
     def doubts(self) -> dict[str, Doubt]:
-        """Of the arms that were fitted: see :func:`.plain.doubts`."""
+        """Doubts about the arms that were fitted: see :func:`.plain.doubts`."""
         arms, config = {axis: search for stage in self.stages for axis, search in stage.arms.items()}, self.result()
         doubts_by_axis = doubts({axis: search.plain for axis, search in arms.items()}, config)
         return {

@@ -197,7 +197,7 @@ class Residuals:
     """One sensor's measurements on one axis, which wait for the estimate at their valid times."""
 
     def __init__(self, sensor: Sensor, biased: bool, estimates: Recent) -> None:
-        """Of a sensor, against the estimates of an axis."""
+        """Residuals of a sensor, against the estimates of an axis."""
         self._sensor, self._biased, self._estimates = sensor, biased, estimates
         self._waiting = np.empty((3, 0))
         self._bias, self._averaged = 0.0, 0
@@ -223,7 +223,7 @@ class Residuals:
 
 
 def _thin(rows: FloatArray) -> FloatArray:
-    """As many rows as a path needs, the newest among them."""
+    """The rows that a path needs, evenly thinned, the newest among them."""
     return rows[:: -(1 + len(rows) // _PATH_POINTS)]
 
 

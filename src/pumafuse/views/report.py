@@ -348,7 +348,7 @@ def write_verification(
 
 
 def _rms(identification: Identification, axis: str | None = None) -> float:
-    """Of the combined model over the trials that it is made of [m or rad]; of all axes for None."""
+    """RMS of the combined model over the trials that it is made of [m or rad]; of all axes for None."""
     used = [trial for trial in identification.trials if trial.left_out is None and axis in (None, trial.axis)]
     return float(np.sqrt(np.mean([trial.combined_rms**2 for trial in used if trial.combined_rms is not None])))
 

@@ -72,7 +72,7 @@ def send_scene(sink: Sink, est: Estimates, run: Run) -> None:
 
 
 def views(est: Estimates, run: Run) -> list[rrb.Spatial3DView]:
-    """Of the path of a tool that turns, and of the cell with the sensors and the robot."""
+    """Views of the path of a tool that turns, and of the cell with the sensors and the robot."""
     path, larger = est.pose.position, _enlargement(est)
     frames = [configured.frame for name in est.measurements.sensors if (configured := est.config.sensors.get(name))]
     links = None if run.command.joints is None else _links(run.command, run.command.joints)[1].reshape(-1, 3)
