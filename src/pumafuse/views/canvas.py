@@ -19,7 +19,7 @@ def render(template: str, content: Mapping[str, Any]) -> str:
     return pages.get_template(template).render(content)
 
 
-def legend(figure: Figure) -> None:
+def draw_legend(figure: Figure) -> None:
     """Say below all axes what the lines of the first are: inside they would cover data."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)

@@ -25,7 +25,7 @@ from ..logs.run import Run
 from ..tuning.latency import Latency
 from ..units import MS, SCREEN, seconds
 from . import colours
-from .canvas import drawing, legend, svg
+from .canvas import draw_legend, drawing, svg
 
 _ZOOM_S = 2.0  # length of the detail in which the band and single measurements can be seen
 _NEARLY_ALL, _LEAST = 0.99, 1e-9  # of what is drawn; m or rad
@@ -48,22 +48,22 @@ def fused_figure(est: Estimates) -> Figure:
             whole, zoom, left, left_zoom = figure.axes[4 * number : 4 * number + 4]
             position, screen = est[name].position, est.config.arm.screen_of(name)
             for axes, shown in ((whole, position), (zoom, position[zoomed])):
-                _commands(axes, est, name)
-                _measurements(axes, est, name)
-                _band(axes, est, name, position)
+                _draw_commands(axes, est, name)
+                _draw_measurements(axes, est, name)
+                _draw_band(axes, est, name, position)
                 axes.plot(est.time, position * screen.scale, color=colours.ESTIMATE, lw=1.0, label="estimate")
-                _reference(axes, est.reference, name, screen.scale)
+                _draw_reference(axes, est.reference, name, screen.scale)
                 axes.set_ylabel(f"{name} [{screen.unit}]")
                 axes.set_ylim(_span(shown * screen.scale))
             for axes in (left, left_zoom):
-                _residuals(axes, est, name)
+                _draw_residuals(axes, est, name)
                 axes.set_ylabel(f"{name}: measured\n− estimate [{screen.unit}]")
             for axes in (zoom, left_zoom):
                 axes.set_xlim(start, end)
             if est.since is not None or est.until is not None:
                 for axes in (whole, left):
                     axes.set_xlim(est.time[0], max(est.time[-1], est.time[0] + 1e-3))
-        legend(figure)
+        draw_legend(figure)
     return figure
 
 
@@ -85,7 +85,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
             for axes in (whole, zoom):
                 for name, position in of_axis.items():
                     axes.plot(results[name].time, position * screen.scale, lw=1.0, color=colour[name], label=name)
-                _reference(axes, reference, axis, screen.scale)
+                _draw_reference(axes, reference, axis, screen.scale)
                 axes.set_ylabel(f"{axis} [{screen.unit}]")
             what, shown = "difference", [np.zeros(1)]
             for name, position in of_axis.items():
@@ -108,7 +108,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
             zoom.set_ylim(_span(first.axes[axis].position[zoomed] * screen.scale))
         for axes in figure.axes[-2:]:
             axes.set_xlabel(_TIME)
-        legend(figure)
+        draw_legend(figure)
         figure.suptitle(why)
     return figure
 
@@ -168,7 +168,7 @@ def error_figure(est: Estimates) -> Figure | None:
                 raw = measured.value - interpolate(measured.time, measured.segment, est.reference, name)
                 label = f"{sensor}, latency removed"
                 axes.plot(measured.time, raw * screen.scale, ".", ms=1.5, color=colour, alpha=0.6, label=label)
-            _band(axes, est, name, np.zeros(len(est.time)))
+            _draw_band(axes, est, name, np.zeros(len(est.time)))
             axes.plot(est.time, error * screen.scale, color=colours.REFERENCE, lw=0.8, label="estimate")
             axes.set_title(
                 f"{name}: RMS error {scored_axis.rmse * screen.scale:.3f} {screen.unit}; the 95 % band holds"
@@ -178,7 +178,7 @@ def error_figure(est: Estimates) -> Figure | None:
             axes.set_ylabel(f"error [{screen.unit}]")
             limit = _reach(np.concatenate([error, Z95 * est[name].position_sd])) * screen.scale
             axes.set_ylim(-limit, limit)
-        legend(figure)
+        draw_legend(figure)
     return figure
 
 
@@ -204,14 +204,14 @@ def validation_figure(est: Estimates) -> Figure | None:
     with _figure(est, len(rows), labels, [3.0, 1.0, 1.0]) as figure:
         for number, (sensor, axis, checked) in enumerate(rows):
             series, histogram, correlation = figure.axes[3 * number : 3 * number + 3]
-            normalised = innovations(series, est, sensor, axis, by_sensor[sensor])
+            normalised = draw_innovations(series, est, sensor, axis, by_sensor[sensor])
             series.set_title(f"{axis}, {sensor}. {sentence(checked)}", loc="left")
             series.set_ylabel("innovation / sd")
             inside = np.clip(normalised, at[0], at[-1])
             histogram.hist(inside, bins=45, range=(at[0], at[-1]), density=True, color=by_sensor[sensor], alpha=0.6)
             histogram.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=colours.REFERENCE, lw=1.0)
             histogram.set_ylabel("density")
-            correlations(correlation, [checked], [by_sensor[sensor]])
+            draw_correlations(correlation, [checked], [by_sensor[sensor]])
             correlation.set_ylabel("autocorrelation")
     return figure
 
@@ -257,7 +257,7 @@ def lag_figures(latency: Latency) -> Markup:
         return svg(figure)
 
 
-def innovations(axes: Axes, est: Estimates, sensor: str, axis: str, colour: str) -> FloatArray:
+def draw_innovations(axes: Axes, est: Estimates, sensor: str, axis: str, colour: str) -> FloatArray:
     """Draw a sensor's innovations on an axis over their sd, those that were fused; the values."""
     measurements = est.measurements.of(sensor, axis)
     fused = measurements.where(measurements.outcome == Outcome.FUSED)
@@ -267,7 +267,7 @@ def innovations(axes: Axes, est: Estimates, sensor: str, axis: str, colour: str)
     return normalised
 
 
-def correlations(axes: Axes, tests: Sequence[Consistency | None], by_test: Sequence[str]) -> None:
+def draw_correlations(axes: Axes, tests: Sequence[Consistency | None], by_test: Sequence[str]) -> None:
     """Draw autocorrelations side by side in their colours, with the narrowest of their bands."""
     highest, band, width = 0.12, 1.0, 0.8 / len(tests)
     for number, (check, colour) in enumerate(zip(tests, by_test, strict=True)):
@@ -308,7 +308,7 @@ def _reach(values: FloatArray) -> float:
     return max(min(1.4 * most, 6.0 * usual) if usual > 0.0 else 1.4 * most, _LEAST)
 
 
-def _commands(axes: Axes, est: Estimates, name: str) -> None:
+def _draw_commands(axes: Axes, est: Estimates, name: str) -> None:
     told = [
         (seconds(time, est.origin), value) for time, value in (segment.commands_of(name) for segment in est.segments)
     ]
@@ -317,29 +317,29 @@ def _commands(axes: Axes, est: Estimates, name: str) -> None:
     axes.step(time, value * scale, where="post", color=colours.COMMAND, lw=1, label="command")
 
 
-def _reference(axes: Axes, reference: ReferenceTrack | None, name: str, scale: float) -> None:
+def _draw_reference(axes: Axes, reference: ReferenceTrack | None, name: str, scale: float) -> None:
     if reference is not None and name in reference.position:
         value = reference.position[name] * scale
         axes.plot(reference.time, value, color=colours.REFERENCE, lw=0.8, ls="--", label="reference")
 
 
-def _band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
+def _draw_band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
     half, scale = Z95 * est[name].position_sd, est.config.arm.screen_of(name).scale
     low, high = (centre - half) * scale, (centre + half) * scale
     axes.fill_between(est.time, low, high, color=colours.ESTIMATE, alpha=0.25, lw=0, label="95 % band")
 
 
-def _measurements(axes: Axes, est: Estimates, name: str) -> None:
+def _draw_measurements(axes: Axes, est: Estimates, name: str) -> None:
     """Measurements; a cross where the axis itself was beyond the gate, pale where another one of its row was."""
     scale = est.config.arm.screen_of(name).scale
     for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
-        _dots(axes, est, sensor, est.measured_positions(sensor, name), scale, colour)
+        _draw_dots(axes, est, sensor, est.measured_positions(sensor, name), scale, colour)
 
 
-def _residuals(axes: Axes, est: Estimates, name: str) -> None:
+def _draw_residuals(axes: Axes, est: Estimates, name: str) -> None:
     """Measurement − estimate, the band of the estimate, and what each sensor's sd claims."""
     scale, shown = est.config.arm.screen_of(name).scale, [Z95 * est[name].position_sd]
-    _band(axes, est, name, np.zeros(len(est.time)))
+    _draw_band(axes, est, name, np.zeros(len(est.time)))
     for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
         measured = est.measured_positions(sensor, name)
         left = measured.value.copy()
@@ -347,7 +347,7 @@ def _residuals(axes: Axes, est: Estimates, name: str) -> None:
             rows, here = measured.segment == number, est.segment == number
             estimates = est.time[here], est[name].position[here]
             left[rows] -= np.interp(measured.time[rows], *estimates, left=np.nan, right=np.nan)
-        _dots(axes, est, sensor, replace(measured, value=left), scale, colour)
+        _draw_dots(axes, est, sensor, replace(measured, value=left), scale, colour)
         shown.append(left[measured.outcome != Outcome.REJECTED])
         if sensor in est.config.sensors and (sd := est.config.sensors[sensor].sd_of(name)) is not None:
             for sign in (-1.0, 1.0):
@@ -357,7 +357,7 @@ def _residuals(axes: Axes, est: Estimates, name: str) -> None:
     axes.set_ylim(-limit, limit)
 
 
-def _dots(axes: Axes, est: Estimates, sensor: str, measured: Measurements, scale: float, colour: str) -> None:
+def _draw_dots(axes: Axes, est: Estimates, sensor: str, measured: Measurements, scale: float, colour: str) -> None:
     rejected = measured.outcome == Outcome.REJECTED
     gate = est.config.sensors[sensor].gate if sensor in est.config.sensors else 0.0
     itself = rejected & (np.abs(measured.innovation) > gate * measured.innovation_sd)

@@ -71,11 +71,11 @@ class Picture:
             screen = self._screens[axis]
             time, command = _columns(frame, f"command/{axis}", 2)
             line = styles.line(colours.COMMAND, "command", step=True)
-            self._sink.series(f"{axis}/command", line, time, command, screen)
+            self._sink.send_series(f"{axis}/command", line, time, command, screen)
             time, position, sd = estimates = _columns(frame, f"estimate/{axis}", 3)
             estimate.add(estimates)
-            self._sink.band(f"{axis}/estimate", "estimate ± sd", time, position, sd, screen)
-            self._sink.band(f"residual/{axis}/estimate", "estimate's sd", time, np.zeros(len(time)), sd, screen)
+            self._sink.send_band(f"{axis}/estimate", "estimate ± sd", time, position, sd, screen)
+            self._sink.send_band(f"residual/{axis}/estimate", "estimate's sd", time, np.zeros(len(time)), sd, screen)
         taken: dict[tuple[str, str], FloatArray] = {}
         for (axis, name), residuals in self._residuals.items():
             residuals.add(_columns(frame, f"measurement/{axis}/{name}", 3))
@@ -86,12 +86,12 @@ class Picture:
             points = styles.points(self._colours[name], name)
             crosses = styles.points(colours.REJECTED, "rejected", "Cross")
             entity = styles.entity(name)
-            self._sink.series(f"{axis}/{entity}", points, time[fused], position[fused], screen)
-            self._sink.series(f"{axis}/{entity}/rejected", crosses, time[rejected], shown[rejected], screen)
-            self._sink.series(f"residual/{axis}/{entity}", points, time[fused], residual[fused], screen)
+            self._sink.send_series(f"{axis}/{entity}", points, time[fused], position[fused], screen)
+            self._sink.send_series(f"{axis}/{entity}/rejected", crosses, time[rejected], shown[rejected], screen)
+            self._sink.send_series(f"residual/{axis}/{entity}", points, time[fused], residual[fused], screen)
         for name, colour in self._of_sensors.items():
             for path in (f"nis/{name}", f"rate/{name}"):
-                self._sink.series(path, styles.line(colour, name), *_columns(frame, path, 2))
+                self._sink.send_series(path, styles.line(colour, name), *_columns(frame, path, 2))
         for moment, level, text in frame.get("log", ()):
             self._sink.log_at(float(moment), _LOG, rr.TextLog(str(text), level=str(level)))
         for name, colour in self._colours.items():

@@ -101,27 +101,27 @@ def _send(est: Estimates, run: Run, sink: Sink) -> None:
     for name, axis in est.axes.items():
         screen = est.config.arm.screen_of(name)
         line = styles.line(colours.COMMAND, "command", step=True)
-        sink.series(f"{name}/command", line, time, command.values[name], screen)
+        sink.send_series(f"{name}/command", line, time, command.values[name], screen)
         if est.reference is not None and name in est.reference.position:
             line = styles.line(colours.REFERENCE_3D, "reference")
-            sink.series(f"{name}/reference", line, est.reference.time, est.reference.position[name], screen)
+            sink.send_series(f"{name}/reference", line, est.reference.time, est.reference.position[name], screen)
         for sensor in est.measurements.sensors:
-            _sensor(sink, est, sensor, name, by_sensor[sensor])
-        sink.band(f"{name}/estimate", "estimate ± sd", est.time, axis.position, axis.position_sd, screen)
+            _send_sensor(sink, est, sensor, name, by_sensor[sensor])
+        sink.send_band(f"{name}/estimate", "estimate ± sd", est.time, axis.position, axis.position_sd, screen)
         if name not in _measured_axes(est):
             continue
         nothing = np.zeros(len(est.time))
-        sink.band(f"residual/{name}/estimate", "estimate's sd", est.time, nothing, axis.position_sd, screen)
+        sink.send_band(f"residual/{name}/estimate", "estimate's sd", est.time, nothing, axis.position_sd, screen)
         for edge in (2.0, -2.0):
             path = f"innovation/{name}/{'upper' if edge > 0.0 else 'lower'}"
             line = styles.line(colours.BAND, f"{edge:+.0f}", width=0.7)
-            sink.series(path, line, est.time[[0, -1]], np.full(2, edge))
+            sink.send_series(path, line, est.time[[0, -1]], np.full(2, edge))
         if _adapts(est, name):
             on_axis = est.measurements.where(est.measurements.axis == est.measurements.axes.index(name))
             line = styles.line(colours.ESTIMATE, _NOISE, step=True)
-            sink.series(f"innovation/{name}/noise", line, on_axis.time, np.sqrt(on_axis.noise_scale))
+            sink.send_series(f"innovation/{name}/noise", line, on_axis.time, np.sqrt(on_axis.noise_scale))
     for sensor in est.measurements.sensors:
-        _outcomes(sink, est, sensor)
+        _send_outcomes(sink, est, sensor)
     send_scene(sink, est, run)
 
 
@@ -134,20 +134,20 @@ def _adapts(est: Estimates, axis: str) -> bool:
     return est.config.process[axis].adaptation > 0.0
 
 
-def _sensor(sink: Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
+def _send_sensor(sink: Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
     measured, screen = est.measured_positions(sensor, axis), est.config.arm.screen_of(axis)
     fused = (measured.outcome == Outcome.FUSED) | (measured.outcome == Outcome.REACQUIRED)
     name = styles.entity(sensor)
     points, crosses = styles.points(colour, sensor), styles.points(colours.REJECTED, "rejected", "Cross")
     position = np.interp(measured.time, est.time, est[axis].position, left=np.nan, right=np.nan)
     for path, value in ((axis, measured.value), (f"residual/{axis}", measured.value - position)):
-        sink.series(f"{path}/{name}", points, measured.time[fused], value[fused], screen)
-        sink.series(f"{path}/{name}/rejected", crosses, measured.time[~fused], value[~fused], screen)
+        sink.send_series(f"{path}/{name}", points, measured.time[fused], value[fused], screen)
+        sink.send_series(f"{path}/{name}/rejected", crosses, measured.time[~fused], value[~fused], screen)
     normalised = measured.innovation / measured.innovation_sd
-    sink.series(f"innovation/{axis}/{name}", points, measured.time, normalised)
+    sink.send_series(f"innovation/{axis}/{name}", points, measured.time, normalised)
 
 
-def _outcomes(sink: Sink, est: Estimates, sensor: str) -> None:
+def _send_outcomes(sink: Sink, est: Estimates, sensor: str) -> None:
     """Send what became of a sensor's rows: the worst of its axes, where that changes; and when it falls silent."""
     measured = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index(sensor))
     measured = measured.where(np.isfinite(measured.stamp))
@@ -166,7 +166,7 @@ def _outcomes(sink: Sink, est: Estimates, sensor: str) -> None:
     shades = [colours.rgb(colours.OUTCOMES.get(word, colours.COMMAND)) for word in words]
     sink.log(f"outcome/{sensor}", rr.StateConfiguration(values=words, colors=shades))
     changes = rr.StateChange.columns(state=[word for _, word in states])
-    sink.columns(f"outcome/{sensor}", np.array([at for at, _ in states]), changes)
+    sink.send_columns(f"outcome/{sensor}", np.array([at for at, _ in states]), changes)
 
 
 def _blueprint(est: Estimates, run: Run) -> rrb.Blueprint:

@@ -49,11 +49,11 @@ def send_scene(sink: Sink, est: Estimates, run: Run) -> None:
     if not names or not all(name in estimated for name in names):
         return
     if all(name in command for name in names):
-        _strip(sink, "path/command", _points([command[name] for name in names]), colours.COMMAND, -0.7)
+        _send_strip(sink, "path/command", _points([command[name] for name in names]), colours.COMMAND, -0.7)
     path = _points([estimated[name] for name in names])
-    _strip(sink, "path/estimate", path, colours.ESTIMATE, -1.2)
+    _send_strip(sink, "path/estimate", path, colours.ESTIMATE, -1.2)
     if run.command.joints is not None:
-        _robot(sink, run.command, run.command.joints, est.origin)
+        _send_robot(sink, run.command, run.command.joints, est.origin)
     every = slice(None, None, max(1, len(path) // _PATH_POINTS))
     if est.turns:
         length, pose, larger = _axes_length(path), est.pose, _enlargement(est)
@@ -68,7 +68,7 @@ def send_scene(sink: Sink, est: Estimates, run: Run) -> None:
     else:
         style = rr.Points3D.from_fields(colors=[colours.rgb(colours.REJECTED)], radii=[-5.0])
         sink.log("path/tool", style)
-        sink.columns("path/tool", est.time[every], rr.Points3D.columns(positions=path[every] * sink.scale))
+        sink.send_columns("path/tool", est.time[every], rr.Points3D.columns(positions=path[every] * sink.scale))
 
 
 def views(est: Estimates, run: Run) -> list[rrb.Spatial3DView]:
@@ -149,12 +149,12 @@ def send_tool(
     The point is in m, (n, 3), the quaternion x, y, z, w, (n, 4), and root the S of the covariance S Sᵀ of x, y, z [m].
     """
     point = point * sink.scale
-    sink.columns("path/tool", time, rr.Transform3D.columns(translation=point, quaternion=quaternion))
+    sink.send_columns("path/tool", time, rr.Transform3D.columns(translation=point, quaternion=quaternion))
     half = larger * _ELLIPSOID * sink.scale * root
-    sink.columns("path/uncertainty", time, rr.Transform3D.columns(translation=point, mat3x3=half))
+    sink.send_columns("path/uncertainty", time, rr.Transform3D.columns(translation=point, mat3x3=half))
 
 
-def _robot(sink: Sink, command: Source, joints: Joints, origin: int) -> None:
+def _send_robot(sink: Sink, command: Source, joints: Joints, origin: int) -> None:
     """Send a line through the robot's links, from the base to the tip, where the joints are told to be.
 
     rerun-sdk's own reader of URDFs draws meshes and shapes only, which a file may not have.
@@ -162,7 +162,7 @@ def _robot(sink: Sink, command: Source, joints: Joints, origin: int) -> None:
     stamp, links = _links(command, joints)
     sink.log("path/robot", rr.LineStrips3D.from_fields(colors=[colours.rgb(colours.COMMAND)], radii=[-2.0]))
     lines = rr.LineStrips3D.columns(strips=list(links * sink.scale))
-    sink.columns("path/robot", seconds(stamp, origin), lines)
+    sink.send_columns("path/robot", seconds(stamp, origin), lines)
 
 
 def _links(command: Source, joints: Joints) -> tuple[TimeArray, FloatArray]:
@@ -212,12 +212,12 @@ def send_placed(sink: Sink, name: str, sensor: Sensor, colour: str, tool: FloatA
     """Send where a sensor stands and what it sees on the tool, as far as this is known."""
     if sensor.frame is not None:
         away = float(np.linalg.norm(tool - sensor.frame.at))
-        _frame(sink, f"path/sensors/{name}", sensor.frame, _OF_SENSOR * away, colour, name)
+        _send_frame(sink, f"path/sensors/{name}", sensor.frame, _OF_SENSOR * away, colour, name)
     if sensor.marker is not None:
-        _frame(sink, f"path/tool/markers/{name}", sensor.marker, _OF_MARKER * length, colour, name)
+        _send_frame(sink, f"path/tool/markers/{name}", sensor.marker, _OF_MARKER * length, colour, name)
 
 
-def _frame(sink: Sink, path: str, placement: Placement, length: float, colour: str, label: str) -> None:
+def _send_frame(sink: Sink, path: str, placement: Placement, length: float, colour: str, label: str) -> None:
     """Send a frame within that of the entity above it: its axes, and its name at their origin."""
     turned = rotations.of_vectors(np.array([placement.rotation]))[0]
     sink.log(path, rr.Transform3D(translation=np.array(placement.at) * sink.scale, quaternion=turned))
@@ -225,7 +225,7 @@ def _frame(sink: Sink, path: str, placement: Placement, length: float, colour: s
     sink.log(path, rr.Points3D([0.0, 0.0, 0.0], colors=[colours.rgb(colour)], radii=[-4.0], labels=label))
 
 
-def _strip(sink: Sink, path: str, points: FloatArray, colour: str, radius: float) -> None:
+def _send_strip(sink: Sink, path: str, points: FloatArray, colour: str, radius: float) -> None:
     """Send a path [m]; a negative radius is in points of the screen, right for a path of any size."""
     points = points[np.isfinite(points).all(axis=1)] * sink.scale
     points = points[:: max(1, len(points) // _PATH_POINTS)]

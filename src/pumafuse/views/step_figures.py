@@ -104,7 +104,7 @@ def fits_by_factor(identification: Identification, trials: StepTrials) -> str:
 
     def draw(axes: Axes, factor: str) -> None:
         for order, (rms, colour, offset) in orders.items():
-            _levels(axes, levels_of(rms, factors[factor]), colour, order, offset)
+            _draw_levels(axes, levels_of(rms, factors[factor]), colour, order, offset)
         axes.set_ylim(bottom=0.0)
         if factor == next(iter(factors)):
             axes.legend(frameon=False)
@@ -121,7 +121,7 @@ def performance(identification: Identification) -> str:
     tolerance = identification.tolerance * screen.scale
 
     def draw(axes: Axes, factor: str) -> None:
-        _levels(axes, levels[factor], colours.ESTIMATE, "combined model", 0.0)
+        _draw_levels(axes, levels[factor], colours.ESTIMATE, "combined model", 0.0)
         top = max(level.mean + 2.0 * (level.sd or 0.0) for level in levels[factor])
         if tolerance < 3.0 * top:
             axes.axhline(tolerance, color=colours.REJECTED, lw=0.8, ls="--")
@@ -146,7 +146,7 @@ def valleys(identification: Identification, trials: StepTrials) -> tuple[str, li
     named = {f"{trial.axis}, trial {trial.trial}": trial for trial in chosen}
 
     def draw(axes: Axes, name: str) -> None:
-        _valley(axes, named[name], measured[named[name].trial])
+        _draw_valley(axes, named[name], measured[named[name].trial])
 
     return _panels(named, draw, "damping ζ", "natural frequency ω [rad/s]"), [trial.trial for trial in chosen]
 
@@ -181,7 +181,7 @@ def _panels(names: Iterable[str], draw: Callable[[Axes, str], None], ylabel: str
         return svg(figure)
 
 
-def _valley(axes: Axes, result: TrialResult, trial: Trial) -> None:
+def _draw_valley(axes: Axes, result: TrialResult, trial: Trial) -> None:
     fit = result.second
     omega, zeta = fit.natural_frequency or 1.0, fit.damping or 1.0
     omega, zeta = (omega, zeta) if zeta < 5.0 else (omega * 5.0 / zeta, 5.0)  # the valley runs off to infinity
@@ -207,7 +207,7 @@ def _valley(axes: Axes, result: TrialResult, trial: Trial) -> None:
     axes.set_ylim(up[0], up[-1])
 
 
-def _levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, offset: float) -> None:
+def _draw_levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, offset: float) -> None:
     """Means with bars of two standard deviations, one for each level."""
     at = np.arange(len(levels)) + offset
     bars = [2.0 * (level.sd or 0.0) for level in levels]

@@ -61,11 +61,11 @@ class Sink:
         self.stream.set_time(TIMELINE, duration=time)
         self.stream.log(f"{self.root}{path}", part)
 
-    def columns(self, path: str, time: FloatArray, columns: rr.ComponentColumnList) -> None:
+    def send_columns(self, path: str, time: FloatArray, columns: rr.ComponentColumnList) -> None:
         """Send what is for times [s since the first command], (n,)."""
         rr.send_columns(f"{self.root}{path}", self.times(time), columns, recording=self.stream)
 
-    def series(
+    def send_series(
         self, path: str, style: Style, time: FloatArray, value: FloatArray, screen: Screen | None = None
     ) -> None:
         """Send the finite values of an entity, with a screen from SI."""
@@ -73,7 +73,9 @@ class Sink:
         scale = 1.0 if screen is None else screen.scale
         self._send(path, style, time[is_known], rr.Scalars.columns(scalars=value[is_known] * scale))
 
-    def band(self, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, screen: Screen) -> None:
+    def send_band(
+        self, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, screen: Screen
+    ) -> None:
         """Send values [SI] with their variances: a line with a translucent band of a standard deviation each way."""
         colour = colours.rgb(colours.ESTIMATE)
         style = rr.Measurements.from_fields(colors=[colour], widths=[1.8], names=label, units=screen.unit)
@@ -87,4 +89,4 @@ class Sink:
         if path not in self._styled:
             self._styled.add(path)
             self.log(path, style)
-        self.columns(path, time, columns)
+        self.send_columns(path, time, columns)

@@ -21,7 +21,7 @@ from ..tuning.tune import Tuning
 from ..tuning.validation import fused
 from . import colours, formatting
 from .canvas import drawing, render, svg
-from .figures import correlations, innovations
+from .figures import draw_correlations, draw_innovations
 
 _Pair: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after
 _WHITE = 0.01  # p-value from which innovations count as white
@@ -134,7 +134,7 @@ def profile_figure(profiles: Sequence[Profile], fitted: Mapping[str, Fitted]) ->
     rows = -(-len(profiles) // _COLUMNS)
     with drawing(_COLUMNS, rows, width=_WIDTH, height=1.95) as figure:
         for axes, profile in zip(figure.axes, profiles, strict=False):
-            _profile(axes, profile, fitted[profile.key])
+            _draw_profile(axes, profile, fitted[profile.key])
         for axes in figure.axes[len(profiles) :]:
             axes.set_visible(False)
         for axes in figure.axes[::_COLUMNS]:
@@ -148,7 +148,7 @@ def innovation_figure(before: Estimates, after: Estimates, sensor: str, axis: st
     with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0)) as figure:
         *series, correlation = figure.axes
         for axes, when, est, colour in zip(series, ("before", "after"), (before, after), pair, strict=True):
-            innovations(axes, est, sensor, axis, colour)
+            draw_innovations(axes, est, sensor, axis, colour)
             axes.set_title(f"{when}: {axis}, {sensor}", loc="left")
             axes.set_xlabel("time since the first command [s]")
         highest = max(4.0, *(abs(end) for axes in series for end in axes.get_ylim()))
@@ -156,13 +156,13 @@ def innovation_figure(before: Estimates, after: Estimates, sensor: str, axis: st
             axes.set_ylim(-highest, highest)
             axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
         series[0].set_ylabel("innovation / sd")
-        correlations(correlation, tests, pair)
+        draw_correlations(correlation, tests, pair)
         correlation.set_title("autocorrelation", loc="left")
         correlation.set_xlabel("lag [measurements]")
         return svg(figure)
 
 
-def _profile(axes: Axes, profile: Profile, fitted: Fitted) -> None:
+def _draw_profile(axes: Axes, profile: Profile, fitted: Fitted) -> None:
     low, high = float(profile.values[0]), float(profile.values[-1])
     if profile.log:
         axes.set_xscale("log")
