@@ -196,7 +196,7 @@ def test_what_is_not_taken_in_is_shed(config: pf.FusionConfig) -> None:
     commands, rows = [Event(k, "", {}) for k in range(100)], [Event(k, "camera", {}) for k in range(9000)]
     for event in (*commands, *rows):
         waiting.add(0.0, event)
-    taken = [event for age in range(40) for event in waiting.some(0.1 * age)]  # the oldest waits longer and longer
+    taken = [event for age in range(40) for event in waiting.take(0.1 * age)]  # the oldest waits longer and longer
     assert taken[:100] == commands and len(taken) + waiting.shed == 9100
     assert f"{waiting.shed} shed" in source.summary()
     assert any("shed so far" in notice for notice in notices)

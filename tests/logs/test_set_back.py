@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.errors import RunError
-from pumafuse.fusion.results import Making
+from pumafuse.fusion.results import Recipe
 from pumafuse.logs.run import Source
 from pumafuse.logs.set_back import going_on
 from pumafuse.pieces import fusing
@@ -161,6 +161,6 @@ def test_a_long_run_is_to_be_cut_there(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "run.toml").write_text("\n".join(lines))
     monkeypatch.setattr(fusing, "PIECE", 1000)
     with pytest.raises(RunError, match=r"all clocks are set back by 0\.300 s .* cut the log there"):
-        fusing.fuse_to(tmp_path, tmp_path / "out", Making(CONFIG))
+        fusing.fuse_to(tmp_path, tmp_path / "out", Recipe(CONFIG))
     whole = pf.Run.read(tmp_path)
     assert np.abs(going_on(whole)[0].command.stamp - logged().command.stamp).max() <= 1

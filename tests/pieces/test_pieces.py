@@ -152,7 +152,7 @@ def both_ways(
 ) -> tuple[Summary, Summary]:
     """Summaries of the run as a whole and in pieces, of which tables must be the same to the last bit."""
     whole = results.write(pf.fuse(pf.Run.read(path).between(*part), CONFIG, **how), folder / "whole", False)
-    pieces = fusing.fuse_to(path, folder / "pieces", results.Making(CONFIG, part=part, **how), progress=progress)
+    pieces = fusing.fuse_to(path, folder / "pieces", results.Recipe(CONFIG, part=part, **how), progress=progress)
     assert names(folder / "whole") | {"log.json"} == names(folder / "pieces")
     for name in same:
         assert pq.read_table(folder / "pieces" / name) == pq.read_table(folder / "whole" / name), name
@@ -254,7 +254,7 @@ def test_rows_that_come_too_late(tmp_path: Path) -> None:
         given["camera"][0]["t"][900] -= 20.0
 
     path = written(tmp_path / "stray", single=True, damage=stray)
-    found = fusing.fuse_to(path, tmp_path / "out", results.Making(CONFIG))
+    found = fusing.fuse_to(path, tmp_path / "out", results.Recipe(CONFIG))
     assert [note for note in found.notes if "1 row left out, stamped more than 10 s behind" in note]
     whole = pf.fuse(pf.Run.read(path), CONFIG)
     assert sum(found.rows["camera"].values()) == sum(whole.counts["camera"].values()) - 1
@@ -267,7 +267,7 @@ def test_rows_that_come_too_late(tmp_path: Path) -> None:
     path = written(tmp_path / "back", single=True, damage=back)
     before = set(tmp_path.iterdir())
     with pytest.raises(PumafuseError, match=r"behind an earlier one|set back") as error:
-        fusing.fuse_to(path, tmp_path / "refused", results.Making(CONFIG))
+        fusing.fuse_to(path, tmp_path / "refused", results.Recipe(CONFIG))
     assert "\n" not in str(error.value) and set(tmp_path.iterdir()) == before
 
 
@@ -305,12 +305,12 @@ def test_what_cannot_be_written_leaves_nothing(
         with monkeypatch.context() as context:
             context.setattr(fusing, "digest", interrupted)
             with pytest.raises((FolderError, KeyboardInterrupt)):
-                fusing.fuse_to(logs[True], tmp_path / "out", results.Making(CONFIG))
+                fusing.fuse_to(logs[True], tmp_path / "out", results.Recipe(CONFIG))
         assert not list(tmp_path.iterdir())
     with pytest.raises(RunError, match="nothing was fused"):
-        fusing.fuse_to(logs[True], tmp_path / "out", results.Making(msgspec.structs.replace(CONFIG, sensors={})))
+        fusing.fuse_to(logs[True], tmp_path / "out", results.Recipe(msgspec.structs.replace(CONFIG, sensors={})))
     with pytest.raises(RunError, match=r"there is no tick of 0\.01 Hz in the part of the run"):
-        fusing.fuse_to(logs[True], tmp_path / "out", results.Making(CONFIG, part=(5.0, 50.0), rate=0.01))
+        fusing.fuse_to(logs[True], tmp_path / "out", results.Recipe(CONFIG, part=(5.0, 50.0), rate=0.01))
     assert not list(tmp_path.iterdir())
 
 
@@ -353,7 +353,7 @@ import resource, sys, warnings
 from pathlib import Path
 import numpy as np, pyarrow as pa, pyarrow.parquet as pq
 import pumafuse as pf
-from pumafuse.fusion.results import Making
+from pumafuse.fusion.results import Recipe
 from pumafuse.pieces.fusing import fuse_to
 
 folder, rows = Path(sys.argv[1]), int(sys.argv[2])
@@ -366,7 +366,7 @@ with pq.ParquetWriter(folder / "log.parquet", schema) as writer:
         command = pa.array(position, mask=n % 28 != 0)
         writer.write_table(pa.table([pa.array(n * 1_000_000), command, pa.array(position)], schema=schema))
 warnings.simplefilter("ignore")
-fuse_to(folder / "log.parquet", folder / "out", Making(config))
+fuse_to(folder / "log.parquet", folder / "out", Recipe(config))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 

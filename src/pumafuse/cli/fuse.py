@@ -50,10 +50,10 @@ def run(
     warn(configured.arm.doubts())
     for line in configured.arm.bends():
         say(line)
-    making = results.Making(configured, sensors, rate, mode, engine, part, extras)
-    job = partial(_fuse, making, force)
+    recipe = results.Recipe(configured, sensors, rate, mode, engine, part, extras)
+    job = partial(_fuse, recipe, force)
     if len(runs) == 1:
-        summary = making.read_summary(output, runs[0]) if resume else None
+        summary = recipe.read_summary(output, runs[0]) if resume else None
         where = "written to" if summary is None else "there already:"
         if summary is None:
             with progress_bar(str(runs[0])) as progress:
@@ -61,23 +61,23 @@ def run(
         show(summary)
         say(f"{where} {output}")
         return
-    places = dict(zip(map(str, runs), folders_of(runs, output), strict=True))
+    folders = dict(zip(map(str, runs), folders_of(runs, output), strict=True))
     done_before = {
         path: summary
-        for path, folder in places.items()
-        if resume and (summary := making.read_summary(folder, Path(path)))
+        for path, folder in folders.items()
+        if resume and (summary := recipe.read_summary(folder, Path(path)))
     }
-    jobs = {path: partial(job, Path(path), folder) for path, folder in places.items() if path not in done_before}
-    done, failed = run_jobs("fusing", jobs, places.values())
+    jobs = {path: partial(job, Path(path), folder) for path, folder in folders.items() if path not in done_before}
+    done, failed = run_jobs("fusing", jobs, folders.values())
     if done_before or done:
         by_path = done_before | done
-        summaries = {folder.name: by_path[path] for path, folder in places.items() if path in by_path}
+        summaries = {folder.name: by_path[path] for path, folder in folders.items() if path in by_path}
         print_tables(runs_table(summaries, kind) for kind in KINDS)
         say(
             f"written to {output}"
             + (f"; {len(done_before)} of {len(by_path)} were there already" if done_before else "")
         )
-    report_failures(failed, len(places), output)
+    report_failures(failed, len(folders), output)
 
 
 def demo(output: Path, force: bool) -> None:
@@ -105,7 +105,7 @@ def demo(output: Path, force: bool) -> None:
 
 
 def _fuse(
-    how: results.Making, force: bool, path: Path, folder: Path, progress: Callable[[float], None] | None = None
+    how: results.Recipe, force: bool, path: Path, folder: Path, progress: Callable[[float], None] | None = None
 ) -> Summary:
     """Fuse a run into its result folder: piece by piece a long one, where nothing, such as an option, forbids that."""
     results.check_writable(folder, force)

@@ -58,7 +58,7 @@ def _block_ctrl_c() -> Generator[None]:
 
 
 def run_jobs(
-    what: str, jobs: Mapping[str, Callable[[], R]], places: Iterable[Path]
+    what: str, jobs: Mapping[str, Callable[[], R]], folders: Iterable[Path]
 ) -> tuple[dict[str, R], dict[str, str]]:
     """Run every job, several at a time."""
     from joblib import Parallel, delayed
@@ -92,7 +92,7 @@ def run_jobs(
             if outcomes is not None:
                 outcomes.close()  # only now does no worker write any more
         threading.excepthook = told
-        sweep(places)
+        sweep(folders)
     done = {name: results[name] for name in jobs if name in results}
     return done, {name: failed[name] for name in jobs if name in failed}
 

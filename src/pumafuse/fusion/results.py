@@ -91,8 +91,8 @@ def check_writable(folder: Path, force: bool, with_run: bool = False) -> None:
 
 
 @dataclass(frozen=True)
-class Making:
-    """How results are made: all that makes them differ, but for the log."""
+class Recipe:
+    """All that makes results differ, but for the log."""
 
     config: FusionConfig
     sensors: Sequence[str] | None = None  # those that are asked for; None: all
@@ -133,7 +133,7 @@ class Making:
 
 
 def write_stamps(folder: Path, stamps: Mapping[str, tuple[int, int]]) -> None:
-    """Write of which files a result was made, for :meth:`Making.read_summary`; ``stamps`` are of before."""
+    """Write of which files a result was made, for :meth:`Recipe.read_summary`; ``stamps`` are of before."""
     (folder / _LOG).write_bytes(msgspec.json.format(msgspec.json.encode(stamps)) + b"\n")
 
 

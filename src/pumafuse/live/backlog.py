@@ -53,7 +53,7 @@ class Backlog(Generic[T]):
             self._bytes -= _size(self._waiting.popleft()[1])
             self.dropped += 1
 
-    def some(self, now: float) -> list[T]:
+    def take(self, now: float) -> list[T]:
         """The oldest items, at ``now`` [s]; that they wait for long is said, and where it goes on, some are shed."""
         self._keep_up(now)
         taken = [self._waiting.popleft()[1] for _ in range(min(len(self._waiting), _MOST_AT_ONCE))]

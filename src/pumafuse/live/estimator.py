@@ -46,7 +46,7 @@ from .screening import NEWS, CommandScreen, HoldWatch, Screened
 from .tool import NO_TOOL, NOISE, ORIENTATION, Row, axes_of, check_tool, parse_noise, tool_of
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
-_MOST_ASIDE = 10_000  # events kept in case a clock was set anew
+_MOST_KEPT = 10_000  # events kept in case a clock was set anew
 _ABSENT = bytes((ABSENT,))
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
 _STRAY, _HELD = Outcome.STRAY, Outcome.HELD
@@ -146,10 +146,10 @@ class LiveEstimator:
         self._no_spread = [1.0] * len(self.axes)
         self._log, self._event_log = RateLimitedLog(on_notice), event_log
         self._refused: IntArray = np.zeros((len(self._sensors) + 1, len(Outcome)), dtype=np.int64)
-        self._strangers = 0
+        self._of_unknown_sensors = 0
         self._doubtful = 0  # commands that may have to be taken back
         self._answers: dict[bytes, UpdateResult] = {}
-        self._set_aside: list[_Counted] = []  # what was refused since the commands' clock may be another one
+        self._of_new_clock: list[_Counted] = []  # what may be stamped by a new clock of the commands
         self._behind: list[_Counted] = []  # what came since that clock may be set back within the window
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
@@ -216,7 +216,7 @@ class LiveEstimator:
             f"sensor '{name}' contradicts '{other}': {_REJECTED}" for name, other in self._contradicting.items()
         )
         faults = (*self._diagnosis.shown, *rejected)
-        return Health(newest, self.segment + 1, commands, sensors, self._strangers, faults)
+        return Health(newest, self.segment + 1, commands, sensors, self._of_unknown_sensors, faults)
 
     @property
     def joints(self) -> Mapping[str, Kind]:
@@ -320,8 +320,8 @@ class LiveEstimator:
                 return refusal
         elif clock.newest is not None and stamp > clock.newest:
             clock.settle(stamp)
-        if sensor is None and self._set_aside:
-            clock.other, self._set_aside = [], []
+        if sensor is None and self._of_new_clock:
+            clock.other, self._of_new_clock = [], []
         if self._event_log is not None:
             self._event_log.append(*event)
         result = self._screen_event(event, parsed)
@@ -375,9 +375,9 @@ class LiveEstimator:
             ahead = f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others"
             result = self._refuse(sensor, values, _INVALID, ahead)
         if len(clock.other) == 1 and command:
-            self._set_aside = []
-        if clock.other and len(self._set_aside) < _MOST_ASIDE:
-            self._set_aside.append(_Counted(event._replace(values=dict(values)), result, is_late))
+            self._of_new_clock = []
+        if clock.other and len(self._of_new_clock) < _MOST_KEPT:
+            self._of_new_clock.append(_Counted(event._replace(values=dict(values)), result, is_late))
         return result
 
     def _screen_event(self, event: _Event, parsed: _Values) -> UpdateResult:
@@ -452,12 +452,12 @@ class LiveEstimator:
             except RunError as error:
                 return self._refuse(None, event.values, _INVALID, str(error))
             early = [earlier for earlier in self._early if earlier.stamp >= oldest]
-            self._restart(self._before)
+            self._restart(self._counts_before)
             self._early, self._frame_start = early, frame_start
             for earlier in early:
                 self._add_to_window(*earlier)
-        if len(self._early) >= _MOST_ASIDE:
-            del self._early[: _MOST_ASIDE // 2]
+        if len(self._early) >= _MOST_KEPT:
+            del self._early[: _MOST_KEPT // 2]
         self._early.append(event)
         return self._add_to_window(*event, judged=again)
 
@@ -465,10 +465,10 @@ class LiveEstimator:
         """Add an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
         if sensor is not None and not judged:
             return self._add_row(stamp, sensor, values)
-        bits, stranger = self._fill(stamp, sensor, values)
+        bits, unknown = self._fill(stamp, sensor, values)
         if stamp < (oldest := self._oldest()):
             return self._refuse_late(stamp, sensor, values, self._counts.outcomes)
-        return self._update(_Event(stamp, sensor, values), bits, stranger, oldest, judged)
+        return self._update(_Event(stamp, sensor, values), bits, unknown, oldest, judged)
 
     def _add_row(self, stamp: int, sensor: str, values: _Values) -> UpdateResult:
         """Put a measurement into the window: as it tells of the tool, as noisy as it says, without what is no news."""
@@ -481,7 +481,7 @@ class LiveEstimator:
         if tool is not None:
             told = tool.to_tool(sensor, stamp, values)
             values = told.values
-        bits, stranger = self._fill(stamp, sensor, values)
+        bits, unknown = self._fill(stamp, sensor, values)
         if stamp < (oldest := self._oldest()):
             return self._refuse_late(stamp, sensor, values, self._counts.outcomes)
         if told is not None:
@@ -494,22 +494,22 @@ class LiveEstimator:
         held, released = self._find_held(stamp, sensor, bits)
         if released or held:
             return self._add_news(stamp, sensor, bits, held, released)
-        return self._update(_Event(stamp, sensor, values), bits, stranger, oldest)
+        return self._update(_Event(stamp, sensor, values), bits, unknown, oldest)
 
     def _fill(self, stamp: int, sensor: str | None, values: _Values) -> tuple[int, str]:
         """Put an event's values into the window's ``value``; which axes these are, as bits, and a name that is none."""
-        new, bits, stranger = self._window.value, 0, ""
+        new, bits, unknown = self._window.value, 0, ""
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
-                stranger = name
+                unknown = name
                 continue
             new[axis] = value if type(value) is float else number(value)
             bits |= 1 << axis
-        if stranger and self.config.frame is not None:
+        if unknown and self.config.frame is not None:
             bits |= self._fill_axes(stamp, sensor, values)
-            stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
-        return bits, stranger
+            unknown = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
+        return bits, unknown
 
     def _fill_axes(self, stamp: int, sensor: str | None, values: _Values, noise: float = 1.0) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
@@ -560,12 +560,12 @@ class LiveEstimator:
             self._add_to_window(earlier, sensor, {name: value}, judged=True)
         return result
 
-    def _update(self, event: _Event, bits: int, stranger: str, oldest: int, judged: bool = False) -> UpdateResult:
+    def _update(self, event: _Event, bits: int, unknown: str, oldest: int, judged: bool = False) -> UpdateResult:
         """Let the filter run on from the place of an event that fills the window's ``value``; what became of it."""
         window, counts, diagnosis, (stamp, sensor, values) = self._window, self._counts, self._diagnosis, event
         if not bits:
-            missing = not stranger and len(values) > 0
-            why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
+            missing = not unknown and len(values) > 0
+            why = "no command has shown yet where x and y are in the arm's axes" if missing else self._why_not(unknown)
             outcome = Outcome.BEFORE_START if missing else _UNKNOWN
             return self._refuse(sensor, values, outcome, why, counts.outcomes)
         rows, source = window.port.end, COMMAND if sensor is None else self._sensors[sensor]
@@ -573,8 +573,8 @@ class LiveEstimator:
         if not window.add(stamp, source, bits, oldest):
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
         codes = bytes(window.outcome)
-        result = self._answers.get(codes) if not stranger else None
-        result = result or self._answer(codes, stranger)
+        result = self._answers.get(codes) if not unknown else None
+        result = result or self._answer(codes, unknown)
         counts.count(window)
         is_due = self._clock.sure >= diagnosis.due or Outcome.REACQUIRED in codes
         if is_due and self._screen.until == NEVER:  # a command that waits may explain it all
@@ -657,25 +657,25 @@ class LiveEstimator:
         elif sensor in self._sensors:
             outcomes[self._sensors[sensor], outcome] += len(result.axes)
         else:
-            self._strangers += 1
+            self._of_unknown_sensors += 1
         return result
 
-    def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
+    def _answer(self, codes: bytes, unknown: str) -> UpdateResult:
         """The result of an event by the codes of its axes; the same object for equal codes, but for unknown names."""
         outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
         result = update_result(outcomes)
-        if stranger:
-            axes = MappingProxyType({**outcomes, stranger: _UNKNOWN})
-            return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
+        if unknown:
+            axes = MappingProxyType({**outcomes, unknown: _UNKNOWN})
+            return result._replace(axes=axes, reason=f"{result.reason}; {self._why_not(unknown)}")
         return self._answers.setdefault(codes, result)
 
-    def _no_axis(self, stranger: str) -> str:
+    def _why_not(self, unknown: str) -> str:
         """Why what an event gives under a name is of no axis."""
-        if stranger in CARTESIAN and self.config.frame is None:
-            return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
-        if not stranger:
+        if unknown in CARTESIAN and self.config.frame is None:
+            return f"'{unknown}' needs a [frame] in fusion.toml; {suggestion(unknown, self.axes)}"
+        if not unknown:
             return "gives no axis"
-        return f"unknown axis '{stranger:.40}'; {suggestion(stranger, [*self.axes, *self.joints])}"
+        return f"unknown axis '{unknown:.40}'; {suggestion(unknown, [*self.axes, *self.joints])}"
 
     def _say_contradiction(self, stamp: int, sensor: str) -> None:
         """Say which other sensor one contradicts, by how much, and since when."""
@@ -735,12 +735,12 @@ class LiveEstimator:
 
     def _start_anew(self, event: _Event, newest: int) -> UpdateResult:
         """A new segment from the events that have shown the commands' clock to be another."""
-        set_aside, self._set_aside = self._set_aside, []
-        first = next(counted.event.stamp for counted in set_aside if counted.event.sensor is None)
+        of_new_clock, self._of_new_clock = self._of_new_clock, []
+        first = next(counted.event.stamp for counted in of_new_clock if counted.event.sensor is None)
         way = "back" if first < newest else "ahead"
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
         self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
-        return self._begin_segment(set_aside, event)
+        return self._begin_segment(of_new_clock, event)
 
     def _begin_segment(self, counted: Sequence[_Counted], *new: _Event) -> UpdateResult:
         """Begin a segment with events of the new clock, which are counted anew; what becomes of the last."""
@@ -773,4 +773,4 @@ class LiveEstimator:
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
         # what came is fed again then, and counted anew.
         self._early: list[_Event] | None = [] if self._frame_start.waits else None
-        self._counts, self._before = counts, copy.deepcopy(counts)
+        self._counts, self._counts_before = counts, copy.deepcopy(counts)

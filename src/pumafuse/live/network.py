@@ -76,7 +76,7 @@ class UdpListener:
         if (lost := self._count_lost()) > self._reported:
             self._reported = lost
             self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
-        return _lines(self._backlog.some(time.monotonic()))
+        return _lines(self._backlog.take(time.monotonic()))
 
     def stop(self) -> list[bytes]:
         """Close the socket, and return the lines that have come and were not given yet."""
@@ -316,7 +316,7 @@ class EventClient(_Client):
         with self._came:
             if not self._backlog:
                 self._came.wait(QUIET)
-            return self._backlog.some(time.monotonic())
+            return self._backlog.take(time.monotonic())
 
     def stop(self) -> list[Event]:
         """The events that have come and were not given yet; no connection is made any more."""

@@ -107,7 +107,7 @@ class Ros2Source:
         self._receive(now)
         if now - self._looked > _LOOK:
             self._find_publishers(now)
-        return self._backlog.some(now)
+        return self._backlog.take(now)
 
     def stop(self) -> list[Event]:
         """The events that have come and were not given yet."""

@@ -25,7 +25,7 @@ from ..fusion.estimates import Estimates
 from ..fusion.faults import by_axis, check_sensors, latency_questions, starts_in_motion
 from ..fusion.offline import Part, estimates_of, row_notes
 from ..fusion.placing import in_base
-from ..fusion.results import Making
+from ..fusion.results import Recipe
 from ..fusion.segments import Segment, build_segment, no_estimates, output_times
 from ..fusion.setup import filter_model
 from ..fusion.summary import Summary, encode
@@ -44,7 +44,7 @@ _IN_ORDER = "so long a run is fused piece by piece, in the order of time: cut th
 
 
 def fuse_to(
-    path: Path, folder: Path, how: Making, force: bool = False, progress: Callable[[float], None] | None = None
+    path: Path, folder: Path, recipe: Recipe, force: bool = False, progress: Callable[[float], None] | None = None
 ) -> Summary:
     """Fuse a long run, filtered, into a result folder that is written as it goes: complete, or not at all."""
     results.check_writable(folder, force)
@@ -55,7 +55,7 @@ def fuse_to(
         with ExitStack() as files:
             names = results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE
             write = [files.enter_context(tables.appending(new / name)) for name in names]
-            for est, span, done in _pieces(Log(path), how):
+            for est, span, done in _pieces(Log(path), recipe):
                 write[0](results.estimates_table(est))
                 write[1](results.measurements_table(est))
                 if est.reference is not None:
@@ -65,29 +65,29 @@ def fuse_to(
                 if progress is not None:
                     progress(done)
         if not any(digest.estimates for digest in digests):
-            raise no_estimates(how.rate)
+            raise no_estimates(recipe.rate)
         summary = merge(digests)
-        results.check_fused(summary.rows, how.config)
-        how.config.save(new)
+        results.check_fused(summary.rows, recipe.config)
+        recipe.config.save(new)
         (new / results.SUMMARY).write_bytes(encode(summary))
     warn(f"run '{summary.run}': {note}" for note in summary.notes)
     return summary
 
 
-def _pieces(log: Log, how: Making) -> Iterator[tuple[Estimates, tuple[int, int], float]]:
+def _pieces(log: Log, recipe: Recipe) -> Iterator[tuple[Estimates, tuple[int, int], float]]:
     """The estimates of each piece, after and until which instants [ns], and which share of the run is done by then."""
-    ahead, overlap = _margins(how.config)
+    ahead, overlap = _margins(recipe.config)
     begun, after, until = None, ALWAYS, ALWAYS
     while until < NEVER:
         cut = log.read_on(PIECE)
         run = log.run()
         if run is None or cut - ahead <= after:
             continue
-        run = run.between(*how.part)
-        begun = begun or _begin(run, how.config, how.selected)
+        run = run.between(*recipe.part)
+        begun = begun or _begin(run, recipe.config, recipe.selected)
         over = cut - ahead > run.ends(begun[0].origin)[1] + overlap
         until = NEVER if cut == NEVER or over else cut - ahead
-        est = _piece(run, how, *begun, (after, until))
+        est = _piece(run, recipe, *begun, (after, until))
         yield est, (after, until), 1.0 if until == NEVER else log.done / log.rows
         told_at = [est.segments[0].commands_of(axis)[0] for axis in est.axes]
         log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in told_at]))
@@ -118,17 +118,17 @@ def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> tupl
     return segment, Filter(model, segment.origin)
 
 
-def _piece(run: Run, how: Making, begun: Segment, core: Filter, span: tuple[int, int]) -> Estimates:
+def _piece(run: Run, recipe: Recipe, begun: Segment, core: Filter, span: tuple[int, int]) -> Estimates:
     """The estimates of the rows after and until the instants ``span`` [int ns], with notes."""
     moved, steps = going_on(run)
     if moved is not run:
         raise RunError(f"{steps[0]}; {_IN_ORDER}")
-    in_place, placed, config = in_base(run, how.config, whole=False)
+    in_place, placed, config = in_base(run, recipe.config, whole=False)
     lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
     if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
         raise RunError(f"{label}: the clock is set back by {lag.max():.3f} s; {_IN_ORDER}")
-    segment = build_segment(in_place, config, how.selected, begun, span)
-    times = output_times(segment, config, how.rate, span=span)
+    segment = build_segment(in_place, config, recipe.selected, begun, span)
+    times = output_times(segment, config, recipe.rate, span=span)
     filtered = filter_piece(segment, core, config, times, span)
     first = span[0] == ALWAYS
     if not first:  # for those who ask where the commands lead: the arm rests at what was commanded before
@@ -141,4 +141,4 @@ def _piece(run: Run, how: Making, begun: Segment, core: Filter, span: tuple[int,
     if first:
         notes += [*starts_in_motion(segment, config), *latency_questions(config, segment.sensors)]
     notes += sensor_problems(est)
-    return replace(est, notes=tuple(notes), rate=how.rate, selected=how.selected, faults=by_axis(faults))
+    return replace(est, notes=tuple(notes), rate=recipe.rate, selected=recipe.selected, faults=by_axis(faults))
