@@ -47,10 +47,6 @@ MM = 1e3  # mm in a metre
 MS = 1e3  # ms in a second
 DEG = 180.0 / math.pi  # degrees in a radian
 TURN = 2.0 * math.pi
-_BESIDE = np.array([0, 1, 3, 4])  # places of the two steps before and after one, with two before the first
-_NOISE = 0.2 / DEG  # rad, of an encoder
-_FEW_JUMPS = 0.05  # of the rows: more are a rotation of nearly a turn from row to row
-_JUMP, _STEP, _ALIKE = 0.75 * TURN, 0.25 * TURN, 3.0  # rad; times the steps beside it, as which a jump goes on
 SCREEN: dict[Kind, Screen] = {
     "length": Screen("mm", MM, "m/s", 1.0),
     "angle": Screen("deg", DEG, "deg/s", DEG),
@@ -92,6 +88,10 @@ _PRECISE = Context(prec=50)
 _RADIANS = Decimal("0.017453292519943295769236907684886127134428718885417254560971914402")  # in a degree
 PROVENANCE = "provenance"  # a table of this name is kept as it is
 INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
+_BESIDE = np.array([0, 1, 3, 4])  # places of the two steps before and after one, with two before the first
+_NOISE = 0.2 / DEG  # rad, of an encoder
+_FEW_JUMPS = 0.05  # of the rows: more are a rotation of nearly a turn from row to row
+_JUMP, _STEP, _ALIKE = 0.75 * TURN, 0.25 * TURN, 3.0  # rad; times the steps beside it, as which a jump goes on
 
 
 @lru_cache(4096)  # a search asks time and again
