@@ -1,6 +1,6 @@
 """Simulated runs of arms of all kinds: do the intervals of `pumafuse latency` hold, and how far off is correlation?
 
-    python benchmarks/lag.py [--runs 200] [--first 1000] [--axes 5] [--drift MS] [--json FILE]
+    python benchmarks/lag.py [--runs 200] [--first 1000] [--axes 5] [--drift MS] [--in-step] [--json FILE]
 
 Motion (steps, scans, sweeps, joints), periods (4 to 50 ms), sensors (5 to 200 Hz), plants, gains, delays and noise are
 drawn at random. The simulation knows nothing of pumafuse: it holds the commands on a grid of 0.1 ms.
@@ -82,13 +82,16 @@ class Found(NamedTuple):
     high: float
 
 
-def simulated(seed: int, axes: int, drift: float = 0.0) -> Case:
-    """A run of so many axes; the lag grows by ``drift`` [s] over it."""
+def simulated(seed: int, axes: int, drift: float = 0.0, in_step: bool = False) -> Case:
+    """A run of so many axes; the lag grows by ``drift`` [s]. ``in_step``: seen at one instant of each period."""
     rng = np.random.default_rng(seed)
     motion, period, rate = (rng.choice(one) for one in (MOTIONS, PERIODS, RATES))
     duration = max(30.0, 300.0 / rate)
     time = np.arange(0.0, duration, period)
     sensor = _stamps(rng, float(rate), duration)
+    if in_step:  # each command, or every n-th, at one instant of its period
+        every = max(round(1.0 / (rate * period)), 1)
+        sensor = time[int(0.5 / period) :: every][:-5] + rng.choice([0.0, 0.1, 0.5]) * period
     second = _stamps(rng, float(rng.choice(RATES)), duration) if rng.random() < 0.5 else None
     shares, shared = rng.random() < 0.6, rng.uniform(0.01, 0.2)
     latency = float(rng.uniform(0.0, 0.1))
@@ -207,10 +210,10 @@ def correlated(case: Case, axis: str) -> float:
     return float(lags[best] + (0.5e-3 * (below - above) / bend if bend < 0.0 else 0.0))
 
 
-def examined(job: tuple[int, int, float]) -> tuple[list[Found], list[tuple[float, float]], list[str]]:
+def examined(job: tuple[int, int, float, bool]) -> tuple[list[Found], list[tuple[float, float]], list[str]]:
     """What is found in a run: numbers with intervals, errors of the lag (ours, the rival's), and what is named."""
-    seed, axes, drift = job
-    case = simulated(seed, axes, drift)
+    seed, axes, drift, in_step = job
+    case = simulated(seed, axes, drift, in_step)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PumafuseWarning)
         try:
@@ -242,10 +245,12 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1000, help="the first seed")
     parser.add_argument("--axes", type=int, default=5)
     parser.add_argument("--drift", type=float, default=0.0, help="of the lag over each run [ms]")
+    parser.add_argument("--in-step", action="store_true", help="measure at one instant of each period")
     parser.add_argument("--json", type=Path, help="keep every number")
     asked = parser.parse_args()
     os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # a process for each run, not for each axis of it
-    jobs = [(seed, asked.axes, 1e-3 * asked.drift) for seed in range(asked.first, asked.first + asked.runs)]
+    seeds = range(asked.first, asked.first + asked.runs)
+    jobs = [(seed, asked.axes, 1e-3 * asked.drift, asked.in_step) for seed in seeds]
     numbers, errors, named = list[tuple[int, Found]](), list[tuple[float, float]](), list[list[str]]()
     with ProcessPoolExecutor() as pool:
         for job, (mine, off, what) in zip(jobs, pool.map(examined, jobs), strict=True):

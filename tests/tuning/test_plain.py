@@ -117,10 +117,12 @@ def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_t
     arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), Arm(0.054, 0.001), 1e-3, *[Measured([], T, [])] * 2)
     doubted = {axis: Doubt(arm, off=1.5e-3, lag=0.08) for axis in config.arm.axes}
 
+    allowed = {axis: one.lag_ci95 for axis, one in doubted.items()}
+
     def told(
         below: float, above: float, lost: Sequence[str] = (), after: pf.FusionConfig = replaced_arm
     ) -> dict[str, tuple[float | None, float | None]]:
-        found = fitted_lags(free, config, after, {first: (below, above)}, doubted, lost)
+        found = fitted_lags(free, config, after, {first: (below, above)}, allowed, lost)
         return {axis: one.lag_ms_ci95 for axis, one in found.items()}
 
     found = told(0.002, 0.002)
@@ -131,6 +133,26 @@ def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_t
     assert told(0.002, np.inf)[first] == (50.0, None)
     assert [Doubt(arm, off, lag=0.08).refutes for off in (3.9e-3, 4.1e-3)] == [False, True]
     assert Doubt(arm, 1e-3, lag=0.08, is_beaten=True).refutes
+
+
+@pytest.mark.parametrize("every", [1, 6])
+def test_a_sensor_in_step_tells_a_dead_time_to_a_period_and_no_better(every: int) -> None:
+    """What it sees 3 ms after commands of 30 Hz is the same for each dead time from 36.4 to 69.6 ms."""
+    period, plant = 1.0 / 30.0, 0.001
+    time = np.arange(0.0, 80.0 / (30.0 / every), period)
+    u = np.interp(time, np.arange(0.0, 90.0, 0.9), 0.1 * np.resize([-1.0, 1.0], 100))
+    axis, stamp, first = AxisModel(plant=FirstOrder(time_constant=plant)), np.rint(time * 1e9).astype(np.int64), u[0]
+    seen = stamp[3::every] + 3_000_000
+    seconds = stamp / 1e9
+    paths = [response(axis, period, delay, stamp, u, first, seen) for delay in (0.0371, 0.066)]
+    np.testing.assert_allclose(*paths, atol=1e-3)
+    value = u[0] + paths[0] + np.random.default_rng(5).normal(0.0, NOISE, len(seen))
+    run = pf.Run.from_arrays(seconds, {"x": u}, {"camera": (seen / 1e9, {"x": value})})
+    found = quietly(lambda: pf.latency(run))
+    low, high = found.details.axes["x"].lag_ci95
+    tuned = quietly(lambda: pf.tune(run, found.config, fit=["noise", "delay", "plant"]))
+    for ends in ((low * 1e3, high * 1e3), tuned.details.lags["x"].lag_ms_ci95):
+        assert -10.0 < ends[0] - 36.4 < 3.0 and -3.0 < ends[1] - 69.6 < 10.0
 
 
 def steps(rest: float, lag: float) -> Recording:

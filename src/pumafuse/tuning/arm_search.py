@@ -329,14 +329,9 @@ class ArmSearch:
         log = fit.log_posterior
         free = [name for name, is_free in zip(names, inside, strict=True) if is_free]
         some = np.flatnonzero(inside)
-        information = fit.information[np.ix_(some, some)]
-        for row, name in enumerate(free):
-            if name in PRIORS:
-                log -= math.log(PRIORS[name][1] * math.sqrt(2.0 * math.pi))
-            else:  # uniform: where the likelihood is flat, it ends at its bounds all the same
-                width = self._longest if name == "delay" else _LOG_RANGE
-                log -= math.log(width)
-                information[row, row] += 12.0 / width**2
+        information = self._bounded(fit.information[np.ix_(some, some)], free)
+        for name in free:
+            log -= math.log(PRIORS[name][1] * math.sqrt(2.0 * math.pi) if name in PRIORS else self._width(name))
         if not np.isfinite(information).all():  # an arm that runs off
             return -math.inf
         if free:
@@ -344,6 +339,14 @@ class ArmSearch:
             _, determinant = np.linalg.slogdet(information / np.outer(size, size) + 1e-9 * np.eye(len(free)))
             log -= 0.5 * (float(determinant) + 2.0 * float(np.log(size).sum()) - len(free) * math.log(2.0 * math.pi))
         return log
+
+    def _width(self, name: str) -> float:
+        """Of the range in which a coordinate without another prior is as likely everywhere."""
+        return self._longest if name == "delay" else _LOG_RANGE
+
+    def _bounded(self, information: FloatArray, names: Coordinates) -> FloatArray:
+        """The information with that of the bounds: where the likelihood is flat, it ends there all the same."""
+        return information + np.diag([0.0 if name in PRIORS else 12.0 / self._width(name) ** 2 for name in names])
 
     # ---- the walk ---------------------------------------------------------------------------------------------------
 
@@ -390,7 +393,7 @@ class ArmSearch:
     def _entry(self, fit: Fit, names: Coordinates) -> Entry:
         inside = self.limits.inside(fit.arm, names)
         free = [name for name, is_free in zip(names, inside, strict=True) if is_free]
-        cov = covariance(fit.information[np.ix_(inside, inside)])
+        cov = covariance(self._bounded(fit.information[np.ix_(inside, inside)], free))
         means = _quantities(fit.arm)
         moved = [_quantities(fit.arm.moved([name], [fit.arm.coordinate(name) + _SLOPE])) for name in free]
         sds: dict[Quantity, float] = {}

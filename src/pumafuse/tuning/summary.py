@@ -20,7 +20,7 @@ from ..units import MS, Kind
 from .identifiability import Correlation
 from .intervals import ConfidenceInterval, Distances, lag_slopes
 from .parameters import Parameter
-from .plain import LONGEST, Doubt
+from .plain import LONGEST
 from .validation import Check, fused
 
 _FROM_PRIOR = 0.8  # of the prior's interval, from which the measurements say hardly anything
@@ -137,20 +137,20 @@ def fitted_lags(
     before: FusionConfig,
     after: FusionConfig,
     around: Mapping[str, Distances],
-    doubts: Mapping[str, Doubt] = MappingProxyType({}),
+    allowed: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     lost: Collection[str] = (),
 ) -> dict[str, FittedLag]:
-    """The lag of each axis that the free parameters change, or whose arm is doubted, but for those that are ``lost``.
+    """The lag of each axis that the free parameters change, or that has ``allowed`` ones, but for those ``lost``.
 
-    Intervals are ``around`` it, from :func:`lag_intervals`; where least squares doubt the arm they cover what these
-    say, and where it was not fitted they are that and the lag itself.
+    Intervals are ``around`` it, from :func:`lag_intervals`; they cover what least squares ``allowed`` [s] where these
+    doubt the arm or know better how sure it is, and where it was not fitted they are that and the lag itself.
     """
     lags, slopes = dict[str, FittedLag](), lag_slopes(free, after)
-    for axis in (axis for axis in dict.fromkeys([*slopes, *doubts]) if axis not in lost):
+    for axis in (axis for axis in dict.fromkeys([*slopes, *allowed]) if axis not in lost):
         lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
         low, high = max(lag - below, min(lag, 0.0)), lag + above  # no arm is there before its commands
-        if axis in doubts:
-            least, most = doubts[axis].lag_ci95
+        if axis in allowed:
+            least, most = allowed[axis]
             low, high = (low, high) if axis in slopes else (lag, lag)
             low, high = min(low, least), max(high, most)
         ends = [end * MS if abs(end) <= LONGEST else None for end in (low, high)]
