@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,7 @@ ABOUT_ONE = 1.25  # factor by which one moves less or more than the other, where
 # Of what is left at a lag before the other moves, as much as is left of it at once: then that lag means nothing. Where
 # it is hardly more than noise, also less does.
 _AS_WELL, _NOISE = 1.05, 3.0
+_IN_STEP = 0.9  # resultant of the measurements' phases: a jitter of 7 % of an update period
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
 
 
@@ -133,6 +135,20 @@ def in_seconds(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatA
     valid = (stamp != NO_STAMP) & (np.abs(value) < _BEYOND)
     time, order = np.unique((stamp[valid] - origin) / 1e9, return_index=True)
     return time, value[valid][order]
+
+
+def phase(rows: Iterable[tuple[TimeArray, TimeArray]], period: float) -> float | None:
+    """How long after a command all measurements are valid, in update periods [s]; None where that differs.
+
+    ``rows``: of each run when commands were given, ascending, and when measurements are valid [ns].
+    """
+    since = [np.zeros(0)]
+    for told, time in rows:
+        row = np.searchsorted(told, time, side="right") - 1
+        since.append((time[row >= 0] - told[row[row >= 0]]) / (period * 1e9))
+    turns = np.exp(2j * np.pi * np.concatenate(since))
+    resultant = turns.mean() if len(turns) else 0.0
+    return float(np.angle(resultant) / (2.0 * np.pi) % 1.0) if abs(resultant) > _IN_STEP else None
 
 
 def _at_span(

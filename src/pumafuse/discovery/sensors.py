@@ -20,7 +20,7 @@ import numpy as np
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..logs.run import Run, Source
 from ..units import MS
-from .following import following, in_seconds, isolated
+from .following import following, in_seconds, isolated, phase
 from .paths import (
     ASIDE,
     Basis,
@@ -47,6 +47,9 @@ _BETTER = 0.98  # of what a smooth path leaves of the second sensor: one through
 _BEYOND = 3.0  # sds from which a row counts less (Huber)
 _PIECES = 20  # of the motion
 _FINEST = 6e-5  # s: between two commands the path is known no better, see benchmarks/lag.py, and no stamp of a log is
+# Of an update period, where a sensor sees one instant of each: the path may have steps there. By simulation,
+# benchmarks/lag.py --in-step
+_UNSEEN = 0.05
 _REACH, _STEP = 0.3, 0.005  # s: how far a latency steps at the most, and the grid on which steps are looked for
 _TABLE, _DENSE = 50_000, 2e-3  # instants at which a path is computed for these, at the most; s between them
 _FAR = 25.0  # squared sds, beyond which a row says no more about a step
@@ -176,6 +179,7 @@ class _Axis:
     z2: FloatArray
     lag: float
     slope: float
+    finest: float  # to which its path is known between rows [s]
 
     @cached_property
     def first(self) -> _Design:
@@ -237,7 +241,10 @@ def _axis(run: Run, name: str, first: Source, second: Source) -> _Axis | None:
     if inside.sum() < _FEWEST:
         return None
     by_first = path(in_seconds(*told, origin), behind.lag, s, z1)
-    return _Axis(name, by_first, s, z1, x[inside], z2[inside], between.lag, between.slope)
+    period = float(np.median(np.diff(stamp := np.sort(told[0])))) / 1e9
+    in_step = any(phase([(stamp, row[0])], period) is not None for row in rows)
+    finest = max(_UNSEEN * period, _FINEST) if in_step else _FINEST
+    return _Axis(name, by_first, s, z1, x[inside], z2[inside], between.lag, between.slope, finest)
 
 
 def _clean(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
@@ -414,7 +421,7 @@ def _jackknife(grams: Sequence[FloatArray], lines: Sequence[_Linear], latency: f
     sd = np.sqrt((_PIECES - 1) / _PIECES * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
     half = float(stdtrit(_PIECES - 1, 0.975)) * sd
     scale = np.array([line.noise.scale for line in lines])
-    return _Fit(latency, max(float(half[0]), _FINEST), scale, half[1:], lines)
+    return _Fit(latency, max(float(half[0]), *(line.axis.finest for line in lines)), scale, half[1:], lines)
 
 
 # ---- steps ----------------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
+from ..discovery.following import phase
 from ..filter.core import AXIS, Record, check, library, ptr
 from ..filter.response import record_of
 from ..model.arm import AxisModel, Gain, Sag
@@ -53,7 +54,6 @@ _REACH = {
 }  # fmt: skip
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _NUDGE = 1e-5  # of a coordinate, by which a size is varied
-_IN_STEP = 0.9  # resultant of the measurements' phases: a jitter of 7 % of an update period
 _SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
 _BLOCKS, _STUDENT = 10, 2.262157  # of the motion; the 97.5 % point of Student's t distribution of one fewer
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -227,13 +227,7 @@ class Measured:
     @property
     def phase(self) -> float | None:
         """How long after a command all measurements are valid, in update periods; None where that differs."""
-        since = [np.zeros(0)]
-        for recording in self.recordings:
-            row = np.searchsorted(recording.told, recording.time, side="right") - 1
-            since.append((recording.time[row >= 0] - recording.told[row[row >= 0]]) / (self.period * 1e9))
-        turns = np.exp(2j * np.pi * np.concatenate(since))
-        resultant = turns.mean() if len(turns) else 0.0
-        return float(np.angle(resultant) / (2.0 * np.pi) % 1.0) if abs(resultant) > _IN_STEP else None
+        return phase(((recording.told, recording.time) for recording in self.recordings), self.period)
 
     def unseen(self, arm: Arm) -> tuple[float, float]:
         """How far an arm is from a line between neighbouring measurements, and how far it goes from one to the next.
