@@ -50,6 +50,9 @@ def test_a_parameter_at_a_bound_is_reported() -> None:
     found = quietly(lambda: pf.tune([sim.run], early, fit=["delay"]))
     for one in found.details.parameters:
         assert one.ci95[0] is None and one.notes.startswith("at its lower bound (0"), one
+    arm = found.config.arm
+    ends = [one.delay_ci95 for one in (arm, *arm.axes.values()) if one.delay_ci95 is not None]
+    assert ends and all(low == 0.0 < high for low, high in ends)  # no dead time is below 0
 
 
 def test_pairs_beyond_nine_tenths_are_named() -> None:

@@ -272,7 +272,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     if endless := [axis for axis, lag in lags.items() if lag.lag > LONGEST]:
         lost += endless
         config, lags = _arm(likelihood.config, {axis: searches[axis] for axis in moving if axis not in lost}, trusted)
-    for axis, (low, high) in unseen_lags({axis: searches[axis].plain for axis in lags}).items():
+    for axis, (low, high) in unseen_lags({axis: searches[axis].plain for axis in lags}, config).items():
         both = min(low, lags[axis].lag_ci95[0]), max(high, lags[axis].lag_ci95[1])
         lags[axis] = msgspec.structs.replace(lags[axis], lag_ci95=both)
     for axis, doubt in doubts({axis: searches[axis].plain for axis in lags}, config).items():

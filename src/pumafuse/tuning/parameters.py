@@ -92,6 +92,11 @@ class Parameter:
         return "bias_drift_sd" in self.path or (self.path[0] == "process" and self.path[-1] != "disturbance_time")
 
     @property
+    def least(self) -> float:
+        """What it can never be below [SI]."""
+        return 0.0 if self.log or self.fit == "delay" else -math.inf
+
+    @property
     def is_noise(self) -> bool:
         """Whether it is the noise of a sensor."""
         return self.fit == "noise" and self.sensor is not None

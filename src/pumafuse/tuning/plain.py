@@ -36,9 +36,10 @@ _MOST = 0.8  # of the measurements: how far these are off is not decided by sing
 _DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced,
 _NOTHING = 1e-3  # of the range that is measured: nothing is said of what is off by less
 _NOTABLE = 0.1  # of the lag, by which it lies outside of what least squares allow, or steps: it is said
+_ANOTHER = 1.0 / 3.0  # of the lag, from which an arm's is quite another one
 _SPLITS = np.linspace(0.1, 0.9, 9)  # of a run, where its lag may step: sooner is its start
 _OF_QUARTERS = np.linspace(0.125, 0.875, 7)  # likewise, of a long one of which parts of its quarters are looked at
-_HALVED = 0.5  # of the squares, which two lags must leave less than
+_HALVED = 0.5  # of the squares, which two lags, or an arm of quite another lag, must leave less than
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
 
 
@@ -189,6 +190,12 @@ class Doubt(NamedTuple):
         return self.off > _DOUBTED * self.plain.delayed_off
 
     @property
+    def is_another(self) -> bool:
+        """Whether its lag is quite another one: how an axis hardly follows its commands, a model of noise decides."""
+        lag = self.plain.arm.total
+        return abs(self.lag - lag) > max(_ANOTHER * lag, self.plain.measured.period)
+
+    @property
     def refutes(self) -> bool:
         """Whether the arm of least squares is to take its place."""
         return self.is_beaten or (self.is_worse and self.off > _REFUTED * self.plain.delayed_off)
@@ -207,7 +214,9 @@ class Doubt(NamedTuple):
                 f" {self.lag * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
                 f" commands{times} {delayed.total * MS:.0f} ms later are {far:.3g}"
             )
-        elif (self.is_beaten and matters) or max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total:
+        elif ((self.is_beaten or self.is_another) and matters) or (
+            max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total
+        ):
             what = (
                 f"the likelihood says a lag of {self.lag * MS:.4g} ms, least squares, which have no model of noise,"
                 f" {self.plain.arm.total * MS:.4g} ({low * MS:.4g} to {high * MS:.4g})"
@@ -224,30 +233,36 @@ def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[s
     """The arms of a configuration that predict worse than the delayed command, or lag otherwise, by axis.
 
     Play, a fastest speed and a gain of the speed make a lag another one with each motion: then it is not compared.
+    Quite another lag is doubted although least squares allow it: where an axis hardly follows, they allow any.
     """
     doubts_by_axis: dict[str, Doubt] = {}
     for axis, plain_here in plain.items():
         if plain_here is not None:
             configured = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
             doubt = Doubt(plain_here, off(plain_here.measured, configured), configured.total)
-            ends = *plain_here.lag_ci95, plain_here.delayed.total
+            ends, measured = (*plain_here.lag_ci95, plain_here.delayed.total), plain_here.measured
             allowed = min(ends) <= configured.total <= max(ends)
+            if doubt.is_another:  # it may be, if it explains much more
+                allowed = allowed and measured.squares(configured) < _HALVED * measured.squares(plain_here.arm)
             if doubt.is_worse or not (allowed or configured.play or configured.max_speed or configured.slope):
                 doubts_by_axis[axis] = doubt
     return doubts_by_axis
 
 
-def unseen_lags(plain: Mapping[str, PlainArm | None]) -> dict[str, tuple[float, float]]:
+def unseen_lags(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[str, tuple[float, float]]:
     """The lags [s] that least squares allow each axis that is measured in step with its commands.
 
     Its sensor sees one instant of each step. The likelihood may be flat between two lags and end there all at once, of
-    which its curvature at a maximum knows nothing.
+    which its curvature at a maximum knows nothing. They are an update period apart at most: so far from the configured
+    one least squares are asked. Beyond, the likelihood knows better what a disturbance or a fastest speed makes of it.
     """
-    return {
-        axis: plain_here.lag_ci95
-        for axis, plain_here in plain.items()
-        if plain_here is not None and plain_here.measured.phase is not None
-    }
+    lags: dict[str, tuple[float, float]] = {}
+    for axis, plain_here in plain.items():
+        if plain_here is not None and plain_here.measured.phase is not None:
+            lag, period = config.arm.lag_of(axis), plain_here.measured.period
+            low, high = np.clip(plain_here.lag_ci95, lag - period, lag + period).tolist()
+            lags[axis] = low, high
+    return lags
 
 
 def lag_steps(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> list[str]:

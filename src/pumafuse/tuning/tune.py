@@ -188,7 +188,7 @@ def tune(
     lost = [axis for axis, search in arms.items() if search.plain is None or result.arm.lag_of(axis) > LONGEST]
     untold = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]  # nobody measures these
     looked_for = {axis: search.plain for axis, search in arms.items() if {"delay", "lag"} & set(search.freedom.free)}
-    allowed = unseen_lags(looked_for) | {axis: doubt.lag_ci95 for axis, doubt in doubted_axes.items()}
+    allowed = unseen_lags(looked_for, result) | {axis: doubt.lag_ci95 for axis, doubt in doubted_axes.items()}
     lags = fitted_lags(free, config, result, around, allowed, untold)
     tuned = _with_provenance(result, free, by_key, {} if interrupted else lags, names)
     doubted += lag_steps({axis: search.plain for axis, search in arms.items()}, tuned)
@@ -422,8 +422,8 @@ def _with_provenance(
     for parameter in arm:
         interval = intervals[parameter.key]
         low, high = (
-            sign * math.inf if is_open else rounded(end)
-            for sign, is_open, end in zip((-1, 1), interval.open, interval.ci95, strict=True)
+            unlimited if is_open else rounded(end)
+            for unlimited, is_open, end in zip((parameter.least, math.inf), interval.open, interval.ci95, strict=True)
         )
         config = changed(config, (*parameter.path[:-1], f"{parameter.path[-1]}_ci95"), (low, high))
     for axis, lag in lags.items():
