@@ -70,7 +70,8 @@ double behind_change(double end, Course first, Course last, auto course) {
     for (int k = 1;; ++k) {
         const double span = end - begin;
         if (span <= 2.0 * width) return course(end), end;
-        const double part = k % 4 == 0 ? 0.5 : zero_of_cubic({first.value, span * first.slope}, {last.value, span * last.slope});
+        const Course from = {first.value, span * first.slope}, to = {last.value, span * last.slope};
+        const double part = k % 4 == 0 ? 0.5 : zero_of_cubic(from, to);
         const double t = clip(begin + span * part + 0.5 * width, begin + width, end - width);
         const Course now = course(t);
         const bool behind = !changes(now.value, last.value);
@@ -165,9 +166,9 @@ struct Arm {
 
     // Whether the drive goes on without its limit, and neither turns against its tool nor leaves it: no cut is needed.
     //
-    // It swings about u + c e, which an input that decays draws it along. The energy of that only falls, which bounds how
-    // large a gap and how far from its tool it gets. Where the decay is close to a pole there is no such path: then the
-    // gain error adds what it can at most.
+    // It swings about u + c e, which an input that decays draws it along. The energy of that only falls, which bounds
+    // how large a gap and how far from its tool it gets. Where the decay is close to a pole there is no such path: then
+    // the gain error adds what it can at most.
     bool is_undisturbed(const Drive<Real>& d, const Real& slack) const {
         const double e = value_of(d.error), along = drawn * e, forced = drawn == 0.0 ? overshoot * std::fabs(e) : 0.0;
         const double x = value_of(d.x) - d.u, rate = value_of(d.rate) + value_of(plant.decay) * along;
@@ -202,8 +203,8 @@ struct Arm {
     }
 
     // How fast the drive goes and the gap closes. With a factor of exp(bt) both have the slope x" + b x', which is free
-    // of the gain error and moves, with its own rate, as the free plant does: it changes its sign once at most within half
-    // a swing, and on either side of that each of the two does (Rolle).
+    // of the gain error and moves, with its own rate, as the free plant does: it changes its sign once at most within
+    // half a swing, and on either side of that each of the two does (Rolle).
     struct Motion { double rate, closing, slope, slope_rate; };
 
     [[gnu::always_inline]] Motion motion(const Drive<Real>& d, int side) const {
@@ -223,8 +224,8 @@ struct Arm {
         return m;
     }
 
-    // That of `then`, dt behind `m` by the transition f of the free plant. By the gap, as at first, it would be rounding
-    // once little is left of it; so is what f leaves of a plant of first order, in the end.
+    // That of `then`, dt behind `m` by the transition f of the free plant. By the gap, as at first, it would be
+    // rounding once little is left of it; so is what f leaves of a plant of first order, in the end.
     Motion later(const Motion& m, const Drive<Real>& then, const Transition<Real>& f, double dt) const {
         const double slope = value_of(f.f11) * m.slope + value_of(f.f12) * m.slope_rate;
         const double decay = value_of(plant.decay), e = value_of(then.error);
@@ -236,8 +237,10 @@ struct Arm {
         return {rate, decay * e + rate, slope, value_of(f.f21) * m.slope + value_of(f.f22) * m.slope_rate};
     }
 
-    // One of the two over time.
-    Course course(const Motion& m, double Motion::*of) const { return {m.*of, m.slope - value_of(plant.decay) * m.*of}; }
+    // A rate of the motion over time.
+    Course course(const Motion& m, double Motion::*of) const {
+        return {m.*of, m.slope - value_of(plant.decay) * m.*of};
+    }
 
     // Whether the drive may have to be cut where one of the two changes its sign, as far as both ends tell at a glance:
     // it need not where both keep it by more than rounding, and do not turn to it and back.
@@ -261,8 +264,8 @@ struct Arm {
         return changes(m.*of, n.*of) || (may_return && m.*of * m.slope < 0.0 && n.*of * n.slope > 0.0);
     }
 
-    // Whether the drive has to be cut where it turns against its tool, or where its gap turns near the limit: a gap that
-    // turns once, and slows down from the start, gets no farther than at the speed that it has.
+    // Whether the drive has to be cut where it turns against its tool, or where its gap turns near the limit: a gap
+    // that turns once, and slows down from the start, gets no farther than at the speed that it has.
     bool play_cuts(const Motion& m, const Motion& n) const { return cut_by_play && turns(m, n, &Motion::rate); }
     bool limit_cuts(const Drive<Real>& d, const Motion& m, const Motion& n, double dt) const {
         if (!cut_by_limit || !turns(m, n, &Motion::closing)) return false;
@@ -285,8 +288,8 @@ struct Arm {
         }
     }
 
-    // The path up to its first cut on the way to `then`, or to that; and how long it takes. Not a part of the loop, which
-    // is small and seldom comes here.
+    // The path up to its first cut on the way to `then`, or to that; and how long it takes. Not a part of the loop,
+    // which is small and seldom comes here.
     [[gnu::noinline]] std::tuple<Drive<Real>, Real> cut(Drive<Real> d, Drive<Real> then, Real slack, int side,
                                                         Real taken) const {
         if (is_undisturbed(d, slack)) return {then, taken};

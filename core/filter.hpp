@@ -357,7 +357,8 @@ void run_as_live(const Filter<N>& filter, State<N, double>& state, const Table& 
         return order;
     };
     const std::vector<Time> queue = by(count, arrival), turn = by(n, asked);
-    std::vector<Time> valid(n + 1, count), back(n + 1, count);  // rows by each estimate, and from where on they run anew
+    // Rows by each estimate, and from where on they run anew.
+    std::vector<Time> valid(n + 1, count), back(n + 1, count);
     Time places = 1;  // more than rows may have to be taken back
     for (Time k = 0, due = 0, reached = 0; k <= n; ++k) {
         if (k < n) valid[k] = std::upper_bound(events.time, events.time + count, times[turn[k]]) - events.time;

@@ -7,7 +7,8 @@ namespace {
 
 constexpr int LANES = 14;  // derivatives that one pass carries at most: as many as an axis of two sensors mostly has
 
-// Calls `make` with as many lanes as k parameters need, where that is worth a compiler's time: few axes have many states.
+// Calls `make` with as many lanes as k parameters need, where that is worth a compiler's time: few axes have many
+// states.
 template <int N>
 void with_lanes(Time k, auto make) {
     if constexpr (N <= 7) {

@@ -100,7 +100,8 @@ class Plant {
         return {omega * omega * h, omega * omega * (f.f12 - decay * h), left};
     }
 
-    // c: what decays is followed to c times itself, once the plant's own motion has faded. 0 where it is close to a pole.
+    // c: what decays is followed to c times itself, once the plant's own motion has faded. 0 where it is close to a
+    // pole.
     Real drawn() const { return close ? Real(0.0) : order == 1 ? share : omega * omega * share; }
 
   private:
@@ -175,7 +176,8 @@ class Plant {
         for (Real left = close ? exp(-b * u) : Real(0.0); doublings > 0; --doublings, left = left * left) {
             const Real f = g_rate + 2.0 * s * g, gg = g * g;  // Phi = [f, g; -w g, g']
             h = f * h + g * (g - b * h) + left * h;
-            if constexpr (ENERGY) energy = energy + f * f * energy + f * g * gg + gg * (w * energy + s * gg + g * g_rate);
+            if constexpr (ENERGY)
+                energy = energy + f * f * energy + f * g * gg + gg * (w * energy + s * gg + g * g_rate);
             g = (f + g_rate) * g, g_rate = g_rate * g_rate - w * gg;
         }
         return {g / fastest, g_rate, h / (fastest * fastest), energy / (fastest * fastest * fastest)};

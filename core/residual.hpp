@@ -54,7 +54,9 @@ struct Noise {
 
     // Add a state; returns which.
     int add(Real rate, Real at_first) {
-        if (size == N) throw std::length_error("an axis has more than 64 states: too many sensors have biases");
+        if (size == N)
+            throw std::length_error("an axis has more than 64 states: too many sensors have biases;"
+                                    " set bias_sd and bias_drift_sd of some to 0 in fusion.toml");
         reverting[size] = rate, variance[size] = at_first;
         return size++;
     }
@@ -231,8 +233,8 @@ struct Residual {
         drift = square(noise.drift) + square(noise.maneuver_drift * maneuver);
     }
 
-    // Phi_s <- Phi Phi_s and Q_s <- Phi Q_s Phi^T + q Q1. Commands change q, so that each ends an interval; x and P wait
-    // for the next measurement, which saves half of the time of a likelihood.
+    // Phi_s <- Phi Phi_s and Q_s <- Phi Q_s Phi^T + q Q1. Commands change q, so that each ends an interval; x and P
+    // wait for the next measurement, which saves half of the time of a likelihood.
     void accumulate(const Plant<Real>& plant, const Instant<Real>& to) {
         const Real dt = seconds(until, to);
         if (is_zero(dt)) return;

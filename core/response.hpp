@@ -52,8 +52,8 @@ struct Response {
     ByDoubt<> by_doubt(const Arm<Real>& arm) const { return {-value_of(speed(arm)), value_of(position(arm))}; }
 };
 
-// Some more commands at their instants, ascending, and the positions at n instants, ascending too. Each follows from the
-// last command alone, so that no bit of it depends on what else is asked for.
+// Some more commands at their instants, ascending, and the positions at n instants, ascending too. Each follows from
+// the last command alone, so that no bit of it depends on what else is asked for.
 inline void follow(Response<double>& response, const Arm<double>& arm, Time delay, Time commands, const Time* told_at,
                    const double* command, Time n, const Time* time, double* position) {
     const auto to = [&](Response<double>& now, Time at) {

@@ -1,4 +1,4 @@
-// The search for an arm: responses of many arms against what was measured, under the noise that the best of them leaves.
+// The search for an arm: responses of many arms against measurements, under the noise that the best of them leaves.
 #pragma once
 #include <cstring>
 
@@ -76,8 +76,9 @@ class Whitening {
     std::vector<Step> steps;
 };
 
-// Where an axis goes without noise, relative to its start level, at n instants, with each of some dead times [ns]: those
-// of one arm have its way through the commands in common. Each position follows from the last command. (delays, n).
+// Where an axis goes without noise, relative to its start level, at n instants, with each of some dead times [ns]:
+// those of one arm have its way through the commands in common. Each position follows from the last command.
+// (delays, n).
 inline void respond(const Arm<double>& arm, double start, const std::vector<Time>& delays, Time commands,
                     const Time* told_at, const double* command, Time n, const Time* time, double* position) {
     Response<double> response;

@@ -27,7 +27,7 @@ template <int N>
 class Window final : public pf_live {
   public:
     Window(const Model<double>& model, Time room, Time most)
-        : model(model), filter(model), state(filter.at_rest(0)), tried(state), rows(room, size(), state), most(most),
+        : model(model), filter(model), state(filter.at_rest(0)), trial(state), rows(room, size(), state), most(most),
           first(size(), PF_NEVER), numbers(7 * size(), 1.0), codes(2 * size()) {
         double period = 0.0, latency = 0.0;
         for (const Axis<double>& axis : model.axes) period = std::max(period, axis.period);
@@ -57,17 +57,17 @@ class Window final : public pf_live {
         while (hidden < done && rows[hidden].stamp <= after) ++hidden;
         const Time until = first_after(time), stamped = std::min(time, after);
         Time row = std::min({hidden, done, until});
-        tried = row < done ? rows.at(row).before : state;
+        trial = row < done ? rows.at(row).before : state;
         std::int16_t contradicts;
         const Fate unused{&numbers[4 * size()], &numbers[5 * size()], &numbers[6 * size()], &codes[size()],
                           &contradicts};
         for (; row < until; ++row)  // what is valid by then, without what is hidden
-            if (rows[row].stamp <= (row < done ? after : stamped)) filter.step(tried, rows[row], unused);
-        filter.estimate(tried, rows, until, end, time, stamped, outputs);
+            if (rows[row].stamp <= (row < done ? after : stamped)) filter.step(trial, rows[row], unused);
+        filter.estimate(trial, rows, until, end, time, stamped, outputs);
         for (Time a = 0; a < size(); ++a) {
-            outputs[a] += tried.axes[a].response.start;  // positions come first
+            outputs[a] += trial.axes[a].response.start;  // positions come first
             fused[a] = port.origin;
-            for (const Gate& gate : tried.gates[a].sensor) fused[a] = std::max(fused[a], gate.fused_at);
+            for (const Gate& gate : trial.gates[a].sensor) fused[a] = std::max(fused[a], gate.fused_at);
         }
     }
 
@@ -132,8 +132,9 @@ class Window final : public pf_live {
         mutable std::vector<Row> places;
 
         Ring(Time room, Time axes, const State<N, double>& state)
-            : axes(axes), places(std::bit_ceil(std::uint64_t(std::max(room, 2 * SPARE * axes))),
-                                 {0, 0, 0, NOBODY, std::vector<double>(5 * axes), std::vector<Code>(2 * axes), state}) {}
+            : axes(axes),
+              places(std::bit_ceil(std::uint64_t(std::max(room, 2 * SPARE * axes))),
+                     {0, 0, 0, NOBODY, std::vector<double>(5 * axes), std::vector<Code>(2 * axes), state}) {}
 
         Time room() const { return Time(places.size()); }
         Row& at(Time row) const { return places[row & (room() - 1)]; }
@@ -153,13 +154,13 @@ class Window final : public pf_live {
 
     Model<double> model;
     Filter<N> filter;
-    State<N, double> state, tried;  // tried: for estimates
+    State<N, double> state, trial;  // trial: for estimates
     Ring rows;
     Time most;                                      // rows, at the most
     Time begin = 0, end = 0, done = 0, target = 0;  // of rows: those in the state, and those that are to be
     Time behind = 0;                                // ns: how far a measurement may lie before its stamp, and a period
     std::vector<Time> first;                        // stamp of the first command of each axis
-    std::vector<double> numbers;                    // of the port; innovations of what is tried
+    std::vector<double> numbers;                    // of the port; innovations of the trial
     std::vector<Code> codes;                        // likewise
 
     Time size() const { return Time(model.axes.size()); }

@@ -117,14 +117,14 @@ PF_API const char *pf_error(void); /* of the last call of this thread that faile
  * input; what an input that decays from 1 m by exp(-dt/Tr) makes of position and rate, and what is left of it; Phi and
  * Q of a smooth disturbance of variance 1. */
 PF_API void pf_transition(const pf_axis *axis, double dt, double step[17]);
-/* Where each of `count` arms goes without noise, relative to its start level [m], at n instants, ascending; commands [m]
- * are told at their instants, ascending. position (count, n). Returns 0; -1 without memory, as the next ones do. */
+/* Where each of `count` arms goes without noise, relative to its start level [m], at n instants, ascending; commands
+ * [m] come at their instants, ascending. position (count, n). Returns 0; -1 without memory, as the next ones do. */
 PF_API int pf_response(int64_t count, const pf_axis *axis, int64_t commands, const int64_t *told_at,
                        const double *command, int64_t n, const int64_t *time, double *position);
 
 /* What an axis without noise does just after a command, relative to its start level: when it acts [ns], the command in
- * force and the step that it was [m], the gain error [m], position [m] and rate [m/s] of the drive, and what the tool is
- * ahead of it [m]. At rest before any: PF_ALWAYS and zeros. */
+ * force and the step that it was [m], the gain error [m], position [m] and rate [m/s] of the drive, and what the tool
+ * is ahead of it [m]. At rest before any: PF_ALWAYS and zeros. */
 typedef struct {
     int64_t time;
     double command, step, error, position, rate, slack;

@@ -54,8 +54,9 @@ def test_what_cannot_be_exported_is_one_line(text: str, name: str, words: str, t
 
 
 def test_a_model_with_too_many_states_is_refused(tmp_path: Path) -> None:
-    """As `live` refuses it: by the core's own reason."""
+    """As `live` refuses it: by the core's own reason, with what is to be done."""
     config = tmp_path / "fusion.toml"
     sensors = "".join(f"[sensors.s{n}]\nsd_mm = 1.0\nbias_sd_mm = 1.0\n" for n in range(70))
     config.write_text(f'arm = "puma560-internal"\n{sensors}')
-    assert "too many sensors have biases" in refused("export", "-c", config, "-o", tmp_path / "filter.h")
+    said = refused("export", "-c", config, "-o", tmp_path / "filter.h")
+    assert "too many sensors have biases; set bias_sd and bias_drift_sd of some to 0" in said
