@@ -36,10 +36,10 @@ def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Call
     if not exists:
         above = next(parent for parent in folder.absolute().parents if parent.exists())
         if not above.is_dir() or not os.access(above, os.W_OK):
-            raise FolderError(f"{folder}: cannot be written: {above} is no folder that may be written to")
+            raise FolderError(f"{folder}: cannot be written: {above} is no folder you may write to; choose another")
         return
     if not folder.is_dir():
-        raise FolderError(f"{folder}: exists and is not a folder")
+        raise FolderError(f"{folder}: exists and is not a folder; choose another name")
     if not any(folder.iterdir()):
         return
     strange = sorted(path.name for path in folder.iterdir() if not ours(path.name) or not path.is_file())

@@ -38,7 +38,7 @@ def test_no_run_and_no_measurement() -> None:
 def test_a_run_given_twice_and_nothing_free() -> None:
     """Measurements must not count twice; fixing everything leaves nothing to fit."""
     run = outage(1).run
-    assert refused([run, run]) == f"run '{run.name}' is given twice: its measurements would count twice"
+    assert refused([run, run]) == f"run '{run.name}' is given twice: its measurements would count twice; give it once"
     assert refused([run], fit=["delay"], fix=["delay_ms"]) == "everything that could be fitted is fixed: nothing to fit"
 
 

@@ -41,6 +41,7 @@ _FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, _LOG, "fusion.toml", ARM_
 _RUN = "run.toml"
 _REFERENCE_PREFIX = "reference."
 _QUATERNION = ("qx", "qy", "qz", "qw")
+_FUSE_AGAIN = "fuse the run again"
 
 
 @dataclass(frozen=True)
@@ -197,19 +198,20 @@ def _summary(folder: Path) -> Summary:
         return decode((folder / SUMMARY).read_bytes())
     except (OSError, msgspec.MsgspecError) as error:
         why = error.strerror if isinstance(error, OSError) else error
-        raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY}: {why})") from None
+        advice = "give the folder of its --output"
+        raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY}: {why}); {advice}") from None
 
 
 def _check_unchanged(path: Path, time: FloatArray, segment: IntArray, axes: Mapping[str, AxisEstimate]) -> None:
     """Refuse estimates that were changed: a comparison would take them for what they are not."""
     if not len(time) or not axes:
-        raise FolderError(f"{path}: no estimates")
+        raise FolderError(f"{path}: no estimates; {_FUSE_AGAIN}")
     within = np.diff(segment) == 0
     if not np.isfinite(time).all() or (np.diff(time)[within] < 0.0).any() or (np.diff(segment) < 0).any():
-        raise FolderError(f"{path}: time_s is not ascending; the file was changed")
+        raise FolderError(f"{path}: time_s is not ascending: the file was changed; {_FUSE_AGAIN}")
     for axis, estimate in axes.items():
         if not np.isfinite([estimate.position, estimate.position_sd]).all():
-            raise FolderError(f"{path}: positions of '{axis}' are missing; the file was changed")
+            raise FolderError(f"{path}: positions of '{axis}' are missing: the file was changed; {_FUSE_AGAIN}")
 
 
 def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTrack:
@@ -222,7 +224,7 @@ def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTr
         run = in_base(Run.read(path), config)[0]
         parts = [part.reference for part in segments(run)[0] if part.reference is not None]
         if not parts:
-            raise RunError(f"{path}: the run has no reference")
+            raise RunError(f"{path}: the run has no reference; [reference] in run.toml names its file")
         for axis in set(run.kinds) & set(config.arm.axes):
             _check_kind(path, axis, run.kinds[axis], config.arm)
         return reference_track(parts, origin)
@@ -331,7 +333,8 @@ def _numbers(table: Table, axis: str, column: str, arm: ArmModel) -> FloatArray:
 
 def _check_kind(path: Path, axis: str, kind: Kind, arm: ArmModel) -> None:
     if arm.axes[axis].kind != kind:
-        raise RunError(f"{path}: {axis} is {AN[kind]} there, but {AN[arm.axes[axis].kind]} in the result")
+        differ = f"{AN[kind]} there, but {AN[arm.axes[axis].kind]} in the result"
+        raise RunError(f"{path}: {axis} is {differ}; give another reference")
 
 
 def _column(axis: str, name: str, kind: Kind) -> str:
@@ -358,7 +361,7 @@ def _time_and_segment(table: Table) -> tuple[FloatArray, IntArray]:
         return time, np.zeros(table.rows, dtype=np.int64)
     segment, _ = table.plain("segment")
     if not np.isfinite(segment).all():
-        raise RunError(f"{table.path}: segment is not a whole number in every row")
+        raise RunError(f"{table.path}: segment is not a whole number in every row; fill it, or leave the column out")
     return time, segment.astype(np.int64)
 
 

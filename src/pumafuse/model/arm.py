@@ -74,11 +74,11 @@ class Sag(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     def __post_init__(self) -> None:
         if (self.knee is None) != (self.slope_beyond is None):
-            raise ConfigError("sag: a knee and slope_beyond belong together")
+            raise ConfigError("sag: a knee and slope_beyond belong together: give both or neither")
         if (self.knee_below is None) != (self.slope_below is None):
-            raise ConfigError("sag: knee_below and slope_below belong together")
+            raise ConfigError("sag: knee_below and slope_below belong together: give both or neither")
         if self.knee is not None and self.knee_below is not None and self.knee_below > self.knee:
-            raise ConfigError("sag: knee_below is above the knee")
+            raise ConfigError("sag: knee_below is above the knee: move it to the knee or below")
 
     def at(self, position: FloatArray) -> FloatArray:
         """Off by how much [m or rad] at positions as commanded; the shape of ``position``."""

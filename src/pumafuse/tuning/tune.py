@@ -244,7 +244,7 @@ def _check(
         raise TuneError("no run to fit on")
     for number, run in enumerate(runs):
         if any(_same(run, other) for other in runs[:number]):
-            raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice")
+            raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice; give it once")
     check_fixed(config, fixed)
     for word in share:
         if word != "delay":
