@@ -111,9 +111,9 @@ def bends(repeats: int) -> list[Row]:
     """The response r of an arm that swings, to a minute of sines which ask for more than its fastest speed."""
     from pumafuse.filter.response import response  # version 0.2 has none
 
-    told_at = 28 * MS * np.arange(2143)
+    stamp = 28 * MS * np.arange(2143)
     time = np.rint(1e9 * np.arange(0.01, 59.5, 1.0 / 30.0)).astype(np.int64)
-    command = 0.1 * np.sin(1e-9 * np.pi * told_at) + 0.03 * np.sin(2.6e-9 * np.pi * told_at)  # m
+    command = 0.1 * np.sin(1e-9 * np.pi * stamp) + 0.03 * np.sin(2.6e-9 * np.pi * stamp)  # m
     arm = partial(pf.AxisModel, plant=pf.SecondOrder(natural_frequency=30.0, damping=0.8))
     kinds = {"linear": {}, "play": {"play": 0.004}, "limit": {"max_speed": 0.25}}
     kinds["play and limit"] = kinds["play"] | kinds["limit"]
@@ -121,9 +121,9 @@ def bends(repeats: int) -> list[Row]:
     for name, bend in kinds.items():
         axis = arm(**bend)
         spent = timed(
-            lambda axis=axis: [response(axis, 0.028, 0.06, told_at, command, 0.0, time) for _ in range(100)], repeats
+            lambda axis=axis: [response(axis, 0.028, 0.06, stamp, command, 0.0, time) for _ in range(100)], repeats
         )
-        values = [1e9 * s / (100 * (len(told_at) + len(time))) for s in spent]
+        values = [1e9 * s / (100 * (len(stamp) + len(time))) for s in spent]
         note = f"{min(values) / min(rows[0]['values']):.2f} of a linear one" if rows else ""
         rows.append(row("response", f"response, {name}", "ns", values, note))
     return rows

@@ -58,22 +58,22 @@ void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     std::copy_n(numbers, 17, step);
 }
 
-int pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int64_t* told_at, const double* command,
+int pf_response(int64_t count, const pf_axis* axis, int64_t commands, const int64_t* stamp, const double* command,
                 int64_t n, const int64_t* time, double* position) {
     return attempt([&] {
         by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
             const Arm<double> arm(lift<Axis, double>(axis + i, 1, {})[0]);
-            respond(arm, axis[i].start, delays, commands, told_at, command, n, time, position + i * n);
+            respond(arm, axis[i].start, delays, commands, stamp, command, n, time, position + i * n);
         });
     });
 }
 
-void pf_follow(const pf_axis* axis, pf_motion* motion, int64_t commands, const int64_t* told_at, const double* command,
+void pf_follow(const pf_axis* axis, pf_motion* motion, int64_t commands, const int64_t* stamp, const double* command,
                int64_t n, const int64_t* time, double* position) {
     const Arm<double> arm(lift<Axis, double>(axis, 1, {})[0]);
     const Drive<double> drive{motion->command, motion->error, motion->position, motion->rate};
     Response<double> response{{motion->time}, axis->start, motion->step, drive, motion->slack};
-    follow(response, arm, std::llround(axis->delay * 1e9), commands, told_at, command, n, time, position);
+    follow(response, arm, std::llround(axis->delay * 1e9), commands, stamp, command, n, time, position);
     const auto& [u, e, x, rate] = response.drive;
     *motion = {response.time.ns, u, response.step, e, x, rate, response.slack};
 }
@@ -88,12 +88,12 @@ int pf_whiten(const pf_noise* noise, int64_t n, const int64_t* time, const doubl
 }
 
 int pf_weigh(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,
-             const double* whitened, int64_t commands, const int64_t* told_at, const double* command, int64_t count,
+             const double* whitened, int64_t commands, const int64_t* stamp, const double* command, int64_t count,
              const pf_axis* axis, double* products) {
     return attempt([&] {
         const Whitening whitening(*noise, n, time, variance);
         by_delays(count, axis, [&](Time i, const std::vector<Time>& delays) {
-            weigh(axis[i], delays, whitening, commands, told_at, command, n, time, c, whitened,
+            weigh(axis[i], delays, whitening, commands, stamp, command, n, time, c, whitened,
                   products + i * 2 * (2 + c));
         });
     });

@@ -54,15 +54,15 @@ struct Response {
 
 // Some more commands at their instants, ascending, and the positions at n instants, ascending too. Each follows from
 // the last command alone, so that no bit of it depends on what else is asked for.
-inline void follow(Response<double>& response, const Arm<double>& arm, Time delay, Time commands, const Time* told_at,
+inline void follow(Response<double>& response, const Arm<double>& arm, Time delay, Time commands, const Time* stamp,
                    const double* command, Time n, const Time* time, double* position) {
     const auto to = [&](Response<double>& now, Time at) {
         if (now.time.ns == PF_ALWAYS) now.time.ns = at;
         now.predict(arm, {at, 0.0});
     };
     for (Time k = 0, c = 0; k < n || c < commands;) {
-        if (c < commands && (k == n || told_at[c] + delay <= time[k])) {
-            to(response, told_at[c] + delay);
+        if (c < commands && (k == n || stamp[c] + delay <= time[k])) {
+            to(response, stamp[c] + delay);
             response.command(arm, command[c++]);
         } else {
             Response<double> then = response;

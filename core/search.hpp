@@ -80,10 +80,10 @@ class Whitening {
 // those of one arm have its way through the commands in common. Each position follows from the last command.
 // (delays, n).
 inline void respond(const Arm<double>& arm, double start, const std::vector<Time>& delays, Time commands,
-                    const Time* told_at, const double* command, Time n, const Time* time, double* position) {
+                    const Time* stamp, const double* command, Time n, const Time* time, double* position) {
     Response<double> response;
     response.start = start;
-    if (commands > 0) response.time.ns = told_at[0];
+    if (commands > 0) response.time.ns = stamp[0];
     constexpr Time NEVER = std::numeric_limits<Time>::max();
     std::vector<Time> next(delays.size(), 0);
     Time due = -NEVER;  // the first instant of a position that is still asked for
@@ -101,8 +101,8 @@ inline void respond(const Arm<double>& arm, double start, const std::vector<Time
         }
     };
     for (Time c = 0; c < commands; ++c) {
-        if (due < told_at[c]) ask(told_at[c], c > 0);
-        response.predict(arm, {told_at[c], 0.0});
+        if (due < stamp[c]) ask(stamp[c], c > 0);
+        response.predict(arm, {stamp[c], 0.0});
         response.command(arm, command[c]);
     }
     ask(NEVER, commands > 0);
@@ -126,7 +126,7 @@ inline void by_delays(Time count, const pf_axis* axis, auto work) {
 // The response at a gain of 1 and what each 1 of gain adds to it, whitened, times one another and times c columns that
 // are, with each of some dead times: products (delays, 2, 2 + c).
 inline void weigh(const pf_axis& axis, const std::vector<Time>& delays, const Whitening& whitening, Time commands,
-                  const Time* told_at, const double* command, Time n, const Time* time, Time c, const double* whitened,
+                  const Time* stamp, const double* command, Time n, const Time* time, Time c, const double* whitened,
                   double* products) {
     const bool straight = axis.max_speed == 0.0 && axis.play == 0.0 && axis.sag_offset == 0.0 &&
                           axis.sag_slope == 0.0 && axis.sag_slope_beyond == 0.0 && axis.sag_slope_below == 0.0 &&
@@ -136,7 +136,7 @@ inline void weigh(const pf_axis& axis, const std::vector<Time>& delays, const Wh
         Axis<double> shape = lift<Axis, double>(&axis, 1, {})[0];
         shape.intercept = 1.0 + i;
         raw[i].resize(delays.size() * n);
-        respond(Arm<double>(shape), axis.start, delays, commands, told_at, command, n, time, raw[i].data());
+        respond(Arm<double>(shape), axis.start, delays, commands, stamp, command, n, time, raw[i].data());
     }
     for (std::size_t d = 0; d < delays.size(); ++d, products += 2 * (2 + c)) {
         whitening(raw[0].data() + d * n, plain.data());

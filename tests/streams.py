@@ -292,7 +292,7 @@ class Both:
         self.stream.end()
 
     def end(self) -> None:
-        self.stream.add(self.lines.remaining())
+        self.stream.add(self.lines.take_last())
         self.stream.end()
 
     def keep(self, lines: list[bytes]) -> None:

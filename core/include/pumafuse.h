@@ -119,7 +119,7 @@ PF_API const char *pf_error(void); /* of the last call of this thread that faile
 PF_API void pf_transition(const pf_axis *axis, double dt, double step[17]);
 /* Where each of `count` arms goes without noise, relative to its start level [m], at n instants, ascending; commands
  * [m] come at their instants, ascending. position (count, n). Returns 0; -1 without memory, as the next ones do. */
-PF_API int pf_response(int64_t count, const pf_axis *axis, int64_t commands, const int64_t *told_at,
+PF_API int pf_response(int64_t count, const pf_axis *axis, int64_t commands, const int64_t *stamp,
                        const double *command, int64_t n, const int64_t *time, double *position);
 
 /* What an axis without noise does just after a command, relative to its start level: when it acts [ns], the command in
@@ -132,7 +132,7 @@ typedef struct {
 
 /* The same as pf_response from a motion on, which becomes that after the commands. Each position follows from the last
  * command alone: it is the same whatever else is asked for, and in whatever pieces. */
-PF_API void pf_follow(const pf_axis *axis, pf_motion *motion, int64_t commands, const int64_t *told_at,
+PF_API void pf_follow(const pf_axis *axis, pf_motion *motion, int64_t commands, const int64_t *stamp,
                       const double *command, int64_t n, const int64_t *time, double *position);
 
 /* What an arm leaves of what is measured, beside white noise. */
@@ -149,7 +149,7 @@ PF_API int pf_whiten(const pf_noise *noise, int64_t n, const int64_t *time, cons
 /* How `count` arms fit c columns that are whitened: the scalar products of two whitened responses, that to a gain of 1
  * and what 1 of gain adds to it, with each other and with the columns. products (count, 2, 2 + c). */
 PF_API int pf_weigh(const pf_noise *noise, int64_t n, const int64_t *time, const double *variance, int64_t c,
-                    const double *whitened, int64_t commands, const int64_t *told_at, const double *command,
+                    const double *whitened, int64_t commands, const int64_t *stamp, const double *command,
                     int64_t count, const pf_axis *axis, double *products);
 /* What each value is before the filter sees it, into known (n, A); too_late (n,): rows far behind earlier ones. */
 PF_API int pf_classify(const pf_model *model, const pf_events *events, int64_t origin, const uint8_t *too_late,

@@ -156,7 +156,7 @@ BAD = {
     "a joint lacks": ({"j1": 0.1, "j2": 0.2}, "needs all joints of the .robot.; it has no j3, j4, j5, j6"),
     "a joint is none": ({**dict.fromkeys(JOINTS, 0.1), "j6": math.nan}, "it has no j6"),
     "a pose, too": ({**dict.fromkeys(JOINTS, 0.1), "x": 0.5}, "gives joints and x"),
-    "a joint far away": ({**dict.fromkeys(JOINTS, 0.1), "j6": 1e300}, "joint j6 is told to be where no robot can be"),
+    "a joint far away": ({**dict.fromkeys(JOINTS, 0.1), "j6": 1e300}, "joint j6 is where no robot can be"),
     "an orientation, too": ({**dict.fromkeys(JOINTS, 0.1), "orientation": (0, 0, 0, 1)}, "gives joints and orient"),
 }
 

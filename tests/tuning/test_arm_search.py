@@ -74,7 +74,7 @@ def test_the_noise_that_is_likely_is_what_second_differences_show(search: ArmSea
     """Of what the best arm leaves where it is calm; here that is the white noise of the sensor, to a tenth."""
     entries = [one for branch in search.posterior.branches for one in branch.entries]
     arm, one = max(entries, key=lambda entry: entry.log_density).arm, measured(1).recordings[0]
-    path = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
+    path = response(arm.model, T, arm.delay, one.stamp, one.command, one.start, one.time)
     ways = np.ptp(np.lib.stride_tricks.sliding_window_view(path, 3), axis=1)
     calm = ways <= np.quantile(ways, 1.0 / 3.0)
     shown = np.median(np.abs(np.diff(one.value - path, 2))[calm]) / (0.6745 * np.sqrt(6.0))

@@ -58,8 +58,8 @@ def test_what_bends_an_axis_is_part_of_its_response(arm: Arm) -> None:
     axis = replaced(bent.model, sag=Sag(offset=0.01, slope=-0.05))
     assert Arm.of(axis, arm.delay) == pytest.approx(bent, rel=1e-12)
     one = recording(3)
-    expected = response(axis, T, arm.delay, one.told, one.command, one.start, one.time)
-    straight = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
+    expected = response(axis, T, arm.delay, one.stamp, one.command, one.start, one.time)
+    straight = response(arm.model, T, arm.delay, one.stamp, one.command, one.start, one.time)
     assert np.abs(expected - straight).max() > 0.005
     measured = Measured([one], T, ["a"], axis).of([one._replace(value=expected).of(slice(None, None, 2))])
     np.testing.assert_allclose(measured.responses(bent)[0], expected[::2], rtol=0.0, atol=1e-12)  # cut elsewhere
@@ -85,7 +85,7 @@ def test_the_likelihood_of_an_arm_is_the_joint_gaussians(arm: Arm, rest: NoiseMo
     measured, expected = Measured(parts, T, ["a"]), 0.0
     reach = max(np.ptp(one.value) for one in parts)
     for one in parts:
-        moved = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
+        moved = response(arm.model, T, arm.delay, one.stamp, one.command, one.start, one.time)
         cov = covariance(one, rest, OFFSET * reach)
         expected += multivariate_normal.logpdf(one.value - moved, cov=cov)
     assert measured.weighed([arm], rest)[0][0] == pytest.approx(expected, rel=1e-7)
@@ -97,7 +97,7 @@ def test_the_best_gain_is_that_of_generalised_least_squares() -> None:
     one, rest, arm = recording(3, 80, sensors=2), NoiseModel(np.array([0.01, 0.02]), 0.02), Arm(0.05, 0.08)
     measured = Measured([one], T, ["a", "b"])
     log, gain = measured.weighed([arm], rest, Limits({}, {}))
-    r = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
+    r = response(arm.model, T, arm.delay, one.stamp, one.command, one.start, one.time)
     X = np.column_stack([r, one.source == 1])
     inverse = np.linalg.inv(covariance(one, rest, OFFSET * np.ptp(one.value)))
     best = np.linalg.solve(X.T @ inverse @ X, X.T @ inverse @ one.value)
@@ -131,7 +131,7 @@ def test_a_long_recording_is_known_by_where_each_quarter_of_it_moves_most(rows: 
 def test_a_fit_is_a_maximum_and_its_information_the_curvature() -> None:
     """A simulated second-order arm: no neighbour is likelier, and the likelihood falls as the information says."""
     one, rest, true = recording(5, 400), NoiseModel(np.array([1e-3])), Arm(0.05, 0.1, damping=0.8, gain=0.95)
-    moved = response(true.model, T, true.delay, one.told, one.command, one.start, one.time)
+    moved = response(true.model, T, true.delay, one.stamp, one.command, one.start, one.time)
     value = moved + np.random.default_rng(5).normal(0.0, 1e-3, 400)
     measured = Measured([one._replace(value=value)], T, ["a"])
     found = measured.fitted(Arm(0.06, 0.08, damping=1.0), NAMES, rest, FREE)
@@ -149,7 +149,7 @@ def test_a_fit_is_a_maximum_and_its_information_the_curvature() -> None:
 def test_a_fit_that_cannot_get_as_high_as_is_worth_it_ends_at_once() -> None:
     """Far below what is worth it an arm stays where it begins; a worth within reach changes no maximum."""
     one, rest, true = recording(5, 400), NoiseModel(np.array([1e-3])), Arm(0.05, 0.1, gain=0.95)
-    moved = response(true.model, T, true.delay, one.told, one.command, one.start, one.time)
+    moved = response(true.model, T, true.delay, one.stamp, one.command, one.start, one.time)
     value = moved + np.random.default_rng(7).normal(0.0, 1e-3, 400)
     measured, begin = Measured([one._replace(value=value)], T, ["a"]), Arm(0.06, 0.09)
     names = ["delay", "lag", "gain"]
@@ -179,7 +179,7 @@ def test_noise_is_believed_to_be_what_second_differences_show_where_the_arm_is_c
     """Within a factor of 1.9: log-posteriors are the likelihood less half the square of that, at a maximum."""
     one, arm = recording(3), Arm(0.05, 0.08)
     measured = Measured([one], T, ["a"])
-    path = response(arm.model, T, arm.delay, one.told, one.command, one.start, one.time)
+    path = response(arm.model, T, arm.delay, one.stamp, one.command, one.start, one.time)
     ways = np.ptp(np.lib.stride_tricks.sliding_window_view(path, 3), axis=1)
     calm = ways <= np.quantile(ways, 1.0 / 3.0)
     shown = np.median(np.abs(np.diff(one.value - path, 2))[calm]) / (0.6745 * np.sqrt(6.0))
@@ -200,7 +200,7 @@ def test_jitter_is_told_where_the_arm_is_calm() -> None:
     time = np.arange(0, 20 * 10**9, 10**7)
     moving = np.sin(time / 2e9) > 0.0
     command = np.cumsum(np.where(moving, 1e-3, 0.0))
-    swing = one._replace(told=time, command=command, start=0.0, time=time, source=np.zeros(len(time), np.int64))
+    swing = one._replace(stamp=time, command=command, start=0.0, time=time, source=np.zeros(len(time), np.int64))
     arm = Arm(0.0, 1e-3)
     path = response(arm.model, T, arm.delay, time, command, 0.0, time)
     value = path + rng.normal(0.0, np.where(moving, 0.02, 2e-3))

@@ -64,8 +64,8 @@ def test_outliers_and_the_length_of_a_recording_do_not_matter() -> None:
     value[::100] += 0.3
     wild = found_in(one._replace(value=value))
     rest, step = 40_000, round(T * 1e9)
-    given = np.append(np.arange(rest) * step, rest * step + one.told)
-    long = one._replace(told=given, command=np.append(np.full(rest, 0.5), one.command), time=rest * step + one.time)
+    given = np.append(np.arange(rest) * step, rest * step + one.stamp)
+    long = one._replace(stamp=given, command=np.append(np.full(rest, 0.5), one.command), time=rest * step + one.time)
     late = found_in(long)
     assert wild.arm.total == pytest.approx(0.14, abs=2e-3)
     assert late.arm.total == pytest.approx(0.14, abs=2e-3)
@@ -280,10 +280,10 @@ def test_an_arm_that_takes_the_place_of_another_is_kept() -> None:
 def test_a_lag_that_steps_is_said_of_one_sensor_alone() -> None:
     """60 ms more from 0.7 of the run on, of which a plant of second order and a gain might make up: both, and when."""
     one, later = (motion(delay, 0.06, 1.0, commands=1500) for delay in (0.08, 0.14))
-    one = one._replace(told=one.told + EPOCH, time=one.time + EPOCH)
+    one = one._replace(stamp=one.stamp + EPOCH, time=one.time + EPOCH)
     edge = one.time[int(0.7 * len(one.time))]
     found = found_in(one._replace(value=np.where(one.time < edge, one.value, later.value)))
-    assert found.step.time == pytest.approx((edge - one.told[0]) / 1e9, abs=0.05 * (one.time[-1] - one.time[0]) / 1e9)
+    assert found.step.time == pytest.approx((edge - one.stamp[0]) / 1e9, abs=0.05 * (one.time[-1] - one.time[0]) / 1e9)
     assert (found.step.before, found.step.after) == pytest.approx((0.14, 0.20), abs=0.01)
     assert f"{1e3 * found.step.before:.0f} ms until about {found.step.time:.0f} s" in str(found.step)
     for steady in (one, later, motion(0.02, 0.3, 0.9, commands=1500)):

@@ -181,7 +181,7 @@ def otherwise_than_at_first(survey: Survey, lags: Mapping[str, FittedLag], arm: 
 
 
 def _speed(command: Source, axis: str) -> float:
-    """How fast an axis is told to move, over all of a run [m/s or rad/s]; above 0."""
+    """How fast an axis is commanded to move, over all of a run [m/s or rad/s]; above 0."""
     way = float(np.abs(np.diff(command.values[axis])).sum())
     return max(way * 1e9 / max(int(np.ptp(command.stamp)), 1), 1e-12)
 

@@ -29,22 +29,22 @@ def run(
         reports.check_writable(report, force)
     runs = [Run.read(path).between(*part) for path in paths]
     with Console(stderr=True).status("looking at how motion follows the commands"):
-        told = latency(runs, sensor=sensor)
+        result = latency(runs, sensor=sensor)
     if arm is not None:
-        write_file(arm, told.arm.to_toml(), replace=force)
+        write_file(arm, result.arm.to_toml(), replace=force)
     if report is not None:
-        reports.write_latency(told, report, force)
+        reports.write_latency(result, report, force)
     if json:
-        say(told.to_json().removesuffix("\n"))
+        say(result.to_json().removesuffix("\n"))
         return
-    say("\n".join(reports.answers(told.details)))
-    print_tables([table(*reports.lags(told.details))])
-    if any(axis.shared_delay for axis in told.details.axes.values()):
+    say("\n".join(reports.answers(result.details)))
+    print_tables([table(*reports.lags(result.details))])
+    if any(axis.shared_delay for axis in result.details.axes.values()):
         say("* one dead time for several axes")
     if arm is None:
         say("\nto write into fusion.toml and arm.toml (pumafuse identify RUN -o arm.toml writes the latter):\n")
-        say(reports.settings(told))
-        say("\n  ".join(["elsewhere:", *reports.elsewhere(told.details)]))
+        say(reports.settings(result))
+        say("\n  ".join(["elsewhere:", *reports.elsewhere(result.details)]))
     if written := [str(path) for path in (arm, report) if path is not None]:
         say(f"written to {' and '.join(written)}")
     if arm is not None:

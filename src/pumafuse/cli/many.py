@@ -86,12 +86,12 @@ def run_jobs(
         kept = f"{len(results)} of {len(jobs)} runs are done and kept"
         raise PumafuseError(f"a worker process died (out of memory?): {kept}") from None
     finally:
-        told, threading.excepthook = threading.excepthook, _unsaid
+        hook, threading.excepthook = threading.excepthook, _unsaid
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of work that is not used
             if outcomes is not None:
                 outcomes.close()  # only now does no worker write any more
-        threading.excepthook = told
+        threading.excepthook = hook
         sweep(folders)
     done = {name: results[name] for name in jobs if name in results}
     return done, {name: failed[name] for name in jobs if name in failed}

@@ -314,8 +314,8 @@ class Filter:
         self.axes: list[Axis] = []
         for a, plant in enumerate(plants):
             commands_here = self.decides[:, a] & (events.source == COMMAND)
-            told = np.searchsorted(events.stamp[commands_here], events.time[commands_here], side="right")
-            in_flight = int((told - np.arange(len(told))).max(initial=0))
+            stamped = np.searchsorted(events.stamp[commands_here], events.time[commands_here], side="right")
+            in_flight = int((stamped - np.arange(len(stamped))).max(initial=0))
             self.axes.append(Axis(plant, model.axis[a], model.sensor, model.view[:, a], origin, in_flight))
 
     def run(self, results: Results, times: TimeArray, progress: Callable[[float], None] | None = None) -> FloatArray:

@@ -29,17 +29,17 @@ def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Rec
 
 
 def response(
-    axis: AxisModel, period: float, delay: float, told_at: TimeArray, command: FloatArray, start: float, time: TimeArray
+    axis: AxisModel, period: float, delay: float, stamp: TimeArray, command: FloatArray, start: float, time: TimeArray
 ) -> FloatArray:
     """The position [m] relative to ``start`` of an axis that rests there until its first command, (n,).
 
-    Period T and delay Td are in s. Each command u [m] is ``told_at`` a time, int64 ns, ascending, (k,). The position is
+    Period T and delay Td are in s. Each command u [m] has a ``stamp``, int64 ns, ascending, (k,). The position is
     asked for at each ``time``, int64 ns, ascending, (n,).
     """
     position = np.empty(len(time))
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
     record = record_of(axis, period, delay, start)
-    commands, asked = (len(told_at), ptr(told_at), ptr(command)), (len(time), ptr(time), ptr(position))
+    commands, asked = (len(stamp), ptr(stamp), ptr(command)), (len(time), ptr(time), ptr(position))
     check(library.pf_response(1, ptr(record), *commands, *asked))
     return position
 
@@ -51,14 +51,14 @@ def at_rest() -> Record:
     return at_rest
 
 
-def follow(axis: Record, motion: Record, told_at: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
+def follow(axis: Record, motion: Record, stamp: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
     """The position [m] of an axis from what it does after a command on, (n,).
 
     No bit of it depends on what else is asked for, or on the pieces in which commands come. The axis, (1,), is of
     :func:`record_of`, with a start level of 0; its ``motion``, (1,), becomes that after the last command. A command u
-    [m] relative to the level of its rest is ``told_at`` at int64 ns, ascending, (k,); ``time`` likewise, (n,).
+    [m] relative to the level of its rest has a ``stamp``, int64 ns, ascending, (k,); ``time`` likewise, (n,).
     """
     position = np.empty(len(time))
-    commands, asked = (len(told_at), ptr(told_at), ptr(command)), (len(time), ptr(time), ptr(position))
+    commands, asked = (len(stamp), ptr(stamp), ptr(command)), (len(time), ptr(time), ptr(position))
     library.pf_follow(ptr(axis), ptr(motion), *commands, *asked)
     return position

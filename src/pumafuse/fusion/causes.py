@@ -282,7 +282,7 @@ class _Part:
     time: TimeArray  # when they are valid, int64 ns, (m,)
     scale: FloatArray  # of their sensors, (m,)
     start: float  # where it rests before the commands that the filter is given
-    told_at: TimeArray  # when these are given, int64 ns, (k,)
+    stamp: TimeArray  # when these are given, int64 ns, (k,)
     command: FloatArray  # these [m or rad], (k,)
 
     @cached_property
@@ -310,15 +310,15 @@ class _Part:
 def _part(est: Estimates, segment: Segment, axis: str, measured: Measurements) -> _Part:
     """Components with the commands that act meanwhile, or without, where these are many and not needed."""
     arm, time = est.config.arm, est.origin + nanoseconds(measured.time)
-    told_at, command = segment.commands_of(axis)
-    first, last = np.searchsorted(told_at + round(arm.delay_of(axis) * 1e9), time[[0, -1]]).tolist()
+    stamp, command = segment.commands_of(axis)
+    first, last = np.searchsorted(stamp + round(arm.delay_of(axis) * 1e9), time[[0, -1]]).tolist()
     if last - first > _COMMANDS * len(time) and not _needs_commands(est.config, axis):
         last = first
     start = float(command[first - 1]) if first else segment.start[axis]
     scales = np.array(
         [est.config.sensors[name].scale if name in est.config.sensors else 1.0 for name in measured.sensors]
     )
-    commands = start, told_at[first:last], command[first:last]
+    commands = start, stamp[first:last], command[first:last]
     return _Part(est.config, segment, axis, measured, time, scales[measured.sensor], *commands)
 
 
@@ -370,9 +370,9 @@ def _filter(
     """
     arm, axis, count, measured = part.config.arm, part.axis, len(models), part.measured
     delay = arm.delay_of(axis)
-    acts = part.told_at + round(delay * 1e9)
+    acts = part.stamp + round(delay * 1e9)
     led = part.start + response(
-        arm.axes[axis], arm.update_period, delay, part.told_at, part.command, part.start, part.time
+        arm.axes[axis], arm.update_period, delay, part.stamp, part.command, part.start, part.time
     )  # by the commands that the filter is given; those before are taken off
     value = (measured.value - part.scale * (part.response - led))[:, None] + moved
     instants = np.concatenate([acts, part.time])

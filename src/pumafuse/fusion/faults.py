@@ -632,13 +632,13 @@ def _turn(value: FloatArray, led: FloatArray, step: FloatArray) -> _Turn:
 
 def _first_speed(segment: Segment, axis: str) -> float:
     """The commanded speed [m/s] that a segment begins with; 0 where its first steps are not alike."""
-    told_at, command = (part[: _ALIKE + 1] for part in segment.commands_of(axis))
+    stamp, command = (part[: _ALIKE + 1] for part in segment.commands_of(axis))
     steps = np.diff(command)
     if len(steps) < _ALIKE or command[0] != segment.start[axis]:
         return 0.0
     if np.abs(steps - steps.mean()).max() > _UNEQUAL * abs(steps.mean()):
         return 0.0
-    return float(command[-1] - command[0]) / (int(told_at[-1] - told_at[0]) / 1e9)
+    return float(command[-1] - command[0]) / (int(stamp[-1] - stamp[0]) / 1e9)
 
 
 def settling_time(config: FusionConfig, axis: str) -> float:
@@ -656,16 +656,16 @@ def _evidence(
     """
     model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
     until, score, information = settling_time(config, axis), 0.0, 0.0
-    (told_at, command), start = segment.commands_of(axis), segment.start[axis]
+    (stamp, command), start = segment.commands_of(axis), segment.start[axis]
     before = np.arange(-min(int(until / period) + 1, _MOST), 0.0)
-    earlier = np.concatenate([told_at[0] + np.rint(before * (period * 1e9)).astype(np.int64), told_at])
+    earlier = np.concatenate([stamp[0] + np.rint(before * (period * 1e9)).astype(np.int64), stamp])
     moving = np.concatenate([start + before * (period * speed), command])
     for name, (valid, position) in ((name, axes[axis]) for name, axes in positions.items() if axis in axes):
-        count = int(np.searchsorted(valid, int(told_at[0]) + round(until * 1e9), side="right"))
+        count = int(np.searchsorted(valid, int(stamp[0]) + round(until * 1e9), side="right"))
         if count < _FEWEST:
             continue
         sensor, valid = config.sensors[name], valid[:count]
-        at_rest = start + response(model, period, delay, told_at, command, start, valid)
+        at_rest = start + response(model, period, delay, stamp, command, start, valid)
         added = moving[0] + response(model, period, delay, earlier, moving, float(moving[0]), valid) - at_rest
         added -= added.mean()
         left = position[:count] - at_rest

@@ -103,10 +103,10 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
     if not set(CARTESIAN) <= source.values.keys():
         raise RunError(f"{source.label_for(name)}: has a frame or a marker, so that it must give x, y and z")
     placing, spread = Placing(config.sensors[name], config.arm), dict(source.spread)
-    told = source.orientation if placing.is_oriented else None
+    turned = source.orientation if placing.is_oriented else None
     measured = np.column_stack([source.values[axis] for axis in CARTESIAN])
     point = placing.to_base(measured)
-    oriented = None if told is None else np.where(lost(measured)[:, None], np.nan, placing.orientation(told))
+    oriented = None if turned is None else np.where(lost(measured)[:, None], np.nan, placing.orientation(turned))
     if oriented is not None and whole and _can_be_commanded(run, config):
         _check_orientation(name, source, oriented, run)
     if placing.has_marker:
@@ -128,11 +128,11 @@ def _of_tool(name: str, source: Source, run: Run, config: FusionConfig, *, whole
 def _check_orientation(name: str, source: Source, oriented: FloatArray, run: Run) -> None:
     """Whether a sensor tells the tool to be turned about as it is commanded to be."""
     assert run.command.orientation is not None
-    told_at, commanded = known_rows(run.command.stamp, run.command.orientation)
+    commanded_at, commanded = known_rows(run.command.stamp, run.command.orientation)
     stamp, seen = known_rows(source.stamp, oriented)
-    if not len(told_at) or not len(stamp):
+    if not len(commanded_at) or not len(stamp):
         return
-    last = np.clip(np.searchsorted(told_at, stamp, side="right") - 1, 0, None)
+    last = np.clip(np.searchsorted(commanded_at, stamp, side="right") - 1, 0, None)
     off = float(np.median(rotations.angle_between(seen, commanded[last])))
     if off > _ELSEWHERE:
         raise RunError(
@@ -154,22 +154,22 @@ def _commanded_orientation(name: str, stamp: TimeArray, run: Run, config: Fusion
         raise ConfigError(f"{where}: nothing tells how the tool is turned: neither the sensor nor the commands")
     if not set(TURNING) <= set(arm.axes):
         raise ConfigError(f"{where}: the sensor tells no orientation, and the arm '{arm.name}' has no axes rx, ry, rz")
-    reference, told_at = np.array(config.tool.reference), run.command.stamp
+    reference, commanded_at = np.array(config.tool.reference), run.command.stamp
     vector = rotations.vectors(commanded, reference)
-    told = np.isfinite(vector[:, 0]) & (told_at != NO_STAMP)
-    told_at, vector = told_at[told], vector[told]
-    if (np.diff(told_at) < -TOLERATED_STEP_BACK_NS).any():
+    usable = np.isfinite(vector[:, 0]) & (commanded_at != NO_STAMP)
+    commanded_at, vector = commanded_at[usable], vector[usable]
+    if (np.diff(commanded_at) < -TOLERATED_STEP_BACK_NS).any():
         raise RunError(f"{run.command.label}: the clock is set back; sensor '{name}' needs one time: cut the log there")
-    order = np.argsort(told_at, kind="stable")
-    told_at, vector = told_at[order], vector[order]
-    last = np.append(np.diff(told_at) > 0, True)  # of a stamp the last command counts
-    told_at, vector = told_at[last], vector[last]
-    asked = np.where(stamp == NO_STAMP, told_at[0], stamp - round(config.sensors[name].latency * 1e9))
+    order = np.argsort(commanded_at, kind="stable")
+    commanded_at, vector = commanded_at[order], vector[order]
+    last = np.append(np.diff(commanded_at) > 0, True)  # of a stamp the last command counts
+    commanded_at, vector = commanded_at[last], vector[last]
+    asked = np.where(stamp == NO_STAMP, commanded_at[0], stamp - round(config.sensors[name].latency * 1e9))
     order = np.argsort(asked, kind="stable")
     vectors = np.empty((len(asked), 3))
     for column, record in enumerate(turning_axes(arm)):
         relative = vector[:, column] - vector[0, column]
-        vectors[order, column] = vector[0, column] + follow(record, at_rest(), told_at, relative, asked[order])
+        vectors[order, column] = vector[0, column] + follow(record, at_rest(), commanded_at, relative, asked[order])
     return rotations.quaternions(vectors, reference)
 
 

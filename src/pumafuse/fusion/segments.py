@@ -466,10 +466,10 @@ def _mark_held(
     """Mark what one sensor says again and again as held; a sentence on each axis where it does."""
     notes = list[str]()
     for column, axis in enumerate(axes):
-        rows_seen, told = (
+        rows_seen, rows_commanded = (
             np.flatnonzero(table_of_rows.codes[:, column] == _FUSED) for table_of_rows in (rows, commands)
         )
-        stamp, command = rows.stamp[rows_seen], (commands.stamp[told], commands.value[told, column])
+        stamp, command = rows.stamp[rows_seen], (commands.stamp[rows_commanded], commands.value[rows_commanded, column])
         again, times = held(stamp, rows.value[rows_seen, column], command, latest_follow(config, name, axis))
         if again.any():
             rows.codes[rows_seen[again], column] = int(Outcome.HELD)

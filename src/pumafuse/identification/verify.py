@@ -187,14 +187,14 @@ def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[Ax
     segment, arm = build_segment(run, config), config.arm
     rows, part = segment.measurement_rows, list[tuple[AxisVerification, Trace]]()
     for number, axis in enumerate(segment.axes):
-        told_at, command = segment.commands_of(axis)
+        stamp, command = segment.commands_of(axis)
         first = segment.start[axis]
         for index, source in enumerate(segment.sensors):
             here = np.flatnonzero((rows.source == index) & (rows.codes[:, number] == Outcome.FUSED))
             if len(here) < _FEWEST or not np.ptp(command) > 0.0:
                 continue
             time, value = rows.time[here], rows.value[here, number] - first
-            recording = Recording(told_at, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
+            recording = Recording(stamp, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
             measured = Measured([recording], arm.update_period, [source], arm.axes[axis])
             counts = {"used" if word == Outcome.FUSED.word else word: n for word, n in segment.counts[source].items()}
             notes = [*jumps, *segment.notes, *overrun_notes([overruns(segment, arm)], arm, segment.origin)]
@@ -232,7 +232,7 @@ def _verify_axis(
     best = best_in_class(measured, configured)
     lag = model.lag(configured.delay, float(speeds(measured).mean()))
     trace = Trace(
-        units.seconds(recording.time, int(recording.told[0])),
+        units.seconds(recording.time, int(recording.stamp[0])),
         recording.value - recording.value.mean(),
         modelled - modelled.mean(),
     )

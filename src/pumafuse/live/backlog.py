@@ -60,7 +60,7 @@ class Backlog(Generic[T]):
         self._bytes -= sum(map(_size, taken))
         return taken
 
-    def remaining(self) -> list[T]:
+    def take_all(self) -> list[T]:
         """All that wait."""
         taken = [item for _, item in self._waiting]
         self._waiting.clear()

@@ -166,7 +166,7 @@ class _Source:
     event: int = 0  # which one was the last row
     back: float = 0.0  # by how much they are set back [ns]
     at: int = ALWAYS  # the newest stamp then [ns]
-    told: int = 0  # the ``since`` that was told of
+    reported: int = 0  # the ``since`` that was reported
 
     def add(self, stamp: int, event: int) -> None:
         """Add the stamp [ns] of the next row, which is the ``event``-th of all."""
@@ -235,7 +235,7 @@ class SetBack:
     def of_sensor(self, sensor: int) -> float:
         """How far the clock of a sensor alone was set back [ns], once, when that shows; else 0."""
         clock, commands = self._sources[sensor], self._sources[-1]
-        if clock.in_a_row < _ROWS or clock.told == clock.since or not commands.has_gone_on(clock.since):
+        if clock.in_a_row < _ROWS or clock.reported == clock.since or not commands.has_gone_on(clock.since):
             return 0.0
-        clock.told = clock.since
+        clock.reported = clock.since
         return clock.back if abs(clock.at - commands.at) > clock.back else 0.0

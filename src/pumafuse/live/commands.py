@@ -28,29 +28,29 @@ class Commands:
     def __init__(self, start: Sequence[float]) -> None:
         """No command yet; ``start`` is the level [m] of each axis before its first one, NaN: that of the first one."""
         self._start = start
-        self._told: list[list[tuple[int, float]]] = [[] for _ in start]  # stamps and values, by stamp
+        self._commanded: list[list[tuple[int, float]]] = [[] for _ in start]  # stamps and values, by stamp
         self._ends = [(math.inf, -math.inf) for _ in start]
 
     def add(self, stamp: int, codes: bytes, values: Sequence[float], oldest: int) -> None:
         """Add the values [m] of a command that were fused, in the place of what the axis had at that stamp [ns]."""
-        for axis, (told, code, value) in enumerate(zip(self._told, codes, values, strict=True)):
+        for axis, (commanded, code, value) in enumerate(zip(self._commanded, codes, values, strict=True)):
             if code != _FUSED:
                 continue
             low, high = self._ends[axis]
             self._ends[axis] = min(low, value), max(high, value)
-            if not told or stamp > told[-1][0]:
-                told.append((stamp, value))
+            if not commanded or stamp > commanded[-1][0]:
+                commanded.append((stamp, value))
             else:
-                row = bisect_left(told, (stamp,))
-                told[row : bisect_left(told, (stamp + 1,))] = [(stamp, value)]
-            if len(told) > 2 and told[2][0] <= oldest:  # one was in force then, and one is for its step
-                del told[0]
+                row = bisect_left(commanded, (stamp,))
+                commanded[row : bisect_left(commanded, (stamp + 1,))] = [(stamp, value)]
+            if len(commanded) > 2 and commanded[2][0] <= oldest:  # one was in force then, and one is for its step
+                del commanded[0]
 
     def at(self, axis: int, stamp: int) -> float | None:
         """What is commanded on an axis at ``stamp`` [ns], in m; None before any command."""
-        told = self._told[axis]
-        row = bisect_left(told, (stamp + 1,))
-        return told[row - 1][1] if row else self._before(axis) if told else None
+        commanded = self._commanded[axis]
+        row = bisect_left(commanded, (stamp + 1,))
+        return commanded[row - 1][1] if row else self._before(axis) if commanded else None
 
     def travel(self, axis: int) -> float:
         """How far apart the commands of an axis have been [m]; 0 before any."""
@@ -59,21 +59,21 @@ class Commands:
 
     def latest(self) -> list[tuple[int, float, float] | None]:
         """Stamp [ns], value and step [m] of the latest command of each axis; None before any."""
-        return [self._latest(axis, told) if told else None for axis, told in enumerate(self._told)]
+        return [self._latest(axis, commanded) if commanded else None for axis, commanded in enumerate(self._commanded)]
 
     def forget(self, after: int) -> None:
         """Take back those that are stamped after ``after`` [ns]."""
-        for told in self._told:
-            del told[bisect_left(told, (after + 1,)) :]
+        for commanded in self._commanded:
+            del commanded[bisect_left(commanded, (after + 1,)) :]
 
-    def _latest(self, axis: int, told: list[tuple[int, float]]) -> tuple[int, float, float]:
-        stamp, value = told[-1]
-        return stamp, value, value - (told[-2][1] if len(told) > 1 else self._before(axis))
+    def _latest(self, axis: int, commanded: list[tuple[int, float]]) -> tuple[int, float, float]:
+        stamp, value = commanded[-1]
+        return stamp, value, value - (commanded[-2][1] if len(commanded) > 1 else self._before(axis))
 
     def _before(self, axis: int) -> float:
         """Where an axis rests before its first command [m]."""
         start = self._start[axis]
-        return self._told[axis][0][1] if math.isnan(start) else start
+        return self._commanded[axis][0][1] if math.isnan(start) else start
 
 
 class CommandWatch:
@@ -98,7 +98,7 @@ class CommandWatch:
         arm = self._arm
         if arm.validity == Validity():
             return
-        latest = {axis: told for axis, told in zip(arm.axes, commands.latest(), strict=True) if told is not None}
+        latest = {axis: last for axis, last in zip(arm.axes, commands.latest(), strict=True) if last is not None}
         speed: dict[Kind, float] = {}
         for axis, (_, _, step) in latest.items():
             kind = arm.axes[axis].kind
@@ -130,8 +130,8 @@ class CommandWatch:
         table = {axis: np.array([number(values.get(axis)) for _, values in recent]) for axis in recent[0][1]}
         steady: dict[str, FloatArray] = {axis: column for axis, column in table.items() if np.isfinite(column).all()}
         if steady and (missing := missing_commands(Source(stamps, steady, "commands"), 0)) is not None:
-            told = f"until {recent[-1][0] / 1e9:.3f} s {missing}: the model holds the one before; send every command"
-            self._log.write("missing commands", told)
+            note = f"until {recent[-1][0] / 1e9:.3f} s {missing}: the model holds the one before; send every command"
+            self._log.write("missing commands", note)
 
 
 def number(value: object) -> float:

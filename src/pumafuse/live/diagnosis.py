@@ -100,24 +100,24 @@ class Recent:
         commands = source == COMMAND
         if not commands.any() or stamp[-1] - stamp[commands][0] < _SHORTEST_NS:
             return None
-        is_told = bits[:, None] >> np.arange(len(self._axes)) & 1
-        value[is_told == 0] = np.nan
+        has_value = bits[:, None] >> np.arange(len(self._axes)) & 1
+        value[has_value == 0] = np.nan
         commanded = [axis for axis in range(len(self._axes)) if np.isfinite(value[commands, axis]).any()]
         usable = commands | (stamp >= stamp[commands][0] + self._settled)  # where the arm was before is not
 
         def rows(chosen: IntArray, label: str) -> Source:
-            told = [axis for axis in commanded if is_told[chosen, axis].any()]
-            values, spreads = ({self._axes[axis]: part[chosen, axis] for axis in told} for part in (value, spread))
+            present = [axis for axis in commanded if has_value[chosen, axis].any()]
+            values, spreads = ({self._axes[axis]: part[chosen, axis] for axis in present} for part in (value, spread))
             return Source(stamp[chosen], values, label, spreads, apart=True)
 
         every = {name: np.flatnonzero(usable & (source == number)) for number, name in enumerate(self._sensors)}
         sensors = {name: rows(chosen, name) for name, chosen in every.items() if len(chosen)}
         names, kinds = {self._axes[axis] for axis in commanded}, self._config.arm.kind_of
         start = {name: level for name, level in self._start.items() if name in names}
-        told = rows(np.flatnonzero(commands), "commands")
-        rested = [np.insert(part, 0, part[np.isfinite(part)][:1].repeat(3)) for part in told.values.values()]
-        stamp = np.insert(told.stamp, 0, told.stamp[0] - self._rests)
-        command = Source(stamp, dict(zip(told.values, rested, strict=True)), "commands", apart=True)
+        sent = rows(np.flatnonzero(commands), "commands")
+        rested = [np.insert(part, 0, part[np.isfinite(part)][:1].repeat(3)) for part in sent.values.values()]
+        stamp = np.insert(sent.stamp, 0, sent.stamp[0] - self._rests)
+        command = Source(stamp, dict(zip(sent.values, rested, strict=True)), "commands", apart=True)
         age, process = (now - self._first) / 1e9, self._config.process
         strayed = {
             axis: math.hypot(self._config.start.offset_sd_of(axis), process[axis].drift * math.sqrt(age))
@@ -227,8 +227,8 @@ class Diagnosis:
 
     def _is_set_back(self, fault: Fault) -> bool:
         """Whether stamps alone have shown, and it was said, that a clock was set back."""
-        told = [self.set_back.get(name, ALWAYS) for name in fault.sensors]
-        return fault.cause == "set" and fault.size < 0.0 and max(told) > fault.at - _BEFORE_NS
+        since = [self.set_back.get(name, ALWAYS) for name in fault.sensors]
+        return fault.cause == "set" and fault.size < 0.0 and max(since) > fault.at - _BEFORE_NS
 
     def _count_missed(self, key: _Key, travel: Mapping[str, float], is_replaced: bool, now: int) -> None:
         """Count that a fault does not show, and say so where the commands would show it, unless another one does."""

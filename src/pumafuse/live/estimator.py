@@ -331,8 +331,8 @@ class LiveEstimator:
 
     def _parse(self, sensor: str | None, values: _Values) -> _Values:
         """An event's values with a pose in the place of joints, and a commanded orientation as axes."""
-        if self._joints is not None and (told := self._joints.parse(values)) is not None:
-            values = self._joints.to_pose(values, told)
+        if self._joints is not None and (joints := self._joints.parse(values)) is not None:
+            values = self._joints.to_pose(values, joints)
         if self._tool is not None:
             return self._tool.parse(sensor, values)
         if ORIENTATION in values:
@@ -385,7 +385,7 @@ class LiveEstimator:
         stamp, sensor, values = event
         if sensor is not None:
             if stamp > self._screen.until:
-                self._add_screened(self._screen.release())
+                self._add_screened(self._screen.take_waiting())
             return self._add_in_frame(stamp, sensor, parsed)
         self._counts.outcomes[COMMAND, _STRAY] += 1  # as long as it waits for the next
         in_joints = not self.joints.keys().isdisjoint(values)  # which are screened: a pose is of all of them
@@ -413,15 +413,12 @@ class LiveEstimator:
     def _add_command(self, stamp: int, values: _Values) -> UpdateResult:
         """Add a command that is to be used; one in joints changes the poses of others, where joints are later."""
         oldest = self._oldest()
-        if self._joints is None or (told := self._joints.parse(values)) is None:
+        if self._joints is None or (joints := self._joints.parse(values)) is None:
             return self._add_in_frame(stamp, None, values)
-        by_stamp = {stamp: told} if stamp < oldest else self._joints.command(stamp, told, oldest)
+        by_stamp = {stamp: joints} if stamp < oldest else self._joints.command(stamp, joints, oldest)
         try:
             first = self._parse(None, self._joints.to_pose(values, by_stamp.pop(stamp)))
-            others = {
-                other: self._parse(None, self._joints.to_pose({}, joints_told))
-                for other, joints_told in by_stamp.items()
-            }
+            others = {other: self._parse(None, self._joints.to_pose({}, moved)) for other, moved in by_stamp.items()}
         except ValueError as error:
             return self._refuse(None, values, _INVALID, str(error))
         result = self._add_in_frame(stamp, None, first)
@@ -472,25 +469,25 @@ class LiveEstimator:
 
     def _add_row(self, stamp: int, sensor: str, values: _Values) -> UpdateResult:
         """Put a measurement into the window: as it tells of the tool, as noisy as it says, without what is no news."""
-        window, tool, told, noise = self._window, self._tool, None, 1.0
+        window, tool, of_tool, noise = self._window, self._tool, None, 1.0
         if self._spreads:
             window.spread[:] = self._no_spread
         if NOISE in values:
             noise, self._spreads = parse_noise(values), True
             values = {name: value for name, value in values.items() if name != NOISE}
         if tool is not None:
-            told = tool.to_tool(sensor, stamp, values)
-            values = told.values
+            of_tool = tool.to_tool(sensor, stamp, values)
+            values = of_tool.values
         bits, unknown = self._fill(stamp, sensor, values)
         if stamp < (oldest := self._oldest()):
             return self._refuse_late(stamp, sensor, values, self._counts.outcomes)
-        if told is not None:
-            for name in told.spread.keys() & self._bits.keys():
-                window.spread[self._bits[name]] = told.spread[name]
+        if of_tool is not None:
+            for name in of_tool.spread.keys() & self._bits.keys():
+                window.spread[self._bits[name]] = of_tool.spread[name]
         if noise != 1.0:
             window.spread[:] = [noise * factor for factor in window.spread]
-        if tool is not None and told is not None and told.seen is not None:
-            tool.add(sensor, Row(stamp, told.seen, [*window.value, *window.spread], noise), oldest)
+        if tool is not None and of_tool is not None and of_tool.seen is not None:
+            tool.add(sensor, Row(stamp, of_tool.seen, [*window.value, *window.spread], noise), oldest)
         held, released = self._find_held(stamp, sensor, bits)
         if released or held:
             return self._add_news(stamp, sensor, bits, held, released)
@@ -515,8 +512,8 @@ class LiveEstimator:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
         window, bits, near = self._window, 0, None
         if sensor is not None:
-            told = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
-            near = np.array([told or 0.0])
+            commanded = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
+            near = np.array([commanded or 0.0])
         point = {name: number(values[name]) for name in CARTESIAN if name in values}
         placed = self._frame_start.in_axes(point, near)
         for name, component in placed.items():
@@ -702,11 +699,11 @@ class LiveEstimator:
         stamp, sensor, values = event
         if sensor is not None and (back := self._set_back.of_sensor(self._sensors[sensor])):
             self._diagnosis.set_back[sensor] = stamp
-            told = (
+            note = (
                 f"sensor '{sensor}': its stamps step back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s and go on there:"
                 " was its clock set? If it was right before, its measurements are stamped too early by that now"
             )
-            self._log.write(f"{sensor} set back", told)
+            self._log.write(f"{sensor} set back", note)
         if sensor is None and self._set_back.commands == 1:
             self._behind = []
         if not self._set_back.commands:
@@ -714,8 +711,8 @@ class LiveEstimator:
         self._behind.append(_Counted(event._replace(values=dict(values)), result, True))
         if not (back := self._set_back.of_all()):
             return result
-        told = f"all clocks were set back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s: new segment, filter restarted"
-        self._log.write("clock", told)
+        note = f"all clocks were set back by {back / 1e9:.3f} s at {stamp / 1e9:.3f} s: new segment, filter restarted"
+        self._log.write("clock", note)
         return self._begin_segment(self._behind)
 
     def _forget(self, after: int) -> None:

@@ -83,7 +83,7 @@ class UdpListener:
         self._receive(_MOST_LEFT)
         self._count_lost()  # for the last time
         self._socket.close()
-        return _lines(self._backlog.remaining())
+        return _lines(self._backlog.take_all())
 
     def summary(self) -> str:
         """How many came, and how many were lost or refused."""
@@ -136,7 +136,7 @@ class _Merged:
         except queue.Empty:
             return []
 
-    def remaining(self) -> Items:
+    def take_all(self) -> Items:
         """What has come and was not given yet; the threads end with the process."""
         left = list[bytes | Event]()
         with contextlib.suppress(queue.Empty):
@@ -158,7 +158,7 @@ def _read_lines(
             some = True
             if whole := lines.cut(piece):
                 put(whole)
-    if remainder := lines.remaining():
+    if remainder := lines.take_last():
         put(remainder)
     return some
 
@@ -184,7 +184,7 @@ class TcpListener(_Merged):
     def stop(self) -> Items:
         """What has come and was not given yet; the connections end with the process."""
         self._log = _SILENT
-        return self.remaining()
+        return self.take_all()
 
     def summary(self) -> str:
         """How many connections there were and are."""
@@ -291,7 +291,7 @@ class TcpClient(_Client):
     def stop(self) -> Items:
         """What has come and was not given yet; no connection is made any more."""
         self._end()
-        return self._merged.remaining()
+        return self._merged.take_all()
 
     def _read(self, connection: socket.socket) -> bool:
         return _read_lines(connection, self._merged.add)
@@ -322,7 +322,7 @@ class EventClient(_Client):
         """The events that have come and were not given yet; no connection is made any more."""
         self._end()
         with self._came:
-            return self._backlog.remaining()
+            return self._backlog.take_all()
 
     def summary(self) -> str:
         """How often the connection was made, how many events came, and how many were lost."""

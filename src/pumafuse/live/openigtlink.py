@@ -53,14 +53,14 @@ class OpenIgtLinkSource(EventClient):
     def _receive(self, connection: socket.socket) -> Iterator[list[Event]]:
         for stamp, seen, poses in _messages(connection.makefile("rb")):
             stamp = time.time_ns() if self._on_receipt or not stamp else stamp
-            told = ((device, pose if seen else [math.nan] * len(pose)) for device, pose in poses)
-            yield [Event(stamp, "" if device == _COMMAND else device, self._values(pose)) for device, pose in told]
+            tracked = ((device, pose if seen else [math.nan] * len(pose)) for device, pose in poses)
+            yield [Event(stamp, "" if device == _COMMAND else device, self._values(pose)) for device, pose in tracked]
 
     def _values(self, pose: list[float]) -> dict[str, Any]:
         """The values of a pose: a point and perhaps a quaternion, or the columns of a rotation matrix and a point."""
         point = pose[-3:] if len(pose) == 12 else pose[:3]
         values: dict[str, Any] = {
-            axis: value / MM for axis, value, told in zip(CARTESIAN, point, self._axes, strict=True) if told
+            axis: value / MM for axis, value, used in zip(CARTESIAN, point, self._axes, strict=True) if used
         }
         turned = _quaternion(pose) if self._turns and len(pose) > 3 and all(map(math.isfinite, pose)) else None
         if turned is not None:

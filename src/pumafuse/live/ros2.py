@@ -112,7 +112,7 @@ class Ros2Source:
     def stop(self) -> list[Event]:
         """The events that have come and were not given yet."""
         self._receive(time.monotonic())
-        return self._backlog.remaining()
+        return self._backlog.take_all()
 
     def close(self) -> None:
         """End the node."""
@@ -237,7 +237,7 @@ class Ros2Estimates:
             self._publish_joints = node.create_publisher(type(self._state), "~/joints", _KEPT).publish
         array = self._diagnostic.DiagnosticArray
         self._publish_diagnostics = node.create_publisher(array, "~/diagnostics", _KEPT).publish
-        self._told = 0.0
+        self._published = 0.0
 
     def event(self, event: Event, result: UpdateResult) -> None:
         """Nothing is published of what came."""
@@ -258,8 +258,8 @@ class Ros2Estimates:
     def tick(self, health: Callable[[], Health]) -> None:
         """Publish diagnostics once a second."""
         now = time.monotonic()
-        if now - self._told >= _EVERY:
-            self._told = now
+        if now - self._published >= _EVERY:
+            self._published = now
             array = self._diagnostic.DiagnosticArray(status=list(self._statuses(health())))
             self._set_header(array.header, self._source.clock())
             self._publish_diagnostics(array)

@@ -77,8 +77,8 @@ class RtdeSource(EventClient):
 
         if ask(_VERSION, struct.pack(">H", _PROTOCOL)) != b"\x01":
             raise Refused(f"the robot does not know version {_PROTOCOL} of RTDE (software 3.3 or newer does)")
-        told = ask(_OUTPUTS, struct.pack(">d", self._rate) + ",".join(self._variables).encode())
-        types = dict(zip(self._variables, told[1:].decode("ascii", "replace").split(","), strict=False))
+        answer = ask(_OUTPUTS, struct.pack(">d", self._rate) + ",".join(self._variables).encode())
+        types = dict(zip(self._variables, answer[1:].decode("ascii", "replace").split(","), strict=False))
         if unknown := [name for name in self._variables if types.get(name) not in _TYPES]:
             raise Refused(f"the robot has no variable {', '.join(unknown)}; names are those of record.py")
         sizes = {name: int(_TYPES[kind][:-1] or 1) for name, kind in types.items()}
@@ -92,7 +92,7 @@ class RtdeSource(EventClient):
             raise Refused(f"the robot has no column {', '.join(lacking)}; it has {', '.join(columns)}")
         if ask(_BEGIN, b"") != b"\x01":
             raise Refused(f"the robot does not begin to send {self._rate:g} times a second")
-        return told[:1], struct.Struct(">" + "".join(_TYPES[kind] for kind in types.values())), columns
+        return answer[:1], struct.Struct(">" + "".join(_TYPES[kind] for kind in types.values())), columns
 
 
 def _variable(column: str) -> str:

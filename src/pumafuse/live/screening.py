@@ -176,37 +176,37 @@ class CommandScreen:
     def add(self, stamp: int, values: Mapping[str, Any]) -> list[Screened]:
         """Add a command; those that are decided by now, without what is stray, and that."""
         consecutive, self._last = 0 < stamp - self._last <= self._apart, stamp
-        told = list[Screened]()
+        decided = list[Screened]()
         if self._waiting and consecutive:
-            told = self._judge_waiting(values)
-            if not told and len(self._waiting) < MOST_STRAY:
+            decided = self._judge_waiting(values)
+            if not decided and len(self._waiting) < MOST_STRAY:
                 self._waiting.append((stamp, dict(values)))
                 return []
-        told = told or self.release()
+        decided = decided or self.take_waiting()
         if consecutive and any(self._leaps(name, value) for name, value in values.items()):
             self._waiting, self.until = [(stamp, dict(values))], stamp + self._patience
-            return told
+            return decided
         self._learn(values, consecutive)
-        return [*told, Screened(stamp, dict(values), {})]
+        return [*decided, Screened(stamp, dict(values), {})]
 
-    def release(self) -> list[Screened]:
+    def take_waiting(self) -> list[Screened]:
         """The commands that wait, as nothing has shown that they are stray."""
-        told, self._waiting, self.until = self._waiting, [], NEVER
-        for _, values in told:
+        waiting, self._waiting, self.until = self._waiting, [], NEVER
+        for _, values in waiting:
             self._learn(values, True)
-        return [Screened(stamp, values, {}) for stamp, values in told]
+        return [Screened(stamp, values, {}) for stamp, values in waiting]
 
     def _judge_waiting(self, now: Mapping[str, Any]) -> list[Screened]:
         """The commands that wait, without what is stray, if each axis that has leapt is back now; else none."""
-        told = list[Screened]()
+        judged = list[Screened]()
         for stamp, values in self._waiting:
             out = {name: number(value) for name, value in values.items() if self._leaps(name, value)}
             for name, value in out.items():
                 if not returns(number(now.get(name)), self._axes[name].value, [value]):
                     return []
-            told.append(Screened(stamp, {name: value for name, value in values.items() if name not in out}, out))
+            judged.append(Screened(stamp, {name: value for name, value in values.items() if name not in out}, out))
         self._waiting, self.until = [], NEVER
-        return told
+        return judged
 
     def _leaps(self, name: str, value: Any) -> bool:
         return name in self._axes and self._axes[name].has_leapt(number(value))

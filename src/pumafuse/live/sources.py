@@ -37,7 +37,7 @@ def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
         except OSError as error:
             raise RunError(f"standard input: cannot be read: {error.strerror}") from None
         if not piece:
-            yield lines.remaining()
+            yield lines.take_last()
             return
         yield lines.cut(piece)
 
@@ -58,8 +58,8 @@ def replay(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Event]
 def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     """When each event arrives [ns], ascending, (n,), and the events."""
     sources = [*run.sensors.items(), ("", believed_commands(run, config))]
-    told = (source.arrival if len(source.arrival) else source.stamp for _, source in sources)
-    arrival = np.concatenate([np.maximum.accumulate(stamp) for stamp in told])
+    times = (source.arrival if len(source.arrival) else source.stamp for _, source in sources)
+    arrival = np.concatenate([np.maximum.accumulate(stamp) for stamp in times])
     events = [event for name, source in sources for event in _events(name, source.in_joints())]
     order = np.argsort(arrival, kind="stable")
     return arrival[order], [events[row] for row in order.tolist()]

@@ -44,8 +44,8 @@ def axes_of(values: Iterable[str]) -> list[str]:
 
 def parse_noise(values: Mapping[str, Any]) -> float:
     """The factor on a row's noise; 1 where it does not tell a positive number."""
-    told = number(values.get(NOISE))
-    return told if 0.0 < told < math.inf else 1.0
+    factor = number(values.get(NOISE))
+    return factor if 0.0 < factor < math.inf else 1.0
 
 
 def check_tool(config: FusionConfig, start: Mapping[str, float]) -> None:
@@ -72,7 +72,7 @@ def tool_of(config: FusionConfig, log: RateLimitedLog) -> Tool | None:
     return Tool(config, log) if placed or config.tool is not None else None
 
 
-class Told(NamedTuple):
+class OfTool(NamedTuple):
     """What a measurement tells of the tool."""
 
     values: dict[str, Any]  # by axis
@@ -115,14 +115,14 @@ class Tool:
         if not self._takes_orientation:
             raise ValueError(NO_TOOL)
         parsed = dict(values)
-        told = unit(parsed.pop(ORIENTATION))
+        orientation = unit(parsed.pop(ORIENTATION))
         if sensor is not None:
-            return parsed | {ORIENTATION: told}
-        return parsed if self._reference is None else parsed | self._commanded_axes(told, self._reference)
+            return parsed | {ORIENTATION: orientation}
+        return parsed if self._reference is None else parsed | self._commanded_axes(orientation, self._reference)
 
-    def _commanded_axes(self, told: FloatArray, reference: FloatArray) -> dict[str, float]:
+    def _commanded_axes(self, orientation: FloatArray, reference: FloatArray) -> dict[str, float]:
         """A commanded orientation (1, 4) as axes."""
-        vector: list[float] = rotations.vectors(told, reference)[0].tolist()
+        vector: list[float] = rotations.vectors(orientation, reference)[0].tolist()
         turn = math.hypot(*vector)
         far = f"the tool is told to turn by {math.degrees(turn):.0f}° from its reference orientation"
         if turn > FARTHEST_TURN:
@@ -131,7 +131,7 @@ class Tool:
             self._log.write("turn", f"{far}: beyond 120° error bars of its orientation are too small")
         return dict(zip(TURNING, vector, strict=True))
 
-    def to_tool(self, sensor: str, stamp: int, values: Mapping[str, Any]) -> Told:
+    def to_tool(self, sensor: str, stamp: int, values: Mapping[str, Any]) -> OfTool:
         """What a sensor tells of the tool."""
         of_axes, spread = dict(values), dict[str, FloatArray]()
         oriented: FloatArray | None = of_axes.pop(ORIENTATION, None)
@@ -153,7 +153,7 @@ class Tool:
             vector = rotations.vectors(oriented, self._reference)
             of_axes.update(zip(TURNING, vector[0].tolist(), strict=True))
             spread |= dict.fromkeys(TURNING, rotations.spread(vector))
-        return Told(of_axes, {axis: float(factor[0]) for axis, factor in spread.items()}, seen)
+        return OfTool(of_axes, {axis: float(factor[0]) for axis, factor in spread.items()}, seen)
 
     def _lever(self, sensor: str, stamp: TimeArray) -> FloatArray:
         """The way from the tool point to what a sensor sees [m], by the commands, (n, 3); NaN before any."""
@@ -203,46 +203,46 @@ class CommandedTurn:
     def __init__(self, arm: ArmModel) -> None:
         self._axes: list[Record] = turning_axes(arm)
         self._delay = [round(arm.delay_of(axis) * 1e9) for axis in TURNING]
-        self._told_at: list[int] = []
+        self._stamps: list[int] = []
         self._vector: list[list[float]] = []
         self._motion: list[list[Record]] = []  # of each axis, after each of them
         self._start = [math.nan] * len(TURNING)
 
     def add(self, stamp: int, vector: list[float], oldest: int) -> int | None:
         """Add rx, ry, rz [rad] in the place of what had the same stamp; from when on that turns the tool otherwise."""
-        row = bisect_left(self._told_at, stamp)
-        again = row < len(self._told_at) and self._told_at[row] == stamp
+        row = bisect_left(self._stamps, stamp)
+        again = row < len(self._stamps) and self._stamps[row] == stamp
         if again and self._vector[row] == vector:
             return None
-        self._told_at[row : row + again], self._vector[row : row + again] = [stamp], [vector]
+        self._stamps[row : row + again], self._vector[row : row + again] = [stamp], [vector]
         if row == 0:
             self._start = vector
         del self._motion[row:]
-        for later in range(row, len(self._told_at)):
+        for later in range(row, len(self._stamps)):
             self._motion.append([self._after(later, axis) for axis in range(len(TURNING))])
-        if len(self._told_at) > 2 and self._told_at[2] <= oldest:  # one acts then, and one may be given anew
-            del self._told_at[0], self._vector[0], self._motion[0]
+        if len(self._stamps) > 2 and self._stamps[2] <= oldest:  # one acts then, and one may be given anew
+            del self._stamps[0], self._vector[0], self._motion[0]
         return stamp + min(self._delay) if row else ALWAYS
 
     def _after(self, row: int, axis: int) -> Record:
         motion = self._motion[row - 1][axis].copy() if row else at_rest()
-        told, relative = self._commands(slice(row, row + 1), axis)
-        follow(self._axes[axis], motion, told, relative, np.empty(0, np.int64))
+        stamps, relative = self._commands(slice(row, row + 1), axis)
+        follow(self._axes[axis], motion, stamps, relative, np.empty(0, np.int64))
         return motion
 
     def _commands(self, chosen: slice, axis: int) -> tuple[TimeArray, FloatArray]:
         """Stamps of commands, and an axis relative to where it starts."""
         relative = np.array([vector[axis] - self._start[axis] for vector in self._vector[chosen]])
-        return np.array(self._told_at[chosen], dtype=np.int64), relative
+        return np.array(self._stamps[chosen], dtype=np.int64), relative
 
     def at(self, time: IntArray) -> FloatArray:
         """rx, ry and rz [rad] at some instants, int64 ns, ascending, (n,) → (n, 3); NaN before any command is known."""
         turned = np.full((len(time), len(TURNING)), np.nan)
-        if not self._told_at:
+        if not self._stamps:
             return turned
         first, last = int(time[0]), int(time[-1])
         for axis, delay in enumerate(self._delay):
-            row, end = (bisect_right(self._told_at, instant - delay) for instant in (first, last))
+            row, end = (bisect_right(self._stamps, instant - delay) for instant in (first, last))
             motion = self._motion[row - 1][axis].copy() if row else at_rest()
             moved = follow(self._axes[axis], motion, *self._commands(slice(row, end), axis), time)
             turned[:, axis] = self._start[axis] + moved
@@ -250,11 +250,11 @@ class CommandedTurn:
 
     def forget(self, after: int) -> int | None:
         """Take back the commands stamped after an instant [ns]; from when on the tool is turned otherwise then [ns]."""
-        row = bisect_right(self._told_at, after)
-        if row == len(self._told_at):
+        row = bisect_right(self._stamps, after)
+        if row == len(self._stamps):
             return None
-        since = self._told_at[row] + min(self._delay)
-        del self._told_at[row:], self._vector[row:], self._motion[row:]
+        since = self._stamps[row] + min(self._delay)
+        del self._stamps[row:], self._vector[row:], self._motion[row:]
         return since if row else ALWAYS
 
 

@@ -50,7 +50,7 @@ class Lines:
             self._torn, self._too_long = b"", True
         return lines
 
-    def remaining(self) -> list[bytes]:
+    def take_last(self) -> list[bytes]:
         """The last line, if the stream ended without a line end."""
         left, self._torn = self._torn, b""
         return [left] if left else []

@@ -89,8 +89,8 @@ def _pieces(log: Log, recipe: Recipe) -> Iterator[tuple[Estimates, tuple[int, in
         until = NEVER if cut == NEVER or over else cut - ahead
         est = _piece(run, recipe, *begun, (after, until))
         yield est, (after, until), 1.0 if until == NEVER else log.done / log.rows
-        told_at = [est.segments[0].commands_of(axis)[0] for axis in est.axes]
-        log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in told_at]))
+        stamps = [est.segments[0].commands_of(axis)[0] for axis in est.axes]
+        log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in stamps]))
         after = until
 
 

@@ -116,8 +116,8 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
     listed = manifest.load(manifest.file_of(path))
     entries = listed.entries.values()
     oriented = [entry for entry in entries if entry.orientation or entry.joints]
-    told = {name for name, entry in listed.sensors.items() if entry in oriented}
-    untold = any(sensor.marker is not None and name not in told for name, sensor in config.sensors.items())
+    turning = {name for name, entry in listed.sensors.items() if entry in oriented}
+    lacks_turns = any(sensor.marker is not None and name not in turning for name, sensor in config.sensors.items())
     framed = isinstance(listed.frame or config.frame, Cylindrical)
     needs = {
         "clock = 'regular'": any(entry.clock == "regular" for entry in entries),
@@ -127,7 +127,7 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
         "a counter or shift_s": any(entry.time.counter or entry.time.shift for entry in entries),
         "joints of which some answer later,": listed.command.joints and any(config.arm.later.values()),
         "an orientation, and no [tool] in fusion.toml,": oriented and config.tool is None,
-        "a marker of a sensor that tells no orientation": oriented and untold,
+        "a marker of a sensor that tells no orientation": oriented and lacks_turns,
         "a cylindrical [frame]": framed and any(not set(CARTESIAN).isdisjoint(entry.axes) for entry in entries),
     }
     return next((what for what, need in needs.items() if need), None)

@@ -194,10 +194,10 @@ def lag_in_space(arm: ArmModel) -> float:
 
 def _turning(registrations: Iterable[Registration], earliest: Response) -> AxisModel:
     """How the tool turns: as the sensor saw that is surest, less what it is later; else as it moves."""
-    told = [(each.rotation, each.position) for each in registrations if each.rotation and each.position]
-    if not told:
+    pairs = [(each.rotation, each.position) for each in registrations if each.rotation and each.position]
+    if not pairs:
         return AxisModel(kind="angle", plant=_plant(earliest))
-    rotation, position = min(told, key=lambda responses: responses[0].lag.half)
+    rotation, position = min(pairs, key=lambda responses: responses[0].lag.half)
     delay = rotation.delay.value - (position.lag.value - earliest.lag.value)
     return AxisModel(kind="angle", plant=_plant(rotation), delay=max(round(delay, DIGITS), 0.0))
 

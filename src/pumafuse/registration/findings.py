@@ -37,7 +37,7 @@ AS_READ = (Finding.SCALE, Finding.READING, Finding.ATTITUDE)  # rows were read o
 class Reading(enum.Enum):
     """How the four numbers of an orientation are to be read."""
 
-    AS_TOLD = "as they are"
+    AS_IT_IS = "as they are"
     INVERSE = "as turning the other way"
     W_FIRST = "with w first (order = 'wxyz')"
     W_LAST = "with w last (order = 'xyzw')"

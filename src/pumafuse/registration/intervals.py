@@ -45,16 +45,16 @@ class Blocks(NamedTuple):
         return np.sqrt(variance) * float(stdtrit(count - 1.0, _LEVEL))
 
 
-def blocks(slope: FloatArray, off: FloatArray, told: FloatArray, weight: FloatArray) -> Blocks:
+def blocks(slope: FloatArray, off: FloatArray, curvature: FloatArray, weight: FloatArray) -> Blocks:
     """What blocks of rows tell that are ``off`` by so much, (n, 3), and change so with a step, (n, 3, k).
 
-    They are weighted for the information as is ``told``, for the score by their ``weight``, (n,) each.
+    They are weighted for the information by their ``curvature``, for the score by their ``weight``, (n,) each.
     """
     first = np.linspace(0.0, len(off), _BLOCKS, endpoint=False).astype(np.int64)
     cuts = [slice(*ends) for ends in pairwise([*first.tolist(), len(off)])]
     both = ((0, 1), (0, 1))
     return Blocks(
-        np.array([np.tensordot(told[cut, None, None] * slope[cut], slope[cut], both) for cut in cuts]),
+        np.array([np.tensordot(curvature[cut, None, None] * slope[cut], slope[cut], both) for cut in cuts]),
         np.array([np.tensordot(slope[cut], weight[cut, None] * off[cut], both) for cut in cuts]),
     )
 

@@ -1,7 +1,7 @@
 """By how much each joint of an arm answers later than the first: from a sensor of the tool alone.
 
 Where joints lag apart, the tool leaves its path in fast motion, and no lag along its axes explains it. A joint that is
-told later moves each row as the kinematics say. Frame, marker and joints are one linear regression; the plant, of which
+delayed moves each row as the kinematics say. Frame, marker and joints are one linear regression; the plant, of which
 what all joints lag is a part, is found anew after it.
 """
 
@@ -19,42 +19,42 @@ from .register import Quantity, Registration, rows_of, thin, within
 from .solve import CENTRE, MARKER, ROTATION, TURN, Rows, State, information_of, residual, slopes
 
 Later = Mapping[str, float]  # of each joint [s]
-Told = Callable[[Later], Sequence[Motion]]  # the commands of each run, with joints told later [s]
-_STEP = 5e-3  # s, by which a joint is told later for a slope
+Delay = Callable[[Later], Sequence[Motion]]  # the commands of each run, with joints delayed [s]
+_STEP = 5e-3  # s, by which a joint is delayed for a slope
 _ROUNDS = 3  # a path bends little within a lag: each round leaves a tenth of what the one before did
 _ROWS = 4000  # that are looked at, evenly
 _BESIDE = np.r_[ROTATION, CENTRE, MARKER, TURN]  # of a registration's step: what is free beside the joints
 _SETTLED = 0.6  # s after the first command
 _KNOWN = 0.03  # s, of half an interval: beyond it the motion does not tell how late a joint is
-_HELD = 0.03  # of the interval of commands, which are held, but told later on the line between: no lag is surer
+_HELD = 0.03  # of the interval of commands, which are held, but delayed on the line between: no lag is surer
 _PAYS = 0.95  # of the noise that is left where all joints answer alike: what gains less than 5 % is no lag of joints
 
 
 class _Step(NamedTuple):
     """A step of the regression."""
 
-    later: FloatArray  # by how much more each joint is to be told later [s], (J,)
+    later: FloatArray  # by how much more each joint is to be delayed [s], (J,)
     half: FloatArray  # half the 95 % intervals [s], (J,)
     noise: FloatArray  # what the registration left before it, of each block [m, rad]
 
 
 def joint_lags(
-    told: Told, joints: Sequence[str], sensor: Sequence[Motion], register: Callable[[Sequence[Motion]], Registration]
+    delay: Delay, joints: Sequence[str], sensor: Sequence[Motion], register: Callable[[Sequence[Motion]], Registration]
 ) -> dict[str, Quantity]:
     """How much later than the first each joint answers [s]; nothing where all answer alike, as far as is told.
 
-    ``told`` gives the commands, beside which ``register`` registers what the sensor told in its own frame, one entry a
+    ``delay`` gives the commands, beside which ``register`` registers what the sensor saw in its own frame, one entry a
     run. A joint of which the motion does not tell is as late as the others are on average, its interval infinite.
     """
     later, steps = dict.fromkeys(joints, 0.0), list[_Step]()
     for _ in range(_ROUNDS + 1):
-        registration = register(told(later))
+        registration = register(delay(later))
         if registration.frame is None:
             return {}
-        steps.append(_step(told, later, sensor, registration))
+        steps.append(_step(delay, later, sensor, registration))
         by = zip(later.items(), steps[-1].later.tolist(), strict=True)
         later = {name: before + more for (name, before), more in by}
-    period = float(np.median(np.diff(told(later)[0].time)))
+    period = float(np.median(np.diff(delay(later)[0].time)))
     half, late = np.hypot(steps[-1].half, _HELD * period), np.array(list(later.values()))
     is_known = half < _KNOWN
     if not is_known.any() or np.mean(np.log(steps[-1].noise / steps[0].noise)) > np.log(_PAYS):
@@ -64,15 +64,15 @@ def joint_lags(
     return dict(zip(joints, map(Quantity.around, late.tolist(), half.tolist()), strict=True))
 
 
-def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Registration) -> _Step:
+def _step(delay: Delay, later: Later, sensor: Sequence[Motion], registration: Registration) -> _Step:
     """How much later each joint is beside a registration."""
-    sensor = _drop_start(told(later), sensor)
+    sensor = _drop_start(delay(later), sensor)
     attitude = registration.rms_rotation is not None
     mean = np.concatenate([motion.position for motion in sensor]).mean(axis=0)
     state = _state(registration, mean)
 
     def beside(commands: Later) -> Rows:
-        return rows_of([motion.valid() for motion in told(commands)], sensor, mean, attitude=attitude)
+        return rows_of([motion.valid() for motion in delay(commands)], sensor, mean, attitude=attitude)
 
     rows = beside(later)
     off = residual(rows, state)
@@ -94,7 +94,7 @@ def _step(told: Told, later: Later, sensor: Sequence[Motion], registration: Regi
 
 
 def _drop_start(command: Sequence[Motion], sensor: Sequence[Motion]) -> list[Motion]:
-    """What the sensor told once it is forgotten how the arm moved before the first command."""
+    """What the sensor saw once it is forgotten how the arm moved before the first command."""
     both = zip(command, sensor, strict=True)
     return thin(
         [within(motion.valid(), command_motion.valid().time, _SETTLED) for command_motion, motion in both], _ROWS

@@ -50,8 +50,8 @@ def latencies_of(
     for name in (other for other in lags if other != best):
         both = [run for run in runs if {name, best} <= run.sensors.keys()]
         points = [_of_point(run, best, registrations[best], placed, name) for run in both]
-        told = later(points, [_in_base(run, name, placed) for run in both], lags[name].value - lags[best].value)
-        beside[name] = told or _sum(lags[name], -lags[best].value)
+        by_both = later(points, [_in_base(run, name, placed) for run in both], lags[name].value - lags[best].value)
+        beside[name] = by_both or _sum(lags[name], -lags[best].value)
     if lag is None:
         first, of_first = min(beside, key=lambda name: beside[name].value), Quantity.around(0.0)
     else:
@@ -128,7 +128,7 @@ class _Path:
 
     def __init__(self, first: Motion) -> None:
         turned = [] if first.quaternion is None else [Rotation.from_quat(first.quaternion).as_matrix().reshape(-1, 9)]
-        self._time, self._told = first.time, np.hstack([despike(first.position), *turned])
+        self._time, self._pose = first.time, np.hstack([despike(first.position), *turned])
 
     def covers(self, time: FloatArray) -> BoolArray:
         """Whether there are velocities at some instants, also when they are shifted a little."""
@@ -136,7 +136,7 @@ class _Path:
         return (time >= first + 2.0 * _SPEED) & (time <= last - 2.0 * _SPEED)
 
     def _at(self, time: FloatArray) -> FloatArray:
-        columns: list[FloatArray] = [np.interp(time, self._time, column) for column in self._told.T]
+        columns: list[FloatArray] = [np.interp(time, self._time, column) for column in self._pose.T]
         return np.column_stack(columns)
 
     def beside(self, other: Motion, late: float) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""What was told to the tool and what a sensor saw of it, and where the tool is by its commands.
+"""What the tool was commanded and what a sensor saw of it, and where the tool is by its commands.
 
 The arm answers by a dead time and a first-order plant, one for positions, one for orientations, between commands that
 are held: exact at any instant. An orientation R is Exp(θ) R₀, and each component of θ goes through the plant.
@@ -92,7 +92,7 @@ class Answer:
         self.turns = all(motion.quaternion is not None for motion in command)  # whether the orientation is commanded
         self._time = time
         self._start = [float(motion.time[0]) for motion in command]
-        self._told_at: list[TimeArray] = [
+        self._stamps: list[TimeArray] = [
             np.round((motion.time - motion.time[0]) * _NS).astype(np.int64) for motion in command
         ]
         self._position = [motion.position for motion in command]
@@ -129,10 +129,10 @@ class Answer:
     def _through(self, levels: Sequence[FloatArray], plant: Plant) -> FloatArray:
         """Three axes of all runs through a plant, (n, 3)."""
         axis, responses = AxisModel(plant=FirstOrder(time_constant=plant.time_constant)), list[FloatArray]()
-        for start, told_at, level, time in zip(self._start, self._told_at, levels, self._time, strict=True):
+        for start, stamps, level, time in zip(self._start, self._stamps, levels, self._time, strict=True):
             at = np.round((time - plant.delay - start) * _NS).astype(np.int64)
             answers = [
-                first + response(axis, _PERIOD, 0.0, told_at, column, first, at)
+                first + response(axis, _PERIOD, 0.0, stamps, column, first, at)
                 for first, column in zip(level[0].tolist(), level.T, strict=True)
             ]
             responses.append(np.stack(answers, axis=-1))

@@ -136,8 +136,8 @@ def register_sensor(
     """Frame, marker and lag of a sensor.
 
     Args:
-        command: What the tool was told in the base's frame, one entry a run.
-        sensor: What the sensor told in its own frame and by the same clock, likewise.
+        command: What the tool was commanded in the base's frame, one entry a run.
+        sensor: What the sensor saw in its own frame and by the same clock, likewise.
         marker: Tool from marker as far as it is known: what motion does not tell stays so. None: zeros.
         fix_marker: Whether it stays as it is.
         loosely: Whether a fifth of what the sensor saw may be left, as where it is not known yet that joints lag apart.
@@ -147,27 +147,27 @@ def register_sensor(
     seconds = sum(float(b.time[-1] - b.time[0]) for _, b in both)
     if seconds < _AT_LEAST:
         return Registration(findings=(Found(finding=Finding.SHORT, size=seconds),))
-    told, seen = [a for a, _ in both], [b for _, b in both]
-    about = rough(told, seen)
+    commanded, seen = [a for a, _ in both], [b for _, b in both]
+    about = rough(commanded, seen)
     if about.correlation < _FOLLOWS:
         return Registration(findings=(Found(finding=Finding.UNRELATED, size=about.correlation),))
     settling = _SETTLED * max(about.lag, 0.0)
     seen = [news(a, drop_gaps(a.time, within(b, a.time, settling), settling)) for a, b in both]
-    begun = _begin(told, seen, about, marker or Placement(), fix_marker, loosely)
+    begun = _begin(commanded, seen, about, marker or Placement(), fix_marker, loosely)
     return _fit(begun, fix_marker, loosely)
 
 
 def within(sensor: Motion, span: FloatArray, settling: float = 0.0) -> Motion:
-    """What a sensor told while there were commands."""
+    """What a sensor saw while there were commands."""
     if not len(span):
         return sensor.only(np.zeros(0, np.int64))
     return sensor.only((sensor.time >= span[0] + settling) & (sensor.time <= span[-1]))
 
 
 def drop_gaps(span: FloatArray, sensor: Motion, settling: float) -> Motion:
-    """What a sensor told, but for gaps of the commands, whose instants are ``span`` [s], (n,).
+    """What a sensor saw, but for gaps of the commands, whose instants are ``span`` [s], (n,).
 
-    Where the tool was told to be in a gap is not known; it may move as was told for ``settling`` [s] after it.
+    Where the tool was commanded in a gap is not known; it may move as was commanded for ``settling`` [s] after it.
     """
     interval = np.diff(span)
     usual, lost = median(interval), np.zeros(len(sensor.time), dtype=np.bool_)
@@ -177,7 +177,7 @@ def drop_gaps(span: FloatArray, sensor: Motion, settling: float) -> Motion:
 
 
 def news(command: Motion, sensor: Motion) -> Motion:
-    """What a sensor told; where much of it was at rest, that around a motion of the commands, and now and then at rest.
+    """What a sensor saw; where much of it was at rest, that around a motion of the commands, and now and then at rest.
 
     Rows at rest say the same again. Where they are many, what one pose errs by would decide, and rows in motion, which
     alone tell a lag, would be the outliers.
@@ -314,8 +314,8 @@ def _coarse(
     turn = Rotation.from_rotvec(marker.rotation).as_matrix()
     markers = np.zeros((3, 0)) if fix_marker else _split_directions(poses.rotation)[1]
     begin = State(first @ rotation, path.mean(axis=0), at, turn, scale, plant, plant)
-    told = markers.size > 0
-    held, free = (_free(np.eye(3), markers, turn=False, scale=of, own_lag=of and told) for of in (False, moves))
+    moves_marker = markers.size > 0
+    held, free = (_free(np.eye(3), markers, turn=False, scale=of, own_lag=of and moves_marker) for of in (False, moves))
     nearer = fit_poses(rows, begin, held).state  # a free scale may make all small first, a held one be stuck far away
     again = _plant(nearer.position.lag)
     both = (fit_poses(rows, start, free) for start in (begin, nearer._replace(position=again, angle=again)))
@@ -333,10 +333,10 @@ def _split_directions(rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Directions on the tool along which a marker's place is not told, and is told, as columns."""
     moved = rotation - rotation.mean(axis=0)
     square, directions = np.linalg.eigh(np.einsum("nij,nik->jk", moved, moved) / len(moved))
-    told = square >= _TURNS**2
-    if told.sum() < 2:  # a rotation moves two directions or three
-        told[:] = False
-    return directions[:, ~told], directions[:, told]
+    determined = square >= _TURNS**2
+    if determined.sum() < 2:  # a rotation moves two directions or three
+        determined[:] = False
+    return directions[:, ~determined], directions[:, determined]
 
 
 def _free(rotation: FloatArray, marker: FloatArray, *, turn: bool, scale: bool, own_lag: bool) -> FloatArray:
@@ -376,14 +376,14 @@ def _unit_finding(scale: float, within: float = _UNIT) -> list[Found]:
 def _add_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: bool) -> _Begin:
     """With the sensor's orientations, where they follow; read otherwise where they follow then."""
     few = thin(begin.sensor, _COARSE)
-    told = ("sensor", Reading.AS_TOLD)
-    ways = [told, *product(("sensor", "command"), tuple(Reading)[1:])]
+    as_it_is = ("sensor", Reading.AS_IT_IS)
+    ways = [as_it_is, *product(("sensor", "command"), tuple(Reading)[1:])]
     aligned = {way: _align(begin, few, *way) for way in ways}
     best = min(ways, key=lambda way: aligned[way].left)
-    if aligned[told].left <= max(aligned[best].left / _CLEARER, _SURELY):
-        best = told
+    if aligned[as_it_is].left <= max(aligned[best].left / _CLEARER, _SURELY):
+        best = as_it_is
     if aligned[best].left > _ALIKE or aligned[best].excess > _OTHERWISE:
-        frame, left = aligned[told].attitude
+        frame, left = aligned[as_it_is].attitude
         angle = float(Rotation.from_matrix(frame @ begin.state.rotation.T).magnitude())
         kind = Finding.ATTITUDE if left < _ALIKE else Finding.ATTITUDE_UNRELATED
         unit = (
@@ -393,7 +393,7 @@ def _add_attitude(begin: _Begin, about: Rough, marker: Placement, fix_marker: bo
     frame = aligned[best].frame
     command, sensor = _read_as(begin.command, begin.sensor, *best)
     state, findings = begin.state, list(begin.findings)
-    if best != told:
+    if best != as_it_is:
         findings.append(Found(finding=Finding.READING, source=best[0], reading=best[1]))
     few = thin(sensor, _COARSE)
     if best[0] == "command":
@@ -439,10 +439,10 @@ def _align(begin: _Begin, few: list[Motion], source: str, reading: Reading) -> _
     path, seen = unit(poses.position + poses.rotation @ state.marker), unit(rows.centred)
     turns = align_turns(Rotation.from_matrix(poses.rotation), Rotation.from_matrix(rows.turned))
     size = max(float(np.linalg.norm(turns[0])) / np.sqrt(len(turns[0])), _NOTABLE) * np.sqrt(len(turns[0]) / len(path))
-    told, measured = (turn / size for turn in turns)
-    frame, left = kabsch(np.vstack([path, told]), np.vstack([seen, measured]))
-    rotation = kabsch(np.vstack([_HARDLY * path, told]), np.vstack([_HARDLY * seen, measured]))[0]
-    of_path, alone = kabsch(path, seen)[1], kabsch(told, measured)[1]
+    commanded, measured = (turn / size for turn in turns)
+    frame, left = kabsch(np.vstack([path, commanded]), np.vstack([seen, measured]))
+    rotation = kabsch(np.vstack([_HARDLY * path, commanded]), np.vstack([_HARDLY * seen, measured]))[0]
+    of_path, alone = kabsch(path, seen)[1], kabsch(commanded, measured)[1]
     half = float(len(path))  # the sum of squares of each
     beyond = max(left - of_path - alone, 0.0)
     share, excess = np.sqrt([0.5 * left / half, 0.5 * beyond / half]).tolist()
@@ -457,9 +457,9 @@ def _fit(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     sensor = thin(begin.sensor, _ROWS)
     rows, state = rows_of(begin.command, sensor, begin.mean, attitude=begin.attitude), begin.state
     poses = rows.answer.poses(state.position, state.angle)
-    blind, told = _split_directions(poses.rotation)
+    blind, determined = _split_directions(poses.rotation)
     if fix_marker:
-        blind = told = np.zeros((3, 0))
+        blind = determined = np.zeros((3, 0))
     elif blind.shape[1] == 3:
         findings.append(Found(finding=Finding.STILL, source=None if rows.answer.turns else "command"))
     elif blind.shape[1] == 1:
@@ -467,11 +467,11 @@ def _fit(begin: _Begin, fix_marker: bool, loosely: bool) -> Registration:
     loose, held = _about(poses.position + poses.rotation @ state.marker, poses.rotation, begin.attitude)
     if loose.shape[1]:
         findings.append(Found(finding=Finding.LINE, axis=_vector(loose[:, 0])))
-    elif begin.either and not (begin.attitude and told.shape[1]):
+    elif begin.either and not (begin.attitude and determined.shape[1]):
         findings.append(Found(finding=Finding.PLANE))
     moves = bool(np.std(poses.position, axis=0).max() > _BESIDE)
-    allowed = partial(_free, held, told, turn=begin.attitude and not fix_marker, scale=False)
-    own_lag = rows.answer.turns and len(told.T) > 0 and moves  # else nothing tells the lag of positions
+    allowed = partial(_free, held, determined, turn=begin.attitude and not fix_marker, scale=False)
+    own_lag = rows.answer.turns and len(determined.T) > 0 and moves  # else nothing tells the lag of positions
     if own_lag and not begin.attitude:
         state = _turning_anew(begin, allowed(own_lag=True))
     fit = fit_poses(rows, state, allowed(own_lag=own_lag))
@@ -502,17 +502,17 @@ def _turning_anew(begin: _Begin, free: FloatArray) -> State:
 
 def _unexplained_finding(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, share: float) -> Found:
     """The finding that no frame explains a share of the motion, and whether commands without orientation may be why."""
-    told_less = command[0].quaternion is None and sensor[0].quaternion is not None
+    lacks_turns = command[0].quaternion is None and sensor[0].quaternion is not None
     unit = _angle_unit_finding(command, sensor, lag)
-    return Found(finding=Finding.UNEXPLAINED, size=share, source="command" if told_less else None, unit=unit)
+    return Found(finding=Finding.UNEXPLAINED, size=share, source="command" if lacks_turns else None, unit=unit)
 
 
 def _angle_unit_finding(command: Sequence[Motion], sensor: Sequence[Motion], lag: float) -> str | None:
     """A question about the unit of angles, where the tool is told to turn as many times as far as deg are of rad."""
     turns = ratio(command, sensor, lag, turns=True)
     if turns > 0.0 and abs(abs(np.log(turns)) - np.log(DEG)) < _ANGLES:
-        told, seen = ("deg read as rad", "rad read as deg")[:: 1 if turns > 1.0 else -1]
-        asked = f"are its angles {seen}, or the commanded {told}?"
+        commanded, seen = ("deg read as rad", "rad read as deg")[:: 1 if turns > 1.0 else -1]
+        asked = f"are its angles {seen}, or the commanded {commanded}?"
         return f"the tool is told to turn {turns:.2g} times as far as is seen: {asked}"
     return None
 
@@ -530,8 +530,8 @@ def _about(path: FloatArray, rotation: FloatArray, attitude: bool) -> tuple[Floa
         turned = Rotation.from_matrix(rotation)
         about = np.vstack([about, _LEVER * (turned * turned.mean().inv()).as_rotvec()])
     square, axes = np.linalg.eigh(np.sum(about**2) * np.eye(3) - about.T @ about)
-    told = square >= _BESIDE**2 * len(path)
-    return axes[:, ~told], axes[:, told]
+    determined = square >= _BESIDE**2 * len(path)
+    return axes[:, ~determined], axes[:, determined]
 
 
 def _vector(of: FloatArray) -> Vector:
@@ -551,15 +551,15 @@ def _add_intervals(fit: Fit, begin: _Begin, loose: FloatArray, blind: FloatArray
     half[(np.abs(slopes @ lost) > _TILT).any(axis=1)] = np.inf
     if not begin.attitude:
         half[9:12] = np.inf
-    told = list(map(Quantity.around, values.tolist(), half.tolist()))
-    position, rotation = (Response(lag=a, delay=b, time_constant=c) for a, b, c in (told[12:15], told[15:18]))
+    numbers = list(map(Quantity.around, values.tolist(), half.tolist()))
+    position, rotation = (Response(lag=a, delay=b, time_constant=c) for a, b, c in (numbers[12:15], numbers[15:18]))
     noise = fit.off.rms()
     turned = values[3:6] - loose @ (loose.T @ values[3:6])
     along = is_here(state.centre - begin.mean, turned)
     ahead = [Found(finding=Finding.AHEAD, size=-position.lag.value)] if position.lag.ci95[1] < 0.0 else []
     return Registration(
-        frame=_of_numbers(told[:6]),
-        marker=_of_numbers(told[6:12]),
+        frame=_of_numbers(numbers[:6]),
+        marker=_of_numbers(numbers[6:12]),
         position=position,
         rotation=rotation if own_lag else None,
         rms=noise[0],
@@ -575,9 +575,9 @@ def is_here(at: Vector | FloatArray, rotation: Vector | FloatArray) -> bool:
     return bool(np.linalg.norm(at) < _HERE and np.linalg.norm(rotation) < _AS_TURNED)
 
 
-def _of_numbers(told: Sequence[Quantity]) -> Registered:
+def _of_numbers(numbers: Sequence[Quantity]) -> Registered:
     """A place and an orientation of six numbers."""
-    x, y, z, a, b, c = told
+    x, y, z, a, b, c = numbers
     return Registered(
         at=(x.value, y.value, z.value),
         at_ci95=(x.ci95, y.ci95, z.ci95),

@@ -22,7 +22,7 @@ from ..logs.run import Run
 from ..model.arm import Joint
 from ..toml import Interval
 from .configured import DIGITS, arm_of, configuration, lag_in_space, set_joints, set_lags, set_placements
-from .joints import Later, Told, joint_lags
+from .joints import Delay, Later, joint_lags
 from .latencies import latencies_of
 from .motion import Motion, drop_repeated, motion_of
 from .register import Quantity, Registered, Registration, is_here, register_sensor
@@ -216,26 +216,26 @@ def _joints(runs: Sequence[Run], names: Sequence[str]) -> dict[str, Joint]:
         return {}
     best, late = np.inf, dict[str, Quantity]()
     for name in names:
-        told, sensor = _apart(runs, name)
+        delay, sensor = _apart(runs, name)
         register = partial(register_sensor, sensor=sensor, loosely=True)
-        begun = register(told({}))
+        begun = register(delay({}))
         if begun.position is None or begun.read_otherwise or begun.position.lag.half >= best:
             continue
-        best, late = begun.position.lag.half, joint_lags(told, order, sensor, register)
+        best, late = begun.position.lag.half, joint_lags(delay, order, sensor, register)
     return {
         name: Joint(later=round(lag.value, DIGITS), later_ci95=lag.ci95 if np.isfinite(lag.half) else None)
         for name, lag in late.items()
     }
 
 
-def _apart(runs: Sequence[Run], name: str) -> tuple[Told, list[Motion]]:
-    """The commands of the runs that have a sensor, with joints told later, and what the sensor told."""
+def _apart(runs: Sequence[Run], name: str) -> tuple[Delay, list[Motion]]:
+    """The commands of the runs that have a sensor, with joints delayed, and what the sensor saw."""
     runs_of_sensor = [run for run in runs if name in run.sensors]
 
-    def told(later: Later) -> list[Motion]:
+    def delay(later: Later) -> list[Motion]:
         return [motion_of(run.command.delayed(later)) for run in runs_of_sensor]
 
-    return told, [drop_repeated(run.sensors[name]) for run in runs_of_sensor]
+    return delay, [drop_repeated(run.sensors[name]) for run in runs_of_sensor]
 
 
 def _sensors(runs: Sequence[Run], config: FusionConfig | None, sensor: str | None) -> list[str]:
@@ -278,9 +278,9 @@ def _missing_note(runs: Sequence[Run], name: str, instead: str) -> str:
 
 def _register_sensor(runs: Sequence[Run], name: str, config: FusionConfig | None, *, fixed: bool) -> Registration:
     """The registration of one sensor by the runs that have it."""
-    told, sensor = _apart(runs, name)
+    delay, sensor = _apart(runs, name)
     marker = None if config is None or name not in config.sensors else config.sensors[name].marker
-    return register_sensor(told({}), sensor, marker=marker, fix_marker=fixed)
+    return register_sensor(delay({}), sensor, marker=marker, fix_marker=fixed)
 
 
 def _drop_frame(registration: Registration) -> Registration:

@@ -107,7 +107,7 @@ class Fit(NamedTuple):
     state: State  # what was looked for
     off: Off  # how far each row is off
     free: FloatArray  # the steps that are allowed, as columns, (17, k)
-    told: Blocks  # what blocks of rows tell of them
+    blocks: Blocks  # what blocks of rows tell of them
     of_poses: FloatArray  # the covariance of their score by what the arm errs with the pose, (k, k)
 
     def left(self) -> float:
@@ -117,8 +117,8 @@ class Fit(NamedTuple):
     def half_widths(self, numbers: FloatArray) -> FloatArray:
         """Half the 95 % interval of numbers that change so with a step, (q, 17) → (q,)."""
         numbers = numbers @ self.free
-        by = numbers @ inverse(self.told.information.sum(axis=0))
-        return np.hypot(self.told.half_widths(numbers), _NORMAL * np.sqrt(np.sum(by @ self.of_poses * by, axis=1)))
+        by = numbers @ inverse(self.blocks.information.sum(axis=0))
+        return np.hypot(self.blocks.half_widths(numbers), _NORMAL * np.sqrt(np.sum(by @ self.of_poses * by, axis=1)))
 
 
 def fit_poses(rows: Rows, state: State, free: FloatArray) -> Fit:
@@ -126,16 +126,16 @@ def fit_poses(rows: Rows, state: State, free: FloatArray) -> Fit:
     off = residual(rows, state)
     for _ in range(_STEPS):
         whitening = off.whitening()
-        told = _normal(rows, state, off, whitening, free, expected=False)
-        step = told.step()
-        if -(told.score.sum(axis=0) @ step) < _ENOUGH * len(rows.centred):
+        normal = _normal(rows, state, off, whitening, free, expected=False)
+        step = normal.step()
+        if -(normal.score.sum(axis=0) @ step) < _ENOUGH * len(rows.centred):
             break
         better = _better(rows, state, free @ step, off.cost(whitening), whitening)
         if better is None:
             break
         state, off = better
-    told = _normal(rows, state, off, off.whitening(), free, expected=True)
-    return Fit(state, off, free, told, _of_poses(rows, state, off, free))
+    normal = _normal(rows, state, off, off.whitening(), free, expected=True)
+    return Fit(state, off, free, normal, _of_poses(rows, state, off, free))
 
 
 def residual(rows: Rows, state: State) -> Off:

@@ -43,22 +43,22 @@ def rough(command: Sequence[Motion], sensor: Sequence[Motion]) -> Rough:
     best = Rough(0.0, np.nan, 0.0)
     for window in _WINDOWS:
         steps = round(window / _TICK)
-        told = [_speeds(path, steps, held=True) for path in command]
+        commanded = [_speeds(path, steps, held=True) for path in command]
         seen = [_speeds(path, steps, held=False) for path in sensor]
         starts = [round((b.time[0] - a.time[0]) / _TICK) for a, b in zip(command, sensor, strict=True)]
         for by, of in ((0, 0), (1, 1), (1, 0)):
-            if all(len(path) > by for path in told) and all(len(path) > of for path in seen):
-                pairs = [(a[by], b[of], at) for a, b, at in zip(told, seen, starts, strict=True)]
+            if all(len(path) > by for path in commanded) and all(len(path) > of for path in seen):
+                pairs = [(a[by], b[of], at) for a, b, at in zip(commanded, seen, starts, strict=True)]
                 for lag in _LAGS:
                     left, right = _beside(pairs, lag)
                     alike = _correlation(left, right)
                     if alike > best.correlation:
-                        best = Rough(lag * _TICK, _ratio(told, seen, starts, lag), alike)
+                        best = Rough(lag * _TICK, _ratio(commanded, seen, starts, lag), alike)
     return best
 
 
 def _speeds(motion: Motion, steps: int, *, held: bool) -> list[FloatArray]:
-    """How far it goes [m], and turns [rad] where it is told, within so many ticks; by ticks from its first row.
+    """How far it goes [m], and turns [rad] where that is known, within so many ticks; by ticks from its first row.
 
     Commands are held, measurements are samples of a path.
     """
@@ -82,36 +82,40 @@ def despike(position: FloatArray) -> FloatArray:
 
 
 def _beside(pairs: Sequence[tuple[FloatArray, FloatArray, int]], lag: int) -> tuple[FloatArray, FloatArray]:
-    """What was told so many ticks before what was seen, where there are both, of all runs."""
+    """What was commanded so many ticks before what was seen, where there are both, of all runs."""
     left, right = list[FloatArray](), list[FloatArray]()
-    for told, seen, start in pairs:
+    for commanded, seen, start in pairs:
         first = max(0, lag - start)
-        count = max(min(len(seen) - first, len(told) - (first + start - lag)), 0)
-        left.append(told[first + start - lag :][:count])
+        count = max(min(len(seen) - first, len(commanded) - (first + start - lag)), 0)
+        left.append(commanded[first + start - lag :][:count])
         right.append(seen[first:][:count])
     return np.concatenate(left), np.concatenate(right)
 
 
-def _ratio(told: Sequence[list[FloatArray]], seen: Sequence[list[FloatArray]], starts: list[int], lag: int) -> float:
+def _ratio(
+    commanded: Sequence[list[FloatArray]], seen: Sequence[list[FloatArray]], starts: list[int], lag: int
+) -> float:
     """How far a marker should go, over how far it is seen to, where the tool is fast; NaN where it keeps its place."""
-    moved, distance = _beside([(a[0], b[0], at) for a, b, at in zip(told, seen, starts, strict=True)], lag)
+    moved, distance = _beside([(a[0], b[0], at) for a, b, at in zip(commanded, seen, starts, strict=True)], lag)
     fast = moved >= np.quantile(moved, _FAST)
     if median(moved[fast]) < _MOVED:
         return np.nan
-    if all(len(path) > 1 for path in told):
-        turned = _beside([(a[1], b[0], at) for a, b, at in zip(told, seen, starts, strict=True)], lag)[0]
+    if all(len(path) > 1 for path in commanded):
+        turned = _beside([(a[1], b[0], at) for a, b, at in zip(commanded, seen, starts, strict=True)], lag)[0]
         moved = np.hypot(moved, _LEVER * turned)
     return median(moved[fast]) / max(median(distance[fast]), _STANDS)
 
 
 def ratio(command: Sequence[Motion], sensor: Sequence[Motion], lag: float, *, turns: bool) -> float:
-    """How far the tool is told to move, or to turn, over how far it is seen to, where it is fast; NaN if untold."""
+    """How far the tool is commanded to move or turn over how far it is seen to, where it is fast; NaN if unknown."""
     steps, column = round(_OVER[turns] / _TICK), int(turns)
-    told, seen = ([_speeds(path, steps, held=held) for path in of] for of, held in ((command, True), (sensor, False)))
-    if any(len(path) <= column for path in (*told, *seen)):
+    commanded, seen = (
+        [_speeds(path, steps, held=held) for path in of] for of, held in ((command, True), (sensor, False))
+    )
+    if any(len(path) <= column for path in (*commanded, *seen)):
         return np.nan
     starts = [round((b.time[0] - a.time[0]) / _TICK) for a, b in zip(command, sensor, strict=True)]
-    pairs = [(a[column], b[column], at) for a, b, at in zip(told, seen, starts, strict=True)]
+    pairs = [(a[column], b[column], at) for a, b, at in zip(commanded, seen, starts, strict=True)]
     moved, distance = _beside(pairs, round(lag / _TICK))
     if not len(moved):
         return np.nan
@@ -147,9 +151,9 @@ def rotations_between(turned: Rotation) -> FloatArray:
     return np.concatenate([(turned[shift:] * turned[:-shift].inv()).as_rotvec() for shift in shifts])
 
 
-def align_turns(told: Rotation, seen: Rotation) -> tuple[FloatArray, FloatArray]:
+def align_turns(commanded: Rotation, seen: Rotation) -> tuple[FloatArray, FloatArray]:
     """Rotations between the same rows of both, those of which the axis is sure."""
-    turns, other = rotations_between(told), rotations_between(seen)
+    turns, other = rotations_between(commanded), rotations_between(seen)
     sure = np.maximum(np.linalg.norm(turns, axis=1), np.linalg.norm(other, axis=1)) < _HALF_TURN
     return turns[sure], other[sure]
 
@@ -157,7 +161,7 @@ def align_turns(told: Rotation, seen: Rotation) -> tuple[FloatArray, FloatArray]
 def read(quaternion: FloatArray, reading: Reading) -> FloatArray:
     """Quaternions x, y, z, w that were read otherwise."""
     match reading:
-        case Reading.AS_TOLD:
+        case Reading.AS_IT_IS:
             return quaternion
         case Reading.INVERSE:
             return quaternion * np.array([-1.0, -1.0, -1.0, 1.0])

@@ -69,7 +69,7 @@ BEYOND = (-0.98, 1.0)  # bounds of the slope of another: no load moves a tool mo
 class Recording(NamedTuple):
     """What was commanded on an axis, and what was measured of it, in one piece."""
 
-    told: TimeArray  # when each command was given, int64 ns, (k,)
+    stamp: TimeArray  # when each command was given, int64 ns, (k,)
     command: FloatArray  # u [m], (k,)
     start: float  # the level [m] at which the axis rests before its first command
     time: TimeArray  # when each measurement is valid, int64 ns, ascending, (m,)
@@ -227,7 +227,7 @@ class Measured:
     @property
     def phase(self) -> float | None:
         """How long after a command all measurements are valid, in update periods; None where that differs."""
-        return phase(((recording.told, recording.time) for recording in self.recordings), self.period)
+        return phase(((recording.stamp, recording.time) for recording in self.recordings), self.period)
 
     def unseen(self, arm: Arm) -> tuple[float, float]:
         """How far an arm is from a line between neighbouring measurements, and how far it goes from one to the next.
@@ -326,7 +326,7 @@ class Measured:
         """
         parts = list[Recording]()
         for recording in self.recordings:
-            commands, long = len(recording.told), max(len(recording.told), len(recording.time))
+            commands, long = len(recording.stamp), max(len(recording.stamp), len(recording.time))
             if long <= most or commands < _FEW_COMMANDS:
                 parts.append(recording)
                 continue
@@ -337,7 +337,7 @@ class Measured:
 
     def excerpt(self, commands: int, rows: int) -> Measured:
         """The part of each recording with the most motion, and some of its measurements, evenly."""
-        parts = [_liveliest(recording, commands, 0, len(recording.told)) for recording in self.recordings]
+        parts = [_liveliest(recording, commands, 0, len(recording.stamp)) for recording in self.recordings]
         return self.of([part.of(slice(None, None, len(part.time) // rows + 1)) for part in parts])
 
     def responses(self, arm: Arm) -> list[FloatArray]:
@@ -377,7 +377,7 @@ class Measured:
             variance = self._variance(recording, noise)
             records["start"] = recording.start
             rows = len(recording.time), ptr(recording.time), ptr(variance), c, ptr(white)
-            commands = len(recording.told), ptr(recording.told), ptr(recording.command)
+            commands = len(recording.stamp), ptr(recording.stamp), ptr(recording.command)
             check(library.pf_weigh(ptr(record), *rows, *commands, len(arms), ptr(records), ptr(products_here)))
             products += products_here
         every = np.zeros((len(arms), 2 + c, 2 + c))  # products of plain response, gain, measurements and biases
@@ -464,7 +464,7 @@ class Measured:
         """
         longest = self.of([max(self.recordings, key=lambda recording: len(recording.time))])
         (recording,) = longest.recordings
-        since: FloatArray = (recording.time - int(recording.told[0])) / 1e9
+        since: FloatArray = (recording.time - int(recording.stamp[0])) / 1e9
         if len(since) < 3 * count:
             return None
         edges = np.linspace(float(since[0]), float(since[-1]), count + 1)
@@ -541,7 +541,7 @@ class Measured:
         for recording in self.recordings:
             records["start"] = recording.start
             moved = np.empty((len(arms), len(recording.time)))
-            commands = len(recording.told), ptr(recording.told), ptr(recording.command)
+            commands = len(recording.stamp), ptr(recording.stamp), ptr(recording.command)
             asked = len(recording.time), ptr(recording.time), ptr(moved)
             check(library.pf_response(len(arms), ptr(records), *commands, *asked))
             responses.append(moved)
@@ -589,18 +589,18 @@ def lonely(far: BoolArray) -> BoolArray:
 
 def _liveliest(recording: Recording, most: int, begin: int, end: int) -> Recording:
     """What was measured while so many commands moved most, of those between two; with commands that still act then."""
-    if len(recording.told) <= most:
+    if len(recording.stamp) <= most:
         return recording
     most = min(most, end - begin)
     firsts = np.append(np.arange(begin, end - most, max(most // 2, 1)), end - most)
     way = np.append(0.0, np.cumsum(np.abs(np.diff(recording.command))))
     first = int(max(firsts, key=lambda row: way[row + most - 1] - way[row]))
     last = first + most - 1
-    part = recording.of((recording.time >= recording.told[first]) & (recording.time <= recording.told[last]))
-    act = int(np.searchsorted(recording.told, int(recording.told[first]) - round(_SETTLED * 1e9)))
+    part = recording.of((recording.time >= recording.stamp[first]) & (recording.time <= recording.stamp[last]))
+    act = int(np.searchsorted(recording.stamp, int(recording.stamp[first]) - round(_SETTLED * 1e9)))
     start = float(recording.command[act]) if act else recording.start
-    times, command = recording.told[act : last + 1], recording.command[act : last + 1]
-    return part._replace(told=times, command=command, start=start, value=part.value + recording.start - start)
+    times, command = recording.stamp[act : last + 1], recording.command[act : last + 1]
+    return part._replace(stamp=times, command=command, start=start, value=part.value + recording.start - start)
 
 
 def covariance(information: FloatArray, scale: float | Sequence[float] = 1.0) -> FloatArray:

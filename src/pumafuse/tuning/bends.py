@@ -98,8 +98,8 @@ class _Search:
 
     def __init__(self, plain: PlainArm, arm: Arm, free: Collection[str]) -> None:
         self.measured, self._names = _looked_at(plain), [name for name in _ANY if name in free]
-        told = np.concatenate([recording.command for recording in self.measured.recordings])
-        self._low, self._high = float(told.min()), float(told.max())
+        commanded = np.concatenate([recording.command for recording in self.measured.recordings])
+        self._low, self._high = float(commanded.min()), float(commanded.max())
         self._middle = 0.5 * (self._low + self._high)
         sag = {name: (self._low, self._high) if name.startswith("knee") else BEYOND for name in SAG}
         self._limits = Limits({**_ANY, **BENDS, **sag}, {})

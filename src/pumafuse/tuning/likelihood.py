@@ -371,13 +371,13 @@ def _liveliest(segment: Segment, share: float) -> Segment:
     fused = rows.codes == Outcome.FUSED
     chosen = fused & segment.turn.any()
     for column, axis in enumerate(segment.axes):
-        told, command = segment.commands_of(axis)
+        stamp, command = segment.commands_of(axis)
         way = np.append(0.0, np.cumsum(np.abs(np.diff(command))))
         by_stamp = np.flatnonzero(fused[:, column])
         by_stamp = by_stamp[np.argsort(rows.stamp[by_stamp], kind="stable")]
         for part in np.array_split(by_stamp, _STRETCHES):
             length = math.ceil(share * len(part))
-            until = np.interp(rows.stamp[part], told, way)
+            until = np.interp(rows.stamp[part], stamp, way)
             first = int(np.argmax(until[length - 1 :] - until[: len(part) - length + 1])) if length else 0
             chosen[part[first : first + length], column] = True
     return _of_rows(segment, chosen)

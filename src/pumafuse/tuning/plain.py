@@ -93,7 +93,7 @@ def independent(left: FloatArray) -> float:
 
 def plain_arm(measured: Measured) -> PlainArm | None:
     """The arm that leaves the least squares, without outliers; None where nothing follows the commands."""
-    begin = min((int(recording.told[0]) for recording in measured.recordings), default=0)
+    begin = min((int(recording.stamp[0]) for recording in measured.recordings), default=0)
     quarters = measured.liveliest(COMMANDS)
     measured = whole = measured.excerpt(COMMANDS, ROWS)
     if measured.count < 2 * _FEWEST or not any(np.ptp(recording.command) > 0.0 for recording in measured.recordings):

@@ -92,7 +92,7 @@ class Search:
         smooth = self._smoothly_disturbed(likeliest)
         if self._likeliest([*points, *smooth]) != likeliest:
             points += smooth
-        best = self._without_needless(self._from_wider_gates(self._likeliest(points, told=True)))
+        best = self._without_needless(self._from_wider_gates(self._likeliest(points, explains=True)))
         likeliest = with_gates(best, config)
         peak = maximise_with_gates(self.likelihood, likeliest, self.free(likeliest), self.notify)
         self._adapt(peak)
@@ -253,7 +253,7 @@ class Search:
 
     # ---- which noise pays -------------------------------------------------------------------------------------------
 
-    def _likeliest(self, peaks: Sequence[Point], told: bool = False) -> FusionConfig:
+    def _likeliest(self, peaks: Sequence[Point], explains: bool = False) -> FusionConfig:
         """The model of noise that is best for each axis after the penalty for its numbers; the reasons get why."""
         scores = [_penalised(self.likelihood, peak, self.free(peak.config)) for peak in peaks]
         for number, axis in enumerate(self.likelihood.axes):
@@ -262,7 +262,7 @@ class Search:
                 kind = _kind(peak.config, axis)
                 score[number] -= _HANDICAPS[kind]
                 best_of_kind[kind] = max(float(score[number]), best_of_kind.get(kind, -np.inf))
-            if told and len(best_of_kind) > 1 and axis in self.reasons:
+            if explains and len(best_of_kind) > 1 and axis in self.reasons:
                 best = max(best_of_kind, key=lambda kind: best_of_kind[kind])
                 calm = best_of_kind.pop(_CALM, -np.inf)
                 why = f"(one {max(best_of_kind.values()) - calm:+.1f})"

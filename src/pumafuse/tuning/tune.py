@@ -186,10 +186,10 @@ def tune(
         free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed)
     result, arms = pipeline.result(), {axis: search for stage in stages for axis, search in stage.arms.items()}
     lost = [axis for axis, search in arms.items() if search.plain is None or result.arm.lag_of(axis) > LONGEST]
-    untold = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]  # nobody measures these
+    unmeasured = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]
     looked_for = {axis: search.plain for axis, search in arms.items() if {"delay", "lag"} & set(search.freedom.free)}
     allowed = unseen_lags(looked_for, result) | {axis: doubt.lag_ci95 for axis, doubt in doubted_axes.items()}
-    lags = fitted_lags(free, config, result, around, allowed, untold)
+    lags = fitted_lags(free, config, result, around, allowed, unmeasured)
     tuned = _with_provenance(result, free, by_key, {} if interrupted else lags, names)
     doubted += lag_steps({axis: search.plain for axis, search in arms.items()}, tuned)
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]

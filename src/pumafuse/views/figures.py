@@ -229,14 +229,14 @@ def lag_figures(latency: Latency) -> Markup:
     with drawing(2, len(axes), width=12.0, height=2.6, ratios=[3.0, 1.4]) as figure:
         for axis, motion, course in zip(axes, figure.axes[::2], figure.axes[1::2], strict=True):
             screen, lag = SCREEN[run.kinds.get(axis, "length")], summary.axes[axis]
-            told_at, command = known_rows(run.command.stamp, run.command.values[axis])
+            commanded_at, command = known_rows(run.command.stamp, run.command.values[axis])
             stamp, value = known_rows(source.stamp, source.values[axis])
-            fine, model, start = np.union1d(told_at, stamp), arm.axes[axis], float(command[0])
-            moved = start + response(model, arm.update_period, arm.delay_of(axis), told_at, command, start, fine)
+            fine, model, start = np.union1d(commanded_at, stamp), arm.axes[axis], float(command[0])
+            moved = start + response(model, arm.update_period, arm.delay_of(axis), commanded_at, command, start, fine)
             scale = latency.config.sensors[summary.sensor].scale
             apart = value - scale * moved[np.searchsorted(fine, stamp)]
             value = (value - float(np.median(apart))) / scale
-            time, seen, length = seconds(told_at, origin), seconds(stamp, origin), max(_ZOOM_S, 8.0 * lag.lag)
+            time, seen, length = seconds(commanded_at, origin), seconds(stamp, origin), max(_ZOOM_S, 8.0 * lag.lag)
             begin, end = busiest(time, {axis: command}, length)
             motion.step(time, command * screen.scale, where="post", color=colours.COMMAND, lw=1, label="command")
             motion.plot(seen, value * screen.scale, ".", ms=4, color=colour, label=summary.sensor)
@@ -309,10 +309,10 @@ def _reach(values: FloatArray) -> float:
 
 
 def _draw_commands(axes: Axes, est: Estimates, name: str) -> None:
-    told = [
+    commands = [
         (seconds(time, est.origin), value) for time, value in (segment.commands_of(name) for segment in est.segments)
     ]
-    time, value = (np.concatenate(part) for part in zip(*told, strict=True))
+    time, value = (np.concatenate(part) for part in zip(*commands, strict=True))
     scale = est.config.arm.screen_of(name).scale
     axes.step(time, value * scale, where="post", color=colours.COMMAND, lw=1, label="command")
 

@@ -152,7 +152,7 @@ class LiveView:
         """Everything since the frame before, evenly thinned where there is too much."""
         frame: Frame = {}
         for source, events in self._events.items():
-            for moment, values, outcomes in _drain(events):
+            for moment, values, outcomes in _take(events):
                 for axis, outcome in outcomes.items():
                     if axis in values and source and outcome in COMPARED:
                         row = moment, float(values[axis]), float(outcome is Outcome.REJECTED)
@@ -161,7 +161,7 @@ class LiveView:
                         frame.setdefault(f"command/{axis}", []).append((moment, float(values[axis])))
                 if source in self._in_space:
                     self._add_position(frame, source or "command", moment, values)
-        for moment, axes, cartesian in _drain(self._estimates):
+        for moment, axes, cartesian in _take(self._estimates):
             for axis, now in axes.items():
                 frame.setdefault(f"estimate/{axis}", []).append((moment, now.position, now.position_sd))
             positions = cartesian if self._framed else {axis: now.position for axis, now in axes.items()}
@@ -226,7 +226,7 @@ def _encode(message: Header | Frame) -> bytes:
     return msgspec.json.encode(message, enc_hook=float) + b"\n"
 
 
-def _drain(rows: list[Any]) -> list[Any]:
+def _take(rows: list[Any]) -> list[Any]:
     """The rows, evenly thinned where they are too many; the list is empty then."""
     taken = rows[:: 1 + len(rows) // _MOST]
     rows.clear()

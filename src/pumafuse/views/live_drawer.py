@@ -79,7 +79,7 @@ class Picture:
         taken: dict[tuple[str, str], FloatArray] = {}
         for (axis, name), residuals in self._residuals.items():
             residuals.add(_columns(frame, f"measurement/{axis}/{name}", 3))
-            time, position, residual, rejected = residuals.drain()
+            time, position, residual, rejected = residuals.take()
             taken[axis, name] = np.array([time, position, rejected], dtype=np.float64)
             screen, fused = self._screens[axis], ~rejected
             shown = self._estimates[axis].clip(position, screen)
@@ -208,7 +208,7 @@ class Residuals:
         rows = np.array([stamp - self._sensor.latency, value / self._sensor.scale, rejected])
         self._waiting = np.concatenate([self._waiting, rows], axis=1)[:, -_MOST_KEPT:]
 
-    def drain(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    def take(self) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Valid times [s], positions, positions less the estimate [SI], and which were rejected."""
         if self._estimates.rows.shape[1] < 2:
             return np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.bool_)

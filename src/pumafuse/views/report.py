@@ -206,8 +206,8 @@ def _changes(summary: LatencySummary) -> list[str]:
             )
         if lag.wander and summary.clock_wander is None:
             lines.append(f"The lag of {axis} wanders by ± {lag.wander * MS:.1f} ms (one standard deviation).")
-    told = any(axis.course for axis in summary.axes.values())
-    return lines or (["The lag stays the same over the run, as far as can be told."] if told else [])
+    has_course = any(axis.course for axis in summary.axes.values())
+    return lines or (["The lag stays the same over the run, as far as can be told."] if has_course else [])
 
 
 def lags(summary: LatencySummary) -> TextTable:
@@ -383,10 +383,8 @@ def _coefficients(fit: OrderFit, screen: Screen) -> list[str]:
     values = [(fit.lag, fit.lag_ci95, MS), (fit.gain, fit.gain_ci95, 1.0), (fit.delay, fit.delay_ci95, MS)]
     values += [(fit.time_constant, fit.time_constant_ci95, MS)]
     values += [(fit.natural_frequency, fit.natural_frequency_ci95, 1.0), (fit.damping, fit.damping_ci95, 1.0)]
-    coefficients_told = [
-        formatting.format_interval(value, ci95, unit) for value, ci95, unit in values if value is not None
-    ]
-    return [*coefficients_told, f"{fit.rms * screen.scale:.3f} ({fit.rms_percent:.1f} %)"]
+    coefficients = [formatting.format_interval(value, ci95, unit) for value, ci95, unit in values if value is not None]
+    return [*coefficients, f"{fit.rms * screen.scale:.3f} ({fit.rms_percent:.1f} %)"]
 
 
 def _write(template: str, content: Mapping[str, Any], folder: Path, force: bool) -> None:

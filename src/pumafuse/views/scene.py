@@ -155,7 +155,7 @@ def send_tool(
 
 
 def _send_robot(sink: Sink, command: Source, joints: Joints, origin: int) -> None:
-    """Send a line through the robot's links, from the base to the tip, where the joints are told to be.
+    """Send a line through the robot's links, from the base to the tip, where the joints are commanded to be.
 
     rerun-sdk's own reader of URDFs draws meshes and shapes only, which a file may not have.
     """
