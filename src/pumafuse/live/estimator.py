@@ -423,40 +423,39 @@ class LiveEstimator:
             return self._refuse(None, values, _INVALID, str(error))
         result = self._add_in_frame(stamp, None, first)
         for other, pose in others.items():
-            self._add_in_frame(other, None, pose, again=True)
+            self._add_in_frame(other, None, pose, judged=True)
         return result
 
-    def _add_in_frame(self, stamp: int, sensor: str | None, values: _Values, again: bool = False) -> UpdateResult:
-        """Add an event that is to be used; ``again``: in the place of a command of the same stamp."""
-        if self._early is None:
-            return self._add_to_window(stamp, sensor, values, judged=again)
-        if again:
-            self._early = [event for event in self._early if event.sensor is not None or event.stamp != stamp]
-        return self._add_early(_Event(stamp, sensor, dict(values)), again)
+    def _add_in_frame(self, stamp: int, sensor: str | None, values: _Values, judged: bool = False) -> UpdateResult:
+        """Add an event that is to be used; ``judged``: in the place of a command of the same stamp."""
+        if self._early is not None:
+            try:
+                self._add_early(_Event(stamp, sensor, dict(values)), judged)
+            except RunError as error:
+                return self._refuse(None, values, _INVALID, str(error))
+        return self._add_to_window(stamp, sensor, values, judged)
 
-    def _add_early(self, event: _Event, again: bool) -> UpdateResult:
-        """Add an event while the frame's place may still change; a command before all others moves it."""
+    def _add_early(self, event: _Event, judged: bool) -> None:
+        """Keep an event while the frame's place may still change; a command before all others moves it."""
         assert self._early is not None
-        oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
+        early, oldest, origin, since = self._early, self._oldest(), self._window.origin, self._frame_start.since
         if origin is not None and self._clock.sure - origin > self._clock.window:
             self._early = None
-            return self._add_to_window(*event, judged=again)
+            return
+        if judged:
+            early[:] = [earlier for earlier in early if earlier.sensor is not None or earlier.stamp != event.stamp]
         x, y = (number(event.values.get(name)) for name in ("x", "y"))
         if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
             frame_start = FrameStart(self.config.frame, self.axes)
-            try:
-                frame_start.start_at_command(event.stamp, x, y)
-            except RunError as error:
-                return self._refuse(None, event.values, _INVALID, str(error))
-            early = [earlier for earlier in self._early if earlier.stamp >= oldest]
+            frame_start.start_at_command(event.stamp, x, y)
+            early = [earlier for earlier in early if earlier.stamp >= oldest]
             self._restart(self._counts_before)
             self._early, self._frame_start = early, frame_start
             for earlier in early:
                 self._add_to_window(*earlier)
-        if len(self._early) >= _MOST_KEPT:
-            del self._early[: _MOST_KEPT // 2]
-        self._early.append(event)
-        return self._add_to_window(*event, judged=again)
+        if len(early) >= _MOST_KEPT:
+            del early[: _MOST_KEPT // 2]
+        early.append(event)
 
     def _add_to_window(self, stamp: int, sensor: str | None, values: _Values, judged: bool = False) -> UpdateResult:
         """Add an event that is in time to the window; ``judged``: it is not held, nor counted anew."""
