@@ -119,13 +119,14 @@ def test_nothing_is_chosen_where_nothing_is_ahead(tmp_path: Path, told: Told) ->
 def test_estimates_that_were_changed_are_refused(
     tmp_path: Path, change: Callable[[pa.Table], pa.Table], said: str
 ) -> None:
-    """One line with the file, not numbers that mean nothing."""
+    """One line with the file and what to do, not numbers that mean nothing."""
     folder = saved(tmp_path / "result", recorded())
     path = folder / "estimates.parquet"
     pq.write_table(change(pq.read_table(path)), path)
     with pytest.raises(pf.PumafuseError, match=said) as refusal:
         compare.run([folder], None, json=True)
     assert str(path) in str(refusal.value)
+    assert "fuse the run again" in str(refusal.value)
 
 
 def test_a_picture_shows_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

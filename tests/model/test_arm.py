@@ -188,14 +188,14 @@ REFUSED = {
     "a speed in m/s": ("42.5", "42.5\nmax_speed_m_s = 0.3", "'axes.radial.max_speed_m_s'", "max_speed_mm_s"),
     "play below nothing": ("42.5", "42.5\nplay_mm = -0.1", "axes.radial.play_mm", ">= 0"),
     "unknown key of a sag": ("42.5", "42.5\nsag = { knee = 3.0 }", "'axes.radial.sag.knee'", "knee_mm"),
-    "a slope without a knee": ("42.5", "42.5\nsag = { slope_below = 0.1 }", "sag: knee_below", "slope_below"),
+    "a slope without a knee": ("42.5", "42.5\nsag = { slope_below = 0.1 }", "sag: knee_below", "give both or neither"),
     "knees that have changed places": (
         "42.5",
         "42.5\nsag = { knee_mm = 3.0, slope_beyond = 0.1, knee_below_mm = 4.0, slope_below = 0.1 }",
         "sag: knee_below",
-        "above the knee",
+        "above the knee: move it to the knee or below",
     ),
-    "a knee without a slope": ("42.5", "42.5\nsag = { knee_mm = 3.0 }", "sag: a knee", "slope_beyond"),
+    "a knee without a slope": ("42.5", "42.5\nsag = { knee_mm = 3.0 }", "sag: a knee", "give both or neither"),
 }  # fmt: skip
 
 
