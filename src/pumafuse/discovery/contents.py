@@ -32,7 +32,7 @@ from ..logs.run import Source, standing_clock
 from ..logs.stamps import packets
 from ..units import TIMES, Kind, divisor, ending, kind_of, si_of, unwrapped, wraps
 from . import names
-from .orientations import Attitude, are_units, attitudes_in, may_be_part
+from .orientations import QUATERNION, Attitude, are_units, attitudes_in
 
 _TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
 _ACCEPTED = "accepted: CSV, JSON, Parquet, .xlsx, .mat, .npy, .npz, MCAP, bags of ROS, .ulg, .rrd"
@@ -995,7 +995,7 @@ def _wanted(topic: Topic) -> list[str]:
     streamed = single and not several and (topic.last or 0) - (topic.first or 0) < _STREAM_NS * (topic.count - 1)
     if PATH_TIME in topic.fields and not streamed:
         return [PATH]
-    wanted = [name for name in _likeliest(topic.fields) if may_be_part(name) or not names.no_position(name)]
+    wanted = [name for name in _likeliest(topic.fields) if QUATERNION.match(name) or not names.no_position(name)]
     return prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
 
 

@@ -197,10 +197,7 @@ def _arm_toml(survey: Survey, arm: ArmGuess) -> str:
             lines.append(_pair("kind", "angle"))
         as_late_as = f"with the delay {guess.lag * MS:.0f} ms behind the held command, as {guess.follows} is"
         lag = as_late_as if guess.follows else "a guess: nothing follows this axis"
-        lines += [
-            _pair("plant", "first-order"),
-            _pair("time_constant_ms", _digits(guess.time_constant * MS), lag),
-        ]
+        lines += [_pair("plant", "first-order"), _pair("time_constant_ms", _digits(guess.time_constant * MS), lag)]
         if guess.follows and abs(guess.gain - 1.0) > 0.05:
             why = f"{guess.follows} moves {guess.gain:.2f} times as far as commanded: try it, or tune --fit gain"
             lines.append(_line(f"# {_pair('gain', {'intercept': round(guess.gain, 2)})}", why))

@@ -32,7 +32,7 @@ _LATEST, _STEP = 0.6, 0.02  # s, up to which lag turning is compared, and in whi
 _MOST = 1000  # changes that are compared
 _BETTER = 0.05  # share of the turning that the right order explains more than the other
 _FRONT, _BACK = r"^(?P<head>|.*[^A-Za-z]|.*[a-z](?=[A-Z]))", r"(?P<end>[\])]?)(?P<tail>|[^A-Za-z0-9].*)$"
-_QUATERNION = re.compile(
+QUATERNION = re.compile(
     rf"{_FRONT}(?P<word>(?i:q|quat|quaternion|orientation|orient|ori|rotation|rot|attitude))"
     rf"(?P<join>[_. \[(]?)(?P<part>[xyzwXYZW0-4]){_BACK}"
 )
@@ -87,11 +87,6 @@ class Attitude:
         return replace(self, columns=columns, quaternion=rotations.of_quaternions(logged, order))
 
 
-def may_be_part(name: str) -> bool:
-    """Whether a column may be one of a quaternion."""
-    return _QUATERNION.match(name) is not None
-
-
 def attitudes_in(table: Table, paths: Iterable[str]) -> list[Attitude]:
     """The orientations of a table; ``paths`` are those of its numbers."""
     paths = list(paths)
@@ -117,7 +112,7 @@ def _groups(form: re.Pattern[str], paths: Iterable[str], keys: Sequence[str]) ->
 
 
 def _quaternions(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
-    for group in _groups(_QUATERNION, paths, ("head", "word", "join", "end")):
+    for group in _groups(QUATERNION, paths, ("head", "word", "join", "end")):
         parts = "".join(sorted(group))
         if parts != _NAMED and parts not in _NUMBERED:
             continue

@@ -21,19 +21,7 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..logs.run import Run, Source
 from ..units import MS
 from .following import following, in_seconds, isolated, phase
-from .paths import (
-    ASIDE,
-    Basis,
-    Path,
-    Residue,
-    Shrunk,
-    clipped_rms,
-    interpolated,
-    path,
-    residue,
-    robust_sd,
-    shrunk,
-)
+from .paths import ASIDE, Basis, Path, Residue, Shrunk, clipped_rms, interpolated, path, residue, robust_sd, shrunk
 
 _FOLLOWS = 0.5  # correlation of changes below which two sensors do not see one motion
 _FEWEST = 40  # rows of a sensor from which its latency is looked for

@@ -87,10 +87,7 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
 
 
 def innovation_derivatives(
-    segment: Segment,
-    config: FusionConfig,
-    outcome: CodeArray,
-    beside: Sequence[tuple[FusionConfig, float]],
+    segment: Segment, config: FusionConfig, outcome: CodeArray, beside: Sequence[tuple[FusionConfig, float]]
 ) -> tuple[Results, FloatArray, FloatArray]:
     """Innovations as of :func:`innovations`, and derivatives of ν and of S by k parameters, (k, m, A) each.
 

@@ -46,7 +46,7 @@ def in_base(run: Run, config: FusionConfig, *, whole: bool = True) -> tuple[Run,
     }
     in_axes_of_arm, placed = in_axes(replace(run, sensors={**run.sensors, **of_tool}), config.frame, tool)
     if in_axes_of_arm.tool is not None and not set(TURNING) & set(config.arm.axes):
-        in_axes_of_arm = in_axes_of_arm.each(_drop_turning)
+        in_axes_of_arm = in_axes_of_arm.each(lambda _, source: source.without(TURNING))
     return in_axes_of_arm, placed, config
 
 
@@ -54,10 +54,6 @@ def add_tool(config: FusionConfig, run: Run) -> FusionConfig:
     """The configuration with the robot of a run, and the reference orientation of its commands where it has none."""
     tool, robot = reference_orientation(run) if config.tool is None else None, run.robot or config.robot
     return msgspec.structs.replace(config, tool=config.tool if tool is None else Tool(reference=tool), robot=robot)
-
-
-def _drop_turning(_: str, source: Source) -> Source:
-    return replace(source, values={axis: value for axis, value in source.values.items() if axis not in TURNING})
 
 
 class Placing:

@@ -126,12 +126,7 @@ def split_delay(delay: float, period: float) -> tuple[int, float]:
 
 
 def discretize(
-    axis: AxisModel | Plant,
-    period: float,
-    delay: float = 0.0,
-    *,
-    input_noise: float = 0.0,
-    drift: float | None = None,
+    axis: AxisModel | Plant, period: float, delay: float = 0.0, *, input_noise: float = 0.0, drift: float | None = None
 ) -> DiscreteModel:
     """The exact delay-augmented model from v to p at one period; the gain is not part of it.
 

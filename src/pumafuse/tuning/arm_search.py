@@ -120,13 +120,7 @@ class ArmSearch:
 
     noise_models: Sequence[NoiseModel]  # of what the best arm leaves: without a disturbance, a smooth, a rough one
 
-    def __init__(
-        self,
-        measured: Measured,
-        freedom: Freedom,
-        least: Sequence[float],
-        believed: bool = False,
-    ) -> None:
+    def __init__(self, measured: Measured, freedom: Freedom, least: Sequence[float], believed: bool = False) -> None:
         """``least``: noise of each sensor [m]; ``believed``: to be what second differences show."""
         self._measured, self.sensors = measured.liveliest(_ENOUGH), measured.sensors
         self._longest = longest_delay(measured.period)

@@ -42,10 +42,7 @@ def ignore(_: Point) -> None:
 
 
 def point(
-    likelihood: Likelihood,
-    config: FusionConfig,
-    free: Sequence[Parameter],
-    outcomes: Sequence[CodeArray] | None = None,
+    likelihood: Likelihood, config: FusionConfig, free: Sequence[Parameter], outcomes: Sequence[CodeArray] | None = None
 ) -> Point:
     """Evaluate a configuration; with ``outcomes`` these are repeated and its gates are not applied."""
     prior = np.zeros(len(likelihood.axes))
@@ -98,11 +95,7 @@ class _Ascent:
     """Steps from one point to a maximum; each axis has a damping of its own."""
 
     def __init__(
-        self,
-        likelihood: Likelihood,
-        free: Sequence[Parameter],
-        outcomes: Sequence[CodeArray] | None,
-        tolerance: float,
+        self, likelihood: Likelihood, free: Sequence[Parameter], outcomes: Sequence[CodeArray] | None, tolerance: float
     ) -> None:
         self._likelihood, self._free, self._outcomes, self._tolerance = likelihood, free, outcomes, tolerance
         self._low, self._high = np.array([parameter.range for parameter in free]).reshape(-1, 2).T
