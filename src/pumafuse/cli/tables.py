@@ -198,9 +198,8 @@ def _sensors(
     for name, summary in results:
         for axis, part in summary.axes.items():
             if part.kind == kind:
-                yield from (
-                    (name, axis, part, sensor, sensor_summary) for sensor, sensor_summary in part.sensors.items()
-                )
+                for sensor, of_sensor in part.sensors.items():
+                    yield name, axis, part, sensor, of_sensor
 
 
 def share_rejected(sensor: SensorSummary) -> float | None:

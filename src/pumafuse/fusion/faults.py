@@ -119,12 +119,8 @@ def find_faults(segment: Segment, config: FusionConfig, origin: int | None = Non
     faults = [*clocks, *faults]
     named = {name for fault in faults for name in fault.sensors}
     quiet = {name: tracking for name, tracking in trackings.items() if name not in named}
-    return [
-        *find_turns(segment, config),
-        *faults,
-        *_find_moving_alone(config, quiet),
-        *_find_offsets(segment, config, quiet),
-    ]
+    beside = [*_find_moving_alone(config, quiet), *_find_offsets(segment, config, quiet)]
+    return [*find_turns(segment, config), *faults, *beside]
 
 
 def find_not_following(segment: Segment, config: FusionConfig) -> list[Fault]:

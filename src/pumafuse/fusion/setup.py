@@ -56,21 +56,15 @@ def _sensors_of(
     sensor, view = np.zeros(len(names), SENSOR), np.zeros((len(names), len(axes)), VIEW)
     view["sd"], view["bias_time"], sensor["scale"] = np.nan, 1.0, 1.0
     for row, name in enumerate(names):
-        configured = config.sensors.get(name)
-        if configured is None:
+        entry = config.sensors.get(name)
+        if entry is None:
             continue
-        sensor[row] = (
-            configured.scale,
-            configured.latency,
-            configured.latency_sd,
-            configured.gate,
-            configured.gates_rows(config.arm),
-        )
+        sensor[row] = entry.scale, entry.latency, entry.latency_sd, entry.gate, entry.gates_rows(config.arm)
         for number, axis in enumerate(axes):
-            sd = configured.sd_of(axis)
+            sd = entry.sd_of(axis)
             inside = biased is not None and name in biased[number]
-            biases = (configured.bias_sd_of(axis), configured.bias_drift_sd_of(axis)) if inside else (0.0, 0.0)
-            view[row, number] = np.nan if sd is None else sd, *biases, configured.bias_time, turn_of(config, name, axis)
+            biases = (entry.bias_sd_of(axis), entry.bias_drift_sd_of(axis)) if inside else (0.0, 0.0)
+            view[row, number] = np.nan if sd is None else sd, *biases, entry.bias_time, turn_of(config, name, axis)
     return sensor, view
 
 

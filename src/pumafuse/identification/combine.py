@@ -113,7 +113,8 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool, kind: Kind) ->
     usual = usual_gain(fitted)
     if usual == 0.0:
         return "the arm does not move"
-    left_out = _find_unseen(fitted) if paper else _outlying(fitted)
+    unseen = [fit.trial.name for fit in fitted if not fit.onset < fit.trial.time[-1]]
+    left_out = dict.fromkeys(unseen, "not seen to move within the window") if paper else _outlying(fitted)
     left_out |= {fit.trial.name: why for fit in fitted if (why := doubt_words(fit.first, usual)) is not None}
     used = [fit for fit in fitted if fit.trial.name not in left_out]
     if len(used) < _FEWEST:
@@ -161,12 +162,6 @@ def coefficients(fitted: Sequence[Fitted]) -> dict[str, tuple[FloatArray, FloatA
     sds = np.array([fit.first.sd for fit in fitted])
     scales = {"delay_ms": (0, MS), "gain": (3, 1.0), "time_constant_ms": (1, MS)}
     return {name: (values[:, number] * unit, sds[:, number] * unit) for name, (number, unit) in scales.items()}
-
-
-def _find_unseen(fitted: Sequence[Fitted]) -> dict[str, str]:
-    """Trials whose window ends before the arm is seen to move."""
-    unseen = [fit.trial.name for fit in fitted if not fit.onset < fit.trial.time[-1]]
-    return dict.fromkeys(unseen, "not seen to move within the window")
 
 
 def _outlying(fitted: Sequence[Fitted]) -> dict[str, str]:

@@ -240,7 +240,9 @@ class Diagnosis:
         del self._troubles[key]
         if trouble.is_said and not is_replaced and cause != "set":
             shows = SHOWS[cause] if isinstance(cause, str) else "what the verdict says"
-            self._log.write(f"{key} over", f"{_join_names(sensors)}: {shows} shows no more at {now / 1e9:.3f} s")
+            named = f"sensor{'s' if len(sensors) > 1 else ''} {', '.join(map(repr, sensors))}"
+            who = named if sensors else "the commands"
+            self._log.write(f"{key} over", f"{who}: {shows} shows no more at {now / 1e9:.3f} s")
 
     def _unexpected_innovations(self, estimates: Estimates, faults: Sequence[Fault]) -> list[Fault]:
         """What `fuse` says of innovations in the span where no fault is: of each sensor the clearest, of the arm once.
@@ -335,7 +337,3 @@ def _key(fault: Fault) -> _Key:
 
 def _innovations(sensor: str, axes: Mapping[str, int] | Sequence[str]) -> str:
     return f"sensor '{sensor}': its innovations on {', '.join(axes)}"
-
-
-def _join_names(sensors: Sequence[str]) -> str:
-    return f"sensor{'s' if len(sensors) > 1 else ''} {', '.join(map(repr, sensors))}" if sensors else "the commands"

@@ -126,7 +126,9 @@ class ArmSearch:
         self._longest = longest_delay(measured.period)
         self.plain = plain_arm(measured)
         self.noise = NoiseModel(np.ones(len(measured.sensors)))  # at first: least squares
-        self.bent = self._bent(freedom)  # their arm with what it has of play, a fastest speed and a sag
+        is_free = {"delay", "lag"} <= set(freedom.free)
+        # their arm with what it has of play, a fastest speed and a sag
+        self.bent = bent_arm(self.plain, freedom.arm, [*freedom.free]) if self.plain and is_free else None
         self.freedom = freedom.bent(self.bent)
         self.limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
         self._fits = self._by_least_squares()
@@ -170,11 +172,6 @@ class ArmSearch:
         names = self.freedom.names(model)
         variances = self._measured.variances(arm, names, self.noise, self.limits, _PIECES, lambda arm: arm.total)
         return max(1.0, math.sqrt(variances[1] / variances[0])) if variances[0] > 0.0 else 1.0
-
-    def _bent(self, freedom: Freedom) -> Bent | None:
-        if self.plain is None or not {"delay", "lag"} <= set(freedom.free):
-            return None
-        return bent_arm(self.plain, freedom.arm, [*freedom.free])
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
 

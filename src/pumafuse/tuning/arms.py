@@ -514,16 +514,13 @@ class Measured:
     def _derivatives(self, arm: Arm, names: Coordinates) -> list[FloatArray]:
         """The response of each recording, and how it changes with each coordinate, (1 + k, m)."""
         steps = [_LOG_SHIFT if name in LOGARITHMIC else _SHIFT for name in names]
-        if self._is_linear(arm):
+        if not any((arm.play, arm.max_speed, arm.beyond, arm.below)) and not self.sags:  # it is linear
             steps = [1.0 if name in ("gain", "slope") else step for name, step in zip(names, steps, strict=True)]
         beside = [arm.moved([name], [arm.coordinate(name) + step]) for name, step in zip(names, steps, strict=True)]
         responses = self._responses([arm, *beside])
         for moved in responses:
             moved[1:] = (moved[1:] - moved[0]) / np.array(steps)[:, None]
         return responses
-
-    def _is_linear(self, arm: Arm) -> bool:
-        return not any((arm.play, arm.max_speed, arm.beyond, arm.below)) and not self.sags
 
     @property
     def sags(self) -> bool:

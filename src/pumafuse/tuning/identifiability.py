@@ -104,11 +104,6 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
     return axes
 
 
-def least_count(likelihood: Likelihood) -> int:
-    """How many measurements there are of the axis that has the fewest of those that are measured."""
-    return min((count for count in likelihood.count.tolist() if count > 0), default=0)
-
-
 def for_few(likelihood: Likelihood, free: Sequence[Parameter]) -> list[Parameter]:
     """The parameters that as many measurements as there are can tell."""
     few = {axis for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True) if count < FEW}

@@ -321,12 +321,9 @@ def first_guess(guesses: Sequence[tuple[ArmGuess, Mapping[str, SensorGuess]]]) -
         arms.append(arm)
         axes = {**arm.axes, **axes}
         for name, sensor_guess in sensor_guesses.items():
-            before = sensors.get(name)
-            sensors[name] = (
-                sensor_guess
-                if before is None
-                else replace(before, sd={**sensor_guess.sd, **before.sd}, bias={**sensor_guess.bias, **before.bias})
-            )
+            before = sensors.get(name, sensor_guess)
+            sd, bias = {**sensor_guess.sd, **before.sd}, {**sensor_guess.bias, **before.bias}
+            sensors[name] = replace(before, sd=sd, bias=bias)
     model = ArmModel(
         name="identified from motion",
         update_period=float(f"{arms[0].period:.4g}"),

@@ -19,7 +19,7 @@ from ..fusion.placing import add_tool
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..units import MS
-from .identifiability import FEWEST, TuneError, correlations, excited_axes, least_count
+from .identifiability import FEWEST, TuneError, correlations, excited_axes
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, Point
 from .parameters import (
@@ -149,7 +149,8 @@ def tune(
     doubted_axes: dict[str, Doubt] = {}
     doubted: list[str] = []
     until = None
-    if len(runs) == 1 and validate is None and _FITTED_ON * least_count(pipeline.whole) >= FEWEST:
+    fewest = min((count for count in pipeline.whole.count.tolist() if count > 0), default=0)  # of an axis
+    if len(runs) == 1 and validate is None and _FITTED_ON * fewest >= FEWEST:
         until = _fitted_until(runs[0])
     asked = kinds if intervals is None else kinds_of(intervals)
     by_key: dict[str, ConfidenceInterval] = {}
@@ -229,11 +230,7 @@ def tune(
 
 
 def _check(
-    runs: Sequence[Run],
-    config: FusionConfig,
-    kinds: Sequence[Fit],
-    fixed: Sequence[str],
-    share: Iterable[Literal["delay"]],
+    runs: Sequence[Run], config: FusionConfig, kinds: Sequence[Fit], fixed: Sequence[str], share: Iterable[str]
 ) -> None:
     """Whether it can be fitted as asked.
 

@@ -53,8 +53,7 @@ def fused_figure(est: Estimates) -> Figure:
                 _draw_band(axes, est, name, position)
                 axes.plot(est.time, position * screen.scale, color=colours.ESTIMATE, lw=1.0, label="estimate")
                 _draw_reference(axes, est.reference, name, screen.scale)
-                axes.set_ylabel(f"{name} [{screen.unit}]")
-                axes.set_ylim(_span(shown * screen.scale))
+                axes.set(ylabel=f"{name} [{screen.unit}]", ylim=_span(shown * screen.scale))
             for axes in (left, left_zoom):
                 _draw_residuals(axes, est, name)
                 axes.set_ylabel(f"{name}: measured\n− estimate [{screen.unit}]")
@@ -101,8 +100,7 @@ def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack |
                     axes.plot(result.time, shown[-1] * screen.scale, lw=0.8, color=colour[name])
             limit = _reach(np.concatenate(shown)) * screen.scale
             for axes in (left, left_zoom):
-                axes.set_ylim(-limit, limit)
-                axes.set_ylabel(f"{axis}: {what} [{screen.unit}]")
+                axes.set(ylim=(-limit, limit), ylabel=f"{axis}: {what} [{screen.unit}]")
             for axes in (zoom, left_zoom):
                 axes.set_xlim(start, end)
             zoom.set_ylim(_span(first.axes[axis].position[zoomed] * screen.scale))
@@ -277,8 +275,7 @@ def draw_correlations(axes: Axes, tests: Sequence[Consistency | None], by_test: 
             highest = max(highest, 1.1 * float(np.abs(check.correlation).max(initial=0.0)))
             band = min(band, check.correlation_band)
     axes.axhspan(-band, band, color=colours.ESTIMATE, alpha=0.2, lw=0)
-    axes.set_xlim(0, LAGS + 1)
-    axes.set_ylim(-highest, highest)
+    axes.set(xlim=(0, LAGS + 1), ylim=(-highest, highest))
 
 
 @contextmanager

@@ -161,8 +161,7 @@ def verification(verified: AxisVerification, trace: Trace) -> str:
         axes.plot(time, trace.measured[shown] * scale, color=colours.REFERENCE, lw=1.0, label="measured")
         axes.plot(time, trace.modelled[shown] * scale, "--", color=colours.ESTIMATE, lw=1.2, label="model")
         axes.set_title(f"{verified.run}: {verified.axis}, {verified.source}", loc="left")
-        axes.set_xlabel("time since the first command [s]")
-        axes.set_ylabel(f"position without its mean [{screen.unit}]")
+        axes.set(xlabel="time since the first command [s]", ylabel=f"position without its mean [{screen.unit}]")
         axes.legend(frameon=False, ncols=2, loc="upper right")
         return svg(figure)
 
@@ -196,15 +195,13 @@ def _draw_valley(axes: Axes, result: TrialResult, trial: Trial) -> None:
     levels = np.geomspace(float(rms.min()) * 1.02, float(rms.max()), 12)
     axes.contour(across, up, rms.reshape(_GRID, _GRID), levels=levels, colors=colours.ESTIMATE, linewidths=0.7)
     axes.plot(fit.natural_frequency or omega, fit.damping or zeta, "x", color=colours.REJECTED)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log")
     for side, ends in ((axes.xaxis, across), (axes.yaxis, up)):
         marks = float(f"{ends[0]:.1g}") * 2.0 ** np.arange(0, 6)
         side.set_major_locator(FixedLocator(marks.tolist()))
         side.set_major_formatter(FormatStrFormatter("%.3g"))
         side.set_minor_locator(NullLocator())
-    axes.set_xlim(across[0], across[-1])
-    axes.set_ylim(up[0], up[-1])
+    axes.set(xlim=(across[0], across[-1]), ylim=(up[0], up[-1]))
 
 
 def _draw_levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, offset: float) -> None:

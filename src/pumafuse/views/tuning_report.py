@@ -166,8 +166,7 @@ def _draw_profile(axes: Axes, profile: Profile, fitted: Fitted) -> None:
     low, high = float(profile.values[0]), float(profile.values[-1])
     if profile.log:
         axes.set_xscale("log")
-    axes.set_xlim(low, high)
-    axes.set_ylim(_DEEPEST, max(0.5, 1.1 * float(profile.drop.max())))
+    axes.set(xlim=(low, high), ylim=(_DEEPEST, max(0.5, 1.1 * float(profile.drop.max()))))
     ends = [edge if end is None else end for end, edge in zip(fitted.ci95, (low, high), strict=True)]
     axes.axvspan(*ends, color=colours.ESTIMATE, alpha=0.15, lw=0)
     axes.axhline(-0.5 * Z95**2, color=colours.COMMAND, lw=0.8, ls="--")
