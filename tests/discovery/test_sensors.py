@@ -11,6 +11,7 @@ from pumafuse.arrays import FloatArray
 from pumafuse.discovery.following import isolated, scatter
 from pumafuse.discovery.paths import path
 from pumafuse.discovery.sensors import Alignment, aligned, noise
+from pumafuse.filter.response import response
 
 LENGTH, LATENCY, NOISE = 60.0, 0.045, 3e-4  # s, s, m
 
@@ -75,6 +76,24 @@ def test_intervals_hold() -> None:
     off = np.array([(one.latency - LATENCY) / one.half for one in every])
     assert np.count_nonzero(np.abs(off) < 1.0) >= 16
     assert np.sqrt(np.mean(off**2)) > 0.3  # 0.51 if they are exact
+
+
+def test_an_encoder_in_step_with_the_commands_does_not_see_the_steps_between_them() -> None:
+    """An arm that moves in steps of 50 ms, each to two thirds in that time: one interval of eight held."""
+    period, arm = 0.05, pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))
+    t = np.arange(0.0, 40.0, period)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        u, camera = motion(t, rng.uniform(0.0, 6.0, 3)), np.arange(0.5, 38.5, 1.0 / 30.0) + rng.uniform(0.0, 1.0 / 30.0)
+
+        def seen(at: FloatArray, noise: float, u: FloatArray = u, rng: np.random.Generator = rng) -> FloatArray:
+            given, valid = (np.rint(1e9 * time).astype(np.int64) for time in (t, at))
+            return response(arm, period, 0.01, given, u, u[0], valid) + rng.normal(0.0, noise, len(at))
+
+        encoder = t[5:-5], {"x": seen(t[5:-5], 1e-4)}
+        sensors = {"encoder": encoder, "camera": (camera + LATENCY, {"x": seen(camera, NOISE)})}
+        found = told(pf.Run.from_arrays(t, {"x": u}, sensors))
+        assert abs(found.latency - LATENCY) < found.half < 0.06 * period
 
 
 def test_a_scale_costs_no_latency_on_a_path_in_one_direction() -> None:
