@@ -29,7 +29,7 @@ _MOST = 10_000  # rows of a sensor that are used: more only take longer
 _CLEANED = 2  # times outliers are left out: some are beside others
 _STILL = 20  # rows of one value, of which none is used
 _PAUSE = 5.0  # mean intervals, over which a path by a sensor does not go on
-_ROUNDS, _FITTED, _CLOSE = 20, 3, 1e-5  # at the most; in which the noise is fitted anew; s
+_ROUNDS, _FITTED, _CLOSE = 40, 3, 1e-5  # at the most; in which the noise is fitted anew; s
 _FARTHEST = 0.03  # s, by which a round moves the latency
 _BETTER = 0.98  # of what a smooth path leaves of the second sensor: one through all rows of the first must leave less
 _BEYOND = 3.0  # sds from which a row counts less (Huber)
@@ -344,16 +344,17 @@ def _fit(axes: Sequence[_Axis], latency: float) -> _Fit | None:
         left, floor = axis.z2 - axis.slope * axis.path(axis.x - latency), 1e-9 * float(np.ptp(axis.z2))
         sds = max(axis.path.sd, floor), max(clipped_rms(left - np.median(left)), floor)
         noises.append(_Noise(axis.slope, *sds, Residue()))
-    last = 0.0
+    last, far = 0.0, _FARTHEST
     for count in range(_ROUNDS if axes else 0):
         lines = [_linear(axis, noise, latency, count < _FITTED) for axis, noise in zip(axes, noises, strict=True)]
         grams = _grams(lines)
         step, scales = _solved(grams, lines)
         if not math.isfinite(step):
             return None
-        if count > _FITTED and abs(step) < _CLOSE:
+        if step * last < 0.0:  # where it goes to and fro, less and less
+            far = min(far, 0.5 * abs(last))
+        if count > _FITTED and min(abs(step), far) < _CLOSE:
             break
-        far = _FARTHEST if step * last >= 0.0 else 0.5 * abs(last)  # where it goes to and fro, less and less
         latency += (last := min(max(step, -far), far))
         noises = [replace(line.noise, scale=line.noise.scale + more) for line, more in zip(lines, scales, strict=True)]
     else:
