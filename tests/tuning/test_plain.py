@@ -152,7 +152,7 @@ def test_a_sensor_in_step_tells_a_dead_time_to_a_period_and_no_better(every: int
     low, high = found.details.axes["x"].lag_ci95
     tuned = quietly(lambda: pf.tune(run, found.config, fit=["noise", "delay", "plant"]))
     for ends in ((low * 1e3, high * 1e3), tuned.details.lags["x"].lag_ms_ci95):
-        assert -10.0 < ends[0] - 36.4 < 3.0 and -3.0 < ends[1] - 69.6 < 10.0
+        assert ends[0] < 36.4 + 5.0 and ends[1] > 69.6 - 5.0 and ends[1] - ends[0] < 50.0
 
 
 def test_a_disturbance_takes_no_more_than_a_period_from_the_lag_of_a_sensor_in_step() -> None:

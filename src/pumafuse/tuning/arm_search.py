@@ -67,7 +67,8 @@ _TICKS = (-1.0, -0.5, -0.25, 0.25, 0.5, 1.0)
 _SAME = 2e-4  # s, between dead times of maxima that are one
 _STEP = 0.7  # standard deviations, between dead times
 _LONGEST_STEP = 0.03  # s
-_MOST = 20  # steps away from a maximum
+_IN_PERIOD, _SHORT_STEP = 16, 2e-3  # dead times in a period, where one instant of each is seen; s, at the least
+_MOST, _MOST_SHORT = 20, 40  # steps away from a maximum
 _SLOWLY, _LONGER = 0.5, 1.5  # log-likelihood that a step loses: with less the next one is so many times as long
 _PIECES = 20  # of all recordings, that a model which is right has independent scores in
 _ENOUGH = 20_000  # commands or measurements of a recording that an arm is known by: more make none better
@@ -124,6 +125,7 @@ class ArmSearch:
         """``least``: noise of each sensor [m]; ``believed``: to be what second differences show."""
         self._measured, self.sensors = measured.liveliest(_ENOUGH), measured.sensors
         self._longest = longest_delay(measured.period)
+        self.in_step = measured.phase is not None  # seen at one instant of each update period
         self.plain = plain_arm(measured)
         self.noise = NoiseModel(np.ones(len(measured.sensors)))  # at first: least squares
         is_free = {"delay", "lag"} <= set(freedom.free)
@@ -157,6 +159,16 @@ class ArmSearch:
     def spread(self) -> float:
         """How far the measurements are from the best arm, as a standard deviation [m]."""
         return float(self._measured.white(self._best(self._fits).arm).sd[0])
+
+    @property
+    def lag_ci95(self) -> tuple[float, float]:
+        """The middle 95 % of its lag under all models [s].
+
+        An arm in step is seen at one instant of each step, and the likelihood may be flat from one dead time to another
+        and end there all at once: its curvature at a maximum knows nothing of that.
+        """
+        low, high = self.posterior.mixture().quantiles("lag", lambda _: True)
+        return low, high
 
     def arm(self, model: Model, delay: float | None = None) -> Arm:
         """The most likely arm of a model; the one with this dead time [s]."""
@@ -339,6 +351,12 @@ class ArmSearch:
         """The information with that of the bounds: where the likelihood is flat, it ends there all the same."""
         return information + np.diag([0.0 if name in PRIORS else 12.0 / self._width(name) ** 2 for name in names])
 
+    @property
+    def _longest_step(self) -> float:
+        """From one dead time to the next [s]; several in a period, where the likelihood may have plateaus in it."""
+        several = max(self._measured.period / _IN_PERIOD, _SHORT_STEP)
+        return min(several, _LONGEST_STEP) if self.in_step else _LONGEST_STEP
+
     # ---- the walk ---------------------------------------------------------------------------------------------------
 
     def _walk(self, model: Model, peak: Fit, least: float) -> Branch:
@@ -348,7 +366,7 @@ class ArmSearch:
             return Branch(model, [self._entry(peak, names)])
         cov = covariance(peak.information)
         sd, slope = math.sqrt(cov[0, 0]), cov[1:, 0] / cov[0, 0]
-        step = min(max(_STEP * sd, SHORTEST), _LONGEST_STEP)
+        step = min(max(_STEP * sd, SHORTEST), self._longest_step)
         middle = self._at(peak.arm, names[1:])
         sides = [
             list(self._side(peak, names[1:], sign * step, slope, max(least, middle.log_density - _FORLORN)))
@@ -359,7 +377,7 @@ class ArmSearch:
     def _side(self, peak: Fit, names: Coordinates, step: float, slope: FloatArray, least: float) -> Iterator[Entry]:
         low, high = self.limits.range(names)
         before, move, height = peak.arm, step * slope, -np.inf
-        for _ in range(_MOST):
+        for _ in range(_MOST_SHORT if self.in_step else _MOST):
             delay = before.delay + step
             if not -abs(step) < delay <= self._longest:
                 return
@@ -373,7 +391,7 @@ class ArmSearch:
             before = entry.arm
             move = np.array([before.coordinate(name) for name in names]) - at
             if entry.log_density > height - _SLOWLY:  # the maximum was on a bump of a wide hill
-                longer = min(_LONGER * abs(step), _LONGEST_STEP) / abs(step)
+                longer = min(_LONGER * abs(step), self._longest_step) / abs(step)
                 step, move = longer * step, longer * move
             height = entry.log_density
 

@@ -33,7 +33,7 @@ from .arms import BENDS, Arm
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
 from .parameters import changed, rounded, with_arm, with_noise, with_shared_delay
-from .plain import LONGEST, Doubt, doubts, lag_steps, unseen_lags, with_plain_arm
+from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
 from .posterior import Model, Quantity
 
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
@@ -272,9 +272,6 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     if endless := [axis for axis, lag in lags.items() if lag.lag > LONGEST]:
         lost += endless
         config, lags = _arm(likelihood.config, {axis: searches[axis] for axis in moving if axis not in lost}, trusted)
-    for axis, (low, high) in unseen_lags({axis: searches[axis].plain for axis in lags}, config).items():
-        both = min(low, lags[axis].lag_ci95[0]), max(high, lags[axis].lag_ci95[1])
-        lags[axis] = msgspec.structs.replace(lags[axis], lag_ci95=both)
     for axis, doubt in doubts({axis: searches[axis].plain for axis in lags}, config).items():
         lags[axis] = _doubted(lags[axis], doubt, doubt.sentence(config, axis))
         if doubt.refutes:

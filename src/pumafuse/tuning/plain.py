@@ -25,7 +25,6 @@ COMMANDS, ROWS = 6000, 2000  # of a recording that are looked at: where it moves
 _STARTS = 3  # cells from which the least squares are looked for
 _AROUND = np.linspace(-1.5, 1.5, 7)  # logarithm of τ about the best one,
 _BESIDE = np.linspace(-0.03, 0.03, 13)  # s, and lags about its lag: which of them are allowed
-_STEP_LATER = np.linspace(-1.5, 1.5, 49)  # update periods, and dead times alone, where steps are seen at one instant
 _OUTLIER = 8.0  # times the median distance from the best arm: what is farther does not count
 _FEWEST = 4.0  # independent measurements, at least: however alike their errors are
 FOLLOWS = 40.0  # of χ² that an arm must explain: of some hundred arms with noise beside them none does by chance
@@ -107,9 +106,6 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     for start in begun:  # along the ridge on which dead time and plant make up for each other
         for lag in (start.lag * np.exp(_AROUND)).tolist():
             arms += [Arm(delay, lag) for delay in np.maximum(start.delay + start.lag - lag + _BESIDE, 0.0).tolist()]
-    if measured.phase is not None:  # dead times that differ by less than a period may look the same
-        steps = starts[0].total + measured.period * _STEP_LATER
-        arms += [Arm(delay, float(LAGS[0])) for delay in np.maximum(steps - LAGS[0], 0.0).tolist()]
     arms += begun
     log, gains = measured.weighed(arms, noise, _ANY)
     best = int(np.argmax(log))
@@ -247,22 +243,6 @@ def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[s
             if doubt.is_worse or not (allowed or configured.play or configured.max_speed or configured.slope):
                 doubts_by_axis[axis] = doubt
     return doubts_by_axis
-
-
-def unseen_lags(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[str, tuple[float, float]]:
-    """The lags [s] that least squares allow each axis that is measured in step with its commands.
-
-    Its sensor sees one instant of each step. The likelihood may be flat between two lags and end there all at once, of
-    which its curvature at a maximum knows nothing. They are an update period apart at most: so far from the configured
-    one least squares are asked. Beyond, the likelihood knows better what a disturbance or a fastest speed makes of it.
-    """
-    lags: dict[str, tuple[float, float]] = {}
-    for axis, plain_here in plain.items():
-        if plain_here is not None and plain_here.measured.phase is not None:
-            lag, period = config.arm.lag_of(axis), plain_here.measured.period
-            low, high = np.clip(plain_here.lag_ci95, lag - period, lag + period).tolist()
-            lags[axis] = low, high
-    return lags
 
 
 def lag_steps(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> list[str]:

@@ -142,8 +142,8 @@ def fitted_lags(
 ) -> dict[str, FittedLag]:
     """The lag of each axis that the free parameters change, or that has ``allowed`` ones, but for those ``lost``.
 
-    Intervals are ``around`` it, from :func:`lag_intervals`; they cover what least squares ``allowed`` [s] where these
-    doubt the arm or know better how sure it is, and where it was not fitted they are that and the lag itself.
+    Intervals are ``around`` it, from :func:`lag_intervals`; they cover the lags that are ``allowed`` [s] where least
+    squares doubt the arm or it is seen in step, and where it was not fitted they are that and the lag itself.
     """
     lags, slopes = dict[str, FittedLag](), lag_slopes(free, after)
     for axis in (axis for axis in dict.fromkeys([*slopes, *allowed]) if axis not in lost):

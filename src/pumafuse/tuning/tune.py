@@ -34,7 +34,7 @@ from .parameters import (
     with_disturbance,
     with_gates,
 )
-from .plain import LONGEST, Doubt, doubts, lag_steps, unseen_lags, with_plain_arm
+from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, refitted, run_stage
 from .summary import (
     AxisLikelihood,
@@ -188,8 +188,9 @@ def tune(
     result, arms = pipeline.result(), {axis: search for stage in stages for axis, search in stage.arms.items()}
     lost = [axis for axis, search in arms.items() if search.plain is None or result.arm.lag_of(axis) > LONGEST]
     unmeasured = [*lost, *(axis for axis in result.arm.axes if axis not in pipeline.whole.sensors)]
-    looked_for = {axis: search.plain for axis, search in arms.items() if {"delay", "lag"} & set(search.freedom.free)}
-    allowed = unseen_lags(looked_for, result) | {axis: doubt.lag_ci95 for axis, doubt in doubted_axes.items()}
+    searched = {axis: search for axis, search in arms.items() if {"delay", "lag"} & set(search.freedom.free)}
+    allowed = {axis: search.lag_ci95 for axis, search in searched.items() if search.in_step}
+    allowed |= {axis: doubt.lag_ci95 for axis, doubt in doubted_axes.items()}
     lags = fitted_lags(free, config, result, around, allowed, unmeasured)
     tuned = _with_provenance(result, free, by_key, {} if interrupted else lags, names)
     doubted += lag_steps({axis: search.plain for axis, search in arms.items()}, tuned)
