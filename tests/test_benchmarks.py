@@ -126,12 +126,13 @@ def test_the_simulated_arm_answers_as_its_equations_say(benchmark: Callable[[str
 
 
 @pytest.mark.long
-def test_intervals_of_lags_hold_on_arms_of_all_kinds(benchmark: Callable[[str], ModuleType]) -> None:
+@pytest.mark.parametrize("in_step", [False, True])
+def test_intervals_of_lags_hold_on_arms_of_all_kinds(benchmark: Callable[[str], ModuleType], in_step: bool) -> None:
     """Ten runs of two axes: 95 % intervals hold in at least 86 % (95 % less 3.5 sd of some 80), and correlation errs.
 
     The RMS error of the lag is at most a third of that of the best correlation with the same held command.
     """
-    found = [benchmark("lag").examined((seed, 2, 0.0)) for seed in range(300, 310)]
+    found = [benchmark("lag").examined((seed, 2, 0.0, in_step)) for seed in range(300, 310)]
     numbers = [one for mine, _, _ in found for one in mine]
     errors = np.array([off for _, mine, _ in found for off in mine])
     assert len(numbers) > 60
