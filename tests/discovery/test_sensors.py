@@ -66,6 +66,8 @@ def test_a_latency_is_found_whatever_the_rates(rate: float, dense: float) -> Non
     assert found.latency == pytest.approx(LATENCY, abs=5e-4)
     assert turned.latency == pytest.approx(-found.latency, abs=1e-4)
     assert found.half == pytest.approx(1e-3)
+    twice = replace(run, command=run.command.rows(np.repeat(np.arange(len(run.command.stamp)), 3)))
+    assert told(twice).half == pytest.approx(1e-3)  # commands that are written three times are one
     assert found.scale == 1.0
     assert found.sd["x"] == pytest.approx(NOISE, rel=0.15)
     assert found.latency_sd == 0.0

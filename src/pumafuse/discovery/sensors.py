@@ -229,7 +229,8 @@ def _axis(run: Run, name: str, first: Source, second: Source) -> _Axis | None:
     if inside.sum() < _FEWEST:
         return None
     by_first = path(in_seconds(*told, origin), behind.lag, s, z1)
-    period = float(np.median(np.diff(stamp := np.sort(told[0])))) / 1e9
+    stamp = np.unique(told[0][told[0] != NO_STAMP])  # a command that is written several times is one
+    period = float(np.median(np.diff(stamp))) / 1e9
     in_step = any(phase([(stamp, row[0])], period) is not None for row in rows)
     finest = max(_UNSEEN * period, _FINEST) if in_step else _FINEST
     return _Axis(name, by_first, s, z1, x[inside], z2[inside], between.lag, between.slope, finest)
