@@ -38,11 +38,13 @@ struct AxisModel {
     Real delayed;            // what the delay's derivatives make of an instant
     double start;
     ByDoubt<> sd;            // of the lag [s] and of the gain
+    double unseen;           // sd of the lag where no measurement tells [s]
 
     explicit AxisModel(const Axis<Real>& axis)
         : arm(axis), noise(axis), ahead(std::llrint(arm.period * 1e9)),
           motion(noise.motion(arm.plant, double(ahead) / 1e9)), delayed(axis.delay - value_of(axis.delay)),
-          start(value_of(axis.start)), sd{value_of(axis.lag_sd), value_of(axis.gain_sd)} {}
+          start(value_of(axis.start)), sd{value_of(axis.lag_sd), value_of(axis.gain_sd)},
+          unseen(value_of(axis.unseen_lag_sd)) {}
 
     // What lag and gain add to the variance of what changes so with them.
     double variance(const ByDoubt<>& by) const { return square(by[LAG] * sd[LAG]) + square(by[GAIN] * sd[GAIN]); }
@@ -50,6 +52,12 @@ struct AxisModel {
     // The error bar of a state.
     double sd_of(const Residual<N, Real>& xi, int i) const {
         return error_bar(std::max(value_of(xi.P[i][i]), 0.0) + variance({xi.dx[LAG][i], xi.dx[GAIN][i]}));
+    }
+
+    // Widen the error bar of a position by the lag that no measurement sees; the response goes `way` [m] in a period.
+    void widen(double way, double (&numbers)[PF_OUTPUTS]) const {
+        double& sd = numbers[PF_POSITION_SD];
+        if (unseen > 0.0) sd = std::sqrt(square(sd) + square(unseen * way / arm.period));
     }
 
     // How the response changes with lag and gain, where these are doubted.
@@ -141,7 +149,9 @@ class Filter {
             const double moving = now.residual.variance(axis.motion);
             now.residual.P = {};  // what comes is noise alone
             predict_by_commands(now, a, rows, next, end, time + axis.ahead, stamped);
-            const double later = now.response.position(axis.arm) + now.residual.mean(axis.noise.position);
+            const double r_later = now.response.position(axis.arm);
+            axis.widen(r_later - r, numbers);
+            const double later = r_later + now.residual.mean(axis.noise.position);
             numbers[PF_VELOCITY] = (later - numbers[PF_POSITION]) / axis.arm.period;
             const ByDoubt<> then = now.residual.error_by_doubt(axis.doubt(now.response), 1.0, axis.noise.position);
             const double doubted = axis.variance({then[LAG] - left[LAG], then[GAIN] - left[GAIN]});
@@ -164,6 +174,14 @@ class Filter {
         numbers[PF_DISTURBANCE] = disturbed ? xi.x[DISTURBANCE] : 0.0;
         numbers[PF_DISTURBANCE_SD] = disturbed ? axis.sd_of(xi, DISTURBANCE) : 0.0;
         return left;
+    }
+
+    // How far the response of axis `a` goes over the coming period [m]; rows from `next` on are not in it yet.
+    template <class Rows>
+    double way_ahead(AxisState<N, Real> now, Time a, const Rows& rows, Time next, Time end, Time time) const {
+        const double r = now.response.position(axes[a].arm);
+        predict_by_commands(now, a, rows, next, end, time + axes[a].ahead, time);
+        return now.response.position(axes[a].arm) - r;
     }
 
     // Response and residual to an instant.

@@ -20,7 +20,7 @@ struct Axis {  // the fields of pf_axis
     Real max_speed, play, sag_offset, sag_slope, sag_knee, sag_slope_beyond, sag_knee_below, sag_slope_below;
     Real input_noise, drift, maneuver_noise, maneuver_drift, disturbance_sd, disturbance_time, smoothness;
     Real adaptation;
-    Real offset_sd, lag_sd, gain_sd, start;
+    Real offset_sd, lag_sd, gain_sd, unseen_lag_sd, start;
 };
 
 template <class Real>

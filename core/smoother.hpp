@@ -133,6 +133,7 @@ template <int N>
 struct Filtered {
     double r;
     ByDoubt<> doubt;  // of r
+    double way;       // of r over the coming period [m], where an unseen lag counts
     Residual<N, double> residual;
 };
 
@@ -146,9 +147,10 @@ void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& h
     Time k = n - 1;
     const auto smooth_back = [&] {  // estimate k, and on to the one before
         double numbers[PF_OUTPUTS];
-        auto& [r, doubt, residual] = at[k * A + a];
+        auto& [r, doubt, way, residual] = at[k * A + a];
         later.smooth(residual);
         Filter<N>::describe(axis, r, doubt, residual, numbers);
+        axis.widen(way, numbers);
         for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = numbers[i];
         --k;
     };
@@ -183,8 +185,9 @@ void run_smoothed(const Filter<N>& filter, State<N, double>& state, const Table&
         for (Time a = 0; a < A && k < n; ++a) {
             AxisState<N, double> now = state.axes[a];
             filter.predict(now, a, {times[k], 0.0});
-            const Response<double>& r = now.response;
-            at.push_back({r.position(filter.axes[a].arm), filter.axes[a].doubt(r), now.residual});
+            const AxisModel<N, double>& axis = filter.axes[a];
+            const double way = axis.unseen > 0.0 ? filter.way_ahead(now, a, rows, row, count, times[k]) : 0.0;
+            at.push_back({now.response.position(axis.arm), axis.doubt(now.response), way, now.residual});
         }
     }
     for (Time a = 0; a < A; ++a) {

@@ -150,8 +150,10 @@ def axes_of(draw: st.DrawFn) -> pf.ArmModel:
             intercept_ci95=draw(st.sampled_from([None, (0.95, 1.0)])),
         )
         recovery, lag = draw(st.sampled_from([None, 0.01, 0.1, 3.0])), draw(st.sampled_from([None, (0.08, 0.12)]))
-        delay = draw(st.sampled_from([None, 0.0]))
-        return pf.AxisModel(plant=plant, gain=gain, gain_recovery=recovery, delay=delay, lag_ci95=lag)
+        delay, unseen = draw(st.sampled_from([None, 0.0])), draw(st.sampled_from([None, 0.01]))
+        return pf.AxisModel(
+            plant=plant, gain=gain, gain_recovery=recovery, delay=delay, lag_ci95=lag, unseen_lag_sd=unseen
+        )
 
     return pf.ArmModel(name="any", update_period=0.028, delay=0.06, axes={"radial": one(), "vertical": one()})
 

@@ -42,6 +42,7 @@ kind = "angle"
 plant = "first-order"
 time_constant_ms = 33.3
 delay_ms = 12.3
+unseen_lag_sd_ms = 4.0
 play_deg = 0.7
 sag = { offset_deg = 0.1, slope = -0.02, knee_deg = 33.0, slope_beyond = 0.3 }
 gain = { intercept = 0.9, intercept_ci95 = [0.88, 0.93] }
@@ -217,7 +218,7 @@ def test_the_header_has_the_numbers_that_live_has(tmp_path: Path) -> None:
     model = window.call_args.args[0]
     done = subprocess.run([compiled(tmp_path, source)], capture_output=True, check=True)
     expected = np.concatenate([part.ravel().view(np.float64) for part in model])
-    assert len(expected) == 2 * 28 + 2 * 5 + 4 * 5
+    assert len(expected) == 2 * 29 + 2 * 5 + 4 * 5
     np.testing.assert_array_equal(np.frombuffer(done.stdout), expected)
     assert np.count_nonzero(np.isnan(expected)) == 3
     assert done.stderr == b"1 1"

@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 12             /* of this interface: a program and its library must agree */
+#define PF_VERSION 13             /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -64,6 +64,7 @@ typedef struct {
     double adaptation;                     /* how fast all these follow what innovations show; 0: they stay */
     double offset_sd;                      /* prior of the offset [m] */
     double lag_sd, gain_sd;                /* how well the response is known: its lag [s], its size, of 1 */
+    double unseen_lag_sd;                  /* likewise its lag [s] where no measurement tells: between those in step */
     double start;                          /* u0 [m]: where it rests before its first command; NaN: not known */
 } pf_axis;
 

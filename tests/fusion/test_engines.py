@@ -93,7 +93,8 @@ def gated(draw: st.DrawFn, bent: bool = False) -> Case:
         bends = {"max_speed": some(0.01, 0.05), "play": some(0.2e-3, 3e-3), "sag": some(pf.Sag(slope=0.2), curve)}
         chosen = draw(st.sets(st.sampled_from(sorted(bends)), min_size=1))
         return replace(case, axes={"radial": replace_(model, **{name: bends[name] for name in chosen})}, seen=seen)
-    axes = {"radial": replace_(model, lag_ci95=some(None, (0.08, 0.12))), "vertical": AxisModel(plant=LAG, delay=0.033)}
+    doubts = {"lag_ci95": some(None, (0.08, 0.12)), "unseen_lag_sd": some(None, 0.015)}
+    axes = {"radial": replace_(model, **doubts), "vertical": AxisModel(plant=LAG, delay=0.033)}
     return replace(case, axes=axes, seen=seen)
 
 

@@ -15,9 +15,10 @@ from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.core import Filter, Model
 from pumafuse.filter.events import Events, Results
 from pumafuse.filter.outcome import Outcome
+from pumafuse.filter.response import response
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.engine import model_of
-from pumafuse.fusion.estimates import Estimates
+from pumafuse.fusion.estimates import Estimates, Mode
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.segments import build_segment
 from pumafuse.logs.run import Run
@@ -287,6 +288,24 @@ def test_error_bars_count_how_well_the_arm_is_known(case: Case) -> None:
             doubted, certain = (fuse(run, one, **how) for one in (config, known))
         assert np.array_equal(doubted["radial"].position, certain["radial"].position)
         assert np.array_equal(doubted.measurements.innovation_sd, certain.measurements.innovation_sd)
+
+
+@pytest.mark.parametrize("mode", ["filtered", "smoothed"])
+def test_error_bars_count_a_lag_that_no_measurement_sees(mode: Mode) -> None:
+    """It widens the bars of positions alone, by its sd times the speed of the response over the coming period."""
+    run, config = DOUBTED["gain"].made()
+    model = config.arm.axes["radial"]
+    unseen = replace_(model, unseen_lag_sd=0.2, lag_ci95=(0.0, 1.0))  # which is not counted beside
+    configs = (replace_(config, arm=replace_(config.arm, axes={"radial": axis})) for axis in (model, unseen))
+    with warned(run, config):
+        seen, doubted = (fuse(run, each, mode=mode)["radial"] for each in configs)
+    (u,), stamp = run.command.values.values(), run.command.stamp
+    now, later = (response(model, T / 1e9, config.arm.delay, stamp, u, u[0], stamp + ahead) for ahead in (0, T))
+    more = (0.2 * (later - now) / (T / 1e9)) ** 2
+    assert doubted.position_sd**2 == pytest.approx(seen.position_sd**2 + more, rel=1e-9)
+    assert np.median(more) > np.median(seen.position_sd**2)
+    for name in ("position", "velocity", "velocity_sd", "offset", "offset_sd", "disturbance", "disturbance_sd"):
+        assert np.array_equal(getattr(doubted, name), getattr(seen, name), equal_nan=True)
 
 
 def plants() -> st.SearchStrategy[Plant]:

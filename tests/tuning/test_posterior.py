@@ -87,7 +87,7 @@ def test_the_simplest_of_the_likely_models_is_taken() -> None:
         weight = np.array([share, 1.0 - share])
         model = np.array([MODELS.index(FIRST), MODELS.index(SECOND)], dtype=np.float64)
         none = {name: np.zeros(2) for name in QUANTITIES}
-        return Mixture(weight, model, np.zeros(2), none, none)
+        return Mixture(weight, model, np.zeros(2), none, none, np.zeros(2, dtype=np.int64))
 
     assert chosen_model(mixture(0.3)) == FIRST
     assert chosen_model(mixture(0.1)) == SECOND

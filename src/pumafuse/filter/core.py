@@ -20,7 +20,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
 from ..errors import PumafuseError
 from .events import Events, Results
 
-VERSION = 12  # of the interface
+VERSION = 13  # of the interface
 FINEST = 1e-9  # PF_FINEST
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
@@ -35,7 +35,8 @@ AXIS = _numbers(
     *("max_speed", "play", "sag_offset", "sag_slope", "sag_knee", "sag_slope_beyond"),
     *("sag_knee_below", "sag_slope_below"),
     *("input_noise", "drift", "maneuver_noise", "maneuver_drift"),
-    *("disturbance_sd", "disturbance_time", "smoothness", "adaptation", "offset_sd", "lag_sd", "gain_sd", "start"),
+    *("disturbance_sd", "disturbance_time", "smoothness", "adaptation", "offset_sd", "lag_sd", "gain_sd"),
+    *("unseen_lag_sd", "start"),
 )
 SENSOR = _numbers("scale", "latency", "latency_sd", "gate", "gate_rows")
 VIEW = _numbers("sd", "bias_sd", "bias_drift_sd", "bias_time", "turn")

@@ -267,6 +267,8 @@ class Axis:
         doubts = np.stack((left, moves_by, self.by[:, OFFSET], self.by[:, DISTURBANCE]))
         variance += doubts**2 @ self.doubts**2
         sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)), FINEST / np.array((1.0, T, 1.0, 1.0)))
+        way = later.by_doubt()[1] - self.by_doubt()[1]  # of the response
+        sd[0] = math.hypot(sd[0], self.axis["unseen_lag_sd"] * way / T)
         sd[3] *= self.axis["disturbance_sd"] > 0.0  # else there is none
         return np.stack((mean, sd), axis=1).ravel()
 

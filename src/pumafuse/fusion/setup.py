@@ -45,7 +45,11 @@ def _axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, flo
         record["smoothness"] = _SMOOTHNESS[process.disturbance_kind]
         record["adaptation"] = process.adaptation
         record["offset_sd"] = config.start.offset_sd_of(name)
-        record["lag_sd"], record["gain_sd"] = _sd_of(model.lag_ci95, arm.lag_of(name)), _gain_sd_of(model)
+        record["gain_sd"] = _gain_sd_of(model)
+        if model.unseen_lag_sd is None:
+            record["lag_sd"] = _sd_of(model.lag_ci95, arm.lag_of(name))
+        else:  # which is all of the doubt about its lag
+            record["unseen_lag_sd"] = model.unseen_lag_sd
     return axis
 
 

@@ -73,6 +73,7 @@ _SLOWLY, _LONGER = 0.5, 1.5  # log-likelihood that a step loses: with less the n
 _PIECES = 20  # of all recordings, that a model which is right has independent scores in
 _ENOUGH = 20_000  # commands or measurements of a recording that an arm is known by: more make none better
 _SLOPE = 1e-5  # of a coordinate, by which quantities are varied
+_RARE = 1e-4  # probability of an arm, from which it counts
 _NONE = Fit(Arm(0.0, 1.0), -math.inf, np.zeros((0, 0)))  # is worse than any
 
 
@@ -125,7 +126,7 @@ class ArmSearch:
         """``least``: noise of each sensor [m]; ``believed``: to be what second differences show."""
         self._measured, self.sensors = measured.liveliest(_ENOUGH), measured.sensors
         self._longest = longest_delay(measured.period)
-        self.in_step = measured.phase is not None  # seen at one instant of each update period
+        self.phase = measured.phase  # of each update period, where it is seen at one instant of each; else None
         self.plain = plain_arm(measured)
         self.noise = NoiseModel(np.ones(len(measured.sensors)))  # at first: least squares
         is_free = {"delay", "lag"} <= set(freedom.free)
@@ -169,6 +170,24 @@ class ArmSearch:
         """
         low, high = self.posterior.mixture().quantiles("lag", lambda _: True)
         return low, high
+
+    @property
+    def in_step(self) -> bool:
+        """Whether it is seen at one instant of each update period."""
+        return self.phase is not None
+
+    def unseen(self, arm: Arm) -> tuple[float, float]:
+        """How far all likely arms are from one at the commands, as a standard deviation [m], and as one of its lag [s].
+
+        Measurements in step tell nothing of it. Those at the commands leave nothing unseen there.
+        """
+        likely, shares = zip(*((arm, share) for arm, share in self.posterior.arms if share > _RARE), strict=True)
+        moved = np.hstack(self._measured.at_commands().responses_of([arm, *likely]))
+        later = np.concatenate(self._measured.at_commands(self._measured.period).responses(arm))
+        if not np.any(later - moved[0]):  # no command is within the measurements, or none moves it
+            return 0.0, 0.0
+        sd = math.sqrt(float(shares @ np.mean((moved[1:] - moved[0]) ** 2, axis=1)))
+        return sd, sd / float(np.sqrt(np.mean((later - moved[0]) ** 2))) * self._measured.period
 
     def arm(self, model: Model, delay: float | None = None) -> Arm:
         """The most likely arm of a model; the one with this dead time [s]."""

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from msgspec.structs import replace
 
-from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import NEVER, BoolArray, FloatArray, IntArray, TimeArray
 from ..discovery.following import phase
 from ..filter.core import AXIS, Record, check, library, ptr
 from ..filter.response import record_of
@@ -229,21 +229,16 @@ class Measured:
         """How long after a command all measurements are valid, in update periods; None where that differs."""
         return phase(((recording.stamp, recording.time) for recording in self.recordings), self.period)
 
-    def unseen(self, arm: Arm) -> tuple[float, float]:
-        """How far an arm is from a line between neighbouring measurements, and how far it goes from one to the next.
-
-        Root mean squares [m], where neighbours are an update period apart.
-        """
-        off, ways = [np.zeros(0)], [np.zeros(0)]
-        for recording, moved in zip(self.recordings, self.responses(arm), strict=True):
-            gap = np.diff(recording.time)
-            usual = (gap > 0) & (gap < 1.5e9 * self.period)
-            middle = recording.of(slice(1, None))._replace(time=recording.time[:-1] + gap // 2)
-            between = self.of([middle]).responses(arm)[0]
-            off.append((between - 0.5 * (moved[1:] + moved[:-1]))[usual])
-            ways.append(np.diff(moved)[usual])
-        unseen, way = (math.sqrt(np.mean(each**2)) if len(each) else 0.0 for each in map(np.concatenate, (off, ways)))
-        return unseen, way
+    def at_commands(self, later: float = 0.0) -> Measured:
+        """The instants of the commands from the first measurement to the last, or so much ``later`` [s], unmeasured."""
+        parts = list[Recording]()
+        for recording in self.recordings:
+            first, last = recording.time.min(initial=NEVER), recording.time.max(initial=0)
+            within = (recording.stamp >= first) & (recording.stamp <= last)
+            time = recording.stamp[within] + round(later * 1e9)
+            none = np.zeros(len(time))
+            parts.append(recording._replace(time=time, value=none, source=none.astype(np.int64), weight=none))
+        return self.of(parts)
 
     def left(self, arm: Arm) -> FloatArray:
         """What an arm leaves of the measurements that count, of each recording about its mean [m]."""
@@ -342,7 +337,7 @@ class Measured:
 
     def responses(self, arm: Arm) -> list[FloatArray]:
         """The response of each recording [m], relative to its start."""
-        return [moved[0] for moved in self._responses([arm])]
+        return [moved[0] for moved in self.responses_of([arm])]
 
     def residuals(self, arm: Arm) -> list[FloatArray]:
         """What an arm leaves of each recording [m]."""
@@ -517,7 +512,7 @@ class Measured:
         if not any((arm.play, arm.max_speed, arm.beyond, arm.below)) and not self.sags:  # it is linear
             steps = [1.0 if name in ("gain", "slope") else step for name, step in zip(names, steps, strict=True)]
         beside = [arm.moved([name], [arm.coordinate(name) + step]) for name, step in zip(names, steps, strict=True)]
-        responses = self._responses([arm, *beside])
+        responses = self.responses_of([arm, *beside])
         for moved in responses:
             moved[1:] = (moved[1:] - moved[0]) / np.array(steps)[:, None]
         return responses
@@ -532,7 +527,7 @@ class Measured:
         others = [recording.source == other for other in range(1, len(self.sensors))]
         return np.array([recording.value, *others], dtype=np.float64)
 
-    def _responses(self, arms: Sequence[Arm]) -> list[FloatArray]:
+    def responses_of(self, arms: Sequence[Arm]) -> list[FloatArray]:
         """The responses of arms, for each recording (n, m)."""
         records, responses = self._records(arms), list[FloatArray]()
         for recording in self.recordings:

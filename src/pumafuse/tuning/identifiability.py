@@ -20,8 +20,6 @@ from .parameters import Parameter, smallest_sd
 FEWEST, FEW = 12, 30  # components of an axis: to fit anything, and to fit what only many can tell
 _OF_MANY = ("maneuver_noise", "maneuver_drift", "disturbance_sd", "disturbance_time", "intercept", "gain_recovery")
 _ENOUGH = 30  # components for each number fitted to them; with less, coverage was 45 to 85 % in simulated runs
-_AT_ONCE = 0.05  # of an update period: measurements at the commands are where estimates are
-_STEPS = 0.15  # of the way between two measurements: a lag as long as half an update period leaves as much
 _EXCITED = 3.0  # commanded motion over noise from which an axis moves
 _HIGH = 0.9  # a correlation worth reporting
 _MEMBER = 0.3  # share of the largest weight, from which a parameter belongs to a combination
@@ -130,30 +128,6 @@ def few_measurements(likelihood: Likelihood, free: Sequence[Parameter]) -> list[
                 " they are"
             )
     return many + few
-
-
-def unseen_steps(likelihood: Likelihood, config: FusionConfig) -> list[str]:
-    """A sentence for sensors in step with commands, which see one instant of each step in which the fitted arm moves.
-
-    Between these an arm may as well go on: no measurement tells.
-    """
-    off = dict[tuple[str, float], list[str]]()
-    for axis, names in likelihood.sensors.items():
-        measured = likelihood.measured(axis, config)
-        phase, screen = measured.phase, config.arm.screen_of(axis)
-        if phase is None or min(phase, 1.0 - phase) < _AT_ONCE:
-            continue
-        unseen, way = measured.unseen(arms.Arm.of(config.arm.axes[axis], config.arm.delay_of(axis)))
-        if unseen > _STEPS * way and unseen > min(config.sensors[name].sd_of(axis) or 0.0 for name in names):
-            late = round(1e3 * phase * config.arm.update_period)
-            size = f"{unseen * screen.scale:.2g} {screen.unit} on {axis}"
-            off.setdefault((" and ".join(names), late), []).append(size)
-    return [
-        f"{names}: {late} ms after each command, which is one instant of each step of the fitted arm; between these it"
-        f" may be off by about {', '.join(sizes)}, which error bars do not count. A controller that goes on between"
-        " commands is told by interpolation_ms in run.toml; a sensor of another rate tells, too"
-        for (names, late), sizes in off.items()
-    ]
 
 
 # ---- identifiability ------------------------------------------------------------------------------------------------

@@ -61,6 +61,7 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
         sensor: The sensor it is known by, whose stamps are taken to be right.
         lag: Behind the held command at constant velocity [s].
         lag_ci95: Its 95 % interval.
+        unseen_lag_sd: Its standard deviation where no measurement tells [s]; null where sensors see it at any instant.
         delay: The dead time [s].
         delay_ci95: Its interval.
         shared_delay: Whether it is one for several axes.
@@ -93,6 +94,7 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
     sensor: str
     lag: float = msgspec.field(name="lag_ms")
     lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
+    unseen_lag_sd: float | None = msgspec.field(name="unseen_lag_sd_ms", default=None)
     delay: float = msgspec.field(name="delay_ms")
     delay_ci95: Interval = msgspec.field(name="delay_ms_ci95")
     shared_delay: bool
@@ -213,7 +215,8 @@ class Latency:
                 if hasattr(arm.axes[axis].plant, name):
                     arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(lag, f"{name}_ci95"))
             arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), lag.gain_ci95)
-            arm = changed(arm, ("axes", axis, "sag"), lag.sag)
+            for name in ("sag", "unseen_lag_sd"):
+                arm = changed(arm, ("axes", axis, name), getattr(lag, name))
             for name in ("gain_recovery", *BENDS, "lag"):
                 arm = changed(arm, ("axes", axis, f"{name}_ci95"), getattr(lag, f"{name}_ci95"))
             has_own_delay = arm.axes[axis].delay is not None
@@ -481,6 +484,7 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         sensor=trusted,
         lag=arm.total,
         lag_ci95=interval("lag", arm.total, search.lag_scatter(model, arm)),
+        unseen_lag_sd=search.unseen(arm)[1] if search.in_step else None,
         delay=arm.delay,
         delay_ci95=interval("delay", arm.delay),
         shared_delay=shared,

@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import FloatArray, IntArray
 from .arms import BENDS, Arm
 
 # s, but for the gain, ω [rad/s], ζ, play [m] and the fastest speed [m/s]
@@ -96,6 +96,7 @@ class Mixture(NamedTuple):
     delay: FloatArray  # their delays [s]
     mean: Mapping[Quantity, FloatArray]  # of each quantity there; NaN where the model does not have it
     sd: Mapping[Quantity, FloatArray]  # its standard deviation there
+    nearest: IntArray  # numbers of the nearest entries, in order of branches
 
     def log_odds(self, chosen: Callable[[Model], bool]) -> float:
         """The logarithm of how much likelier the models that are chosen are than the others."""
@@ -124,6 +125,13 @@ class AxisPosterior:
 
     branches: Sequence[Branch]  # of all models that count
 
+    @property
+    def arms(self) -> list[tuple[Arm, float]]:
+        """The arms of all entries with their probabilities."""
+        mixture, entries = self.mixture(), [entry for branch in self.branches for entry in branch.entries]
+        weight = np.bincount(mixture.nearest, mixture.weight, len(entries))
+        return [(entry.arm, share) for entry, share in zip(entries, weight.tolist(), strict=True)]
+
     def log_density(self, delays: FloatArray) -> FloatArray:
         """The log-density of the delay, all models together, (m,)."""
         densities = np.full(len(delays), -np.inf)
@@ -135,6 +143,7 @@ class AxisPosterior:
     def mixture(self, others: Iterable[AxisPosterior] = (), sharing: float = 1.0) -> Mixture:
         """The mixture, with what other axes say of the dead time, as it is likely by ``sharing`` that they share it."""
         parts = [self._points(branch) for branch in self.branches]
+        firsts = np.cumsum([0, *(len(branch.entries) for branch in self.branches[:-1])])
         delay = np.concatenate([part.delay for part in parts])
         weights = np.concatenate([part.weight for part in parts])
         shared = weights + sum(other.log_density(delay) for other in others)
@@ -145,6 +154,7 @@ class AxisPosterior:
             delay,
             {name: np.concatenate([part.mean[name] for part in parts]) for name in QUANTITIES},
             {name: np.concatenate([part.sd[name] for part in parts]) for name in QUANTITIES},
+            np.concatenate([first + part.nearest for first, part in zip(firsts, parts, strict=True)]),
         )
 
     def _points(self, branch: Branch) -> Mixture:
@@ -167,6 +177,7 @@ class AxisPosterior:
             np.asarray(delay, dtype=np.float64),
             {name: between([entry.means.get(name, np.nan) for entry in branch.entries]) for name in QUANTITIES},
             {name: between([entry.sds.get(name, np.nan) for entry in branch.entries]) for name in QUANTITIES},
+            np.rint(position).astype(np.int64),
         )
 
 

@@ -21,7 +21,6 @@ from .identifiability import (
     not_identifiable,
     not_identifiable_noise,
     shared_times,
-    unseen_steps,
 )
 from .likelihood import Likelihood, Point
 from .maximise import Notify, ignore, maximise_with_gates, point
@@ -135,7 +134,6 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
     notes += few_measurements(likelihood, free(best.config))
-    notes += unseen_steps(likelihood, best.config)
     hidden = hidden_disturbances(likelihood, best, free(best.config), search.may_be_disturbed(best.config))
     for axis, sd in hidden.items():
         screen = best.config.arm.screen_of(axis)

@@ -19,6 +19,8 @@ from ..fusion.placing import add_tool
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..units import MS
+from .arm_search import ArmSearch
+from .arms import Arm
 from .identifiability import FEWEST, TuneError, correlations, excited_axes
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, Point
@@ -52,6 +54,7 @@ from .validation import Check, check
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
 _LATE = 0.1  # of a run: measurements that begin later are split for themselves
 _BEATEN = 0.8  # of the innovations, which another arm must leave to take the place of the likeliest
+_UNSEEN = 0.1  # of an update period: a lag that is known better is not worth a note
 _NOTHING = 0.01  # log-likelihood by which the configuration as given must be ahead to be kept
 
 Progress: TypeAlias = Callable[[str, float], None]
@@ -192,7 +195,16 @@ def tune(
     allowed = {axis: search.lag_ci95 for axis, search in searched.items() if search.in_step}
     allowed |= {axis: doubt.lag_ci95 for axis, doubt in doubted_axes.items()}
     lags = fitted_lags(free, config, result, around, allowed, unmeasured)
+    unseen = {
+        axis: search.unseen(Arm.of(result.arm.axes[axis], result.arm.delay_of(axis)))
+        for axis, search in searched.items()
+        if search.in_step
+    }
+    for axis in searched:
+        _, sd = unseen.get(axis, (0.0, None))
+        result = changed(result, ("arm", "axes", axis, "unseen_lag_sd"), sd if sd is None else rounded(sd))
     tuned = _with_provenance(result, free, by_key, {} if interrupted else lags, names)
+    doubted += _unseen_notes(searched, unseen, result)
     doubted += lag_steps({axis: search.plain for axis, search in arms.items()}, tuned)
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
     if interrupted:
@@ -435,6 +447,26 @@ def _tuned_on(config: FusionConfig) -> list[str]:
     """The runs on which a configuration was fitted, by the provenance of its arm."""
     tuned_on: object = config.arm.provenance.get("tuned_on", [])
     return [str(run) for run in cast(list[object], tuned_on)] if isinstance(tuned_on, list) else [str(tuned_on)]
+
+
+def _unseen_notes(
+    arms: Mapping[str, ArmSearch], unseen: Mapping[str, tuple[float, float]], config: FusionConfig
+) -> list[str]:
+    """A sentence for sensors in step with commands, where arms that say the same of all measurements are far apart."""
+    off = dict[tuple[str, float], list[str]]()
+    for axis, (sd, lag_sd) in unseen.items():
+        names, phase, screen = arms[axis].sensors, arms[axis].phase, config.arm.screen_of(axis)
+        is_noise = sd < min(config.sensors[name].sd_of(axis) or 0.0 for name in names)
+        if phase is not None and lag_sd > _UNSEEN * config.arm.update_period and not is_noise:
+            late = round(1e3 * phase * config.arm.update_period)
+            off.setdefault((" and ".join(names), late), []).append(f"{sd * screen.scale:.2g} {screen.unit} on {axis}")
+    return [
+        f"{names}: {late} ms after each command, which is one instant of each step; of the rest nothing tells: at the"
+        f" commands arms that are as likely differ by about {', '.join(sizes)}, which error bars count"
+        " (unseen_lag_sd_ms in arm.toml). A controller that goes on between commands is told by interpolation_ms in"
+        " run.toml; a sensor of another rate tells, too"
+        for (names, late), sizes in off.items()
+    ]
 
 
 def _seen_before(config: FusionConfig, run: Run, validation: Sequence[Check] | None) -> list[str]:
