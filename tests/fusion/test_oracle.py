@@ -295,7 +295,7 @@ def test_error_bars_count_a_lag_that_no_measurement_sees(mode: Mode) -> None:
     """It widens the bars of positions alone, by its sd times the speed of the response over the coming period."""
     run, config = DOUBTED["gain"].made()
     model = config.arm.axes["radial"]
-    unseen = replace_(model, unseen_lag_sd=0.2, lag_ci95=(0.0, 1.0))  # which is not counted beside
+    unseen = replace_(model, seen_lag_sd=0.0, unseen_lag_sd=0.2, lag_ci95=(0.0, 1.0))
     configs = (replace_(config, arm=replace_(config.arm, axes={"radial": axis})) for axis in (model, unseen))
     with warned(run, config):
         seen, doubted = (fuse(run, each, mode=mode)["radial"] for each in configs)

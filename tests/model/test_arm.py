@@ -71,6 +71,7 @@ axis_models = st.builds(
     sag=st.none() | sags,
     delay_ci95=interval,
     lag_ci95=ascending,
+    seen_lag_sd=st.none() | st.floats(0.0, 1e4),
     unseen_lag_sd=st.none() | st.floats(0.0, 1e4),
 )
 provenance = st.fixed_dictionaries(

@@ -45,11 +45,9 @@ def _axes_of(config: FusionConfig, axes: Sequence[str], levels: Mapping[str, flo
         record["smoothness"] = _SMOOTHNESS[process.disturbance_kind]
         record["adaptation"] = process.adaptation
         record["offset_sd"] = config.start.offset_sd_of(name)
-        record["gain_sd"] = _gain_sd_of(model)
-        if model.unseen_lag_sd is None:
-            record["lag_sd"] = _sd_of(model.lag_ci95, arm.lag_of(name))
-        else:  # which is all of the doubt about its lag
-            record["unseen_lag_sd"] = model.unseen_lag_sd
+        by_interval = _sd_of(model.lag_ci95, arm.lag_of(name))
+        record["lag_sd"] = by_interval if model.seen_lag_sd is None else model.seen_lag_sd
+        record["gain_sd"], record["unseen_lag_sd"] = _gain_sd_of(model), model.unseen_lag_sd or 0.0
     return axis
 
 

@@ -125,8 +125,9 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         delay_ci95: Its 95 % interval [s], if it was fitted.
         lag_ci95: The 95 % interval of :meth:`lag` at slow motion [s], if it was fitted: delay and plant make up for
             each other, so that their sum is known better than either.
-        unseen_lag_sd: The standard deviation of the lag [s] where no measurement tells: an arm that was fitted to
-            sensors in step with its commands was seen at one instant of each step.
+        seen_lag_sd: The standard deviation of the lag [s] at the one instant of each step at which sensors in step with
+            the commands saw the arm that was fitted; None: the interval tells.
+        unseen_lag_sd: What is more than that at the commands [s], where no measurement told.
     """
 
     kind: Kind = "length"
@@ -142,6 +143,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     delay: Delay | None = msgspec.field(name="delay_ms", default=None)
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
     lag_ci95: Interval | None = msgspec.field(name="lag_ms_ci95", default=None)
+    seen_lag_sd: Delay | None = msgspec.field(name="seen_lag_sd_ms", default=None)
     unseen_lag_sd: Delay | None = msgspec.field(name="unseen_lag_sd_ms", default=None)
 
     def lag(self, delay: float, speed: float = 0.0) -> float:

@@ -117,6 +117,14 @@ class Freedom(NamedTuple):
         return arm._replace(recovery=0.0, slope=0.0) if gain == "static" else arm._replace(slope=self.arm.slope)
 
 
+class LagSds(NamedTuple):
+    """Standard deviations of a lag that was measured in step with the commands, at one instant of each period."""
+
+    seen: float  # at the measurements [s], which the next ones correct
+    unseen: float  # at the commands, what is more than that [s]: no measurement tells
+    apart: float  # so far apart are likely arms there, unseen [m]
+
+
 class ArmSearch:
     """The arms of an axis: maxima of each model, and the walk from one along the dead time."""
 
@@ -176,18 +184,22 @@ class ArmSearch:
         """Whether it is seen at one instant of each update period."""
         return self.phase is not None
 
-    def unseen(self, arm: Arm) -> tuple[float, float]:
-        """How far all likely arms are from one at the commands, as a standard deviation [m], and as one of its lag [s].
-
-        Measurements in step tell nothing of it. Those at the commands leave nothing unseen there.
-        """
+    def lag_sds(self, arm: Arm) -> LagSds | None:
+        """How well the lag of an arm is known, by all likely arms; None where measurements are not in step."""
+        commands, later = (self._measured.at_commands(by) for by in (0.0, self._measured.period))
+        way = np.concatenate(later.responses(arm)) - np.concatenate(commands.responses(arm))
+        if not self.in_step or not way.any():
+            return None
         likely, shares = zip(*((arm, share) for arm, share in self.posterior.arms if share > _RARE), strict=True)
-        moved = np.hstack(self._measured.at_commands().responses_of([arm, *likely]))
-        later = np.concatenate(self._measured.at_commands(self._measured.period).responses(arm))
-        if not np.any(later - moved[0]):  # no command is within the measurements, or none moves it
-            return 0.0, 0.0
-        sd = math.sqrt(float(shares @ np.mean((moved[1:] - moved[0]) ** 2, axis=1)))
-        return sd, sd / float(np.sqrt(np.mean((later - moved[0]) ** 2))) * self._measured.period
+
+        def variance(at: Measured) -> float:
+            moved = np.hstack(at.responses_of([arm, *likely]))
+            return float(shares @ np.mean((moved[1:] - moved[0]) ** 2, axis=1))
+
+        seen = variance(self._measured)
+        apart, period = math.sqrt(max(variance(commands) - seen, 0.0)), self._measured.period
+        speed = float(np.sqrt(np.mean(way**2))) / period
+        return LagSds(math.sqrt(seen) / speed, apart / speed, apart)
 
     def arm(self, model: Model, delay: float | None = None) -> Arm:
         """The most likely arm of a model; the one with this dead time [s]."""

@@ -61,7 +61,8 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
         sensor: The sensor it is known by, whose stamps are taken to be right.
         lag: Behind the held command at constant velocity [s].
         lag_ci95: Its 95 % interval.
-        unseen_lag_sd: Its standard deviation where no measurement tells [s]; null where sensors see it at any instant.
+        seen_lag_sd: Its standard deviation at the measurements [s], where these are in step with commands; else null.
+        unseen_lag_sd: What is more than that at the commands, where no measurement tells; likewise.
         delay: The dead time [s].
         delay_ci95: Its interval.
         shared_delay: Whether it is one for several axes.
@@ -94,6 +95,7 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
     sensor: str
     lag: float = msgspec.field(name="lag_ms")
     lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
+    seen_lag_sd: float | None = msgspec.field(name="seen_lag_sd_ms", default=None)
     unseen_lag_sd: float | None = msgspec.field(name="unseen_lag_sd_ms", default=None)
     delay: float = msgspec.field(name="delay_ms")
     delay_ci95: Interval = msgspec.field(name="delay_ms_ci95")
@@ -215,7 +217,7 @@ class Latency:
                 if hasattr(arm.axes[axis].plant, name):
                     arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(lag, f"{name}_ci95"))
             arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), lag.gain_ci95)
-            for name in ("sag", "unseen_lag_sd"):
+            for name in ("sag", "seen_lag_sd", "unseen_lag_sd"):
                 arm = changed(arm, ("axes", axis, name), getattr(lag, name))
             for name in ("gain_recovery", *BENDS, "lag"):
                 arm = changed(arm, ("axes", axis, f"{name}_ci95"), getattr(lag, f"{name}_ci95"))
@@ -480,11 +482,13 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         sizes = {name: (getattr(sag, name), _MARGIN * half) for name, half in search.bent.sag_half.items()}
         ends = {f"{name}_ci95": (size - half, size + half) for name, (size, half) in sizes.items()}
         values["sag"] = msgspec.structs.replace(sag, **ends)
+    sds = search.lag_sds(arm)
     lag = AxisLag(
         sensor=trusted,
         lag=arm.total,
         lag_ci95=interval("lag", arm.total, search.lag_scatter(model, arm)),
-        unseen_lag_sd=search.unseen(arm)[1] if search.in_step else None,
+        seen_lag_sd=sds.seen if sds else None,
+        unseen_lag_sd=sds.unseen if sds else None,
         delay=arm.delay,
         delay_ci95=interval("delay", arm.delay),
         shared_delay=shared,

@@ -19,7 +19,7 @@ from ..fusion.placing import add_tool
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..units import MS
-from .arm_search import ArmSearch
+from .arm_search import ArmSearch, LagSds
 from .arms import Arm
 from .identifiability import FEWEST, TuneError, correlations, excited_axes
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
@@ -195,16 +195,16 @@ def tune(
     allowed = {axis: search.lag_ci95 for axis, search in searched.items() if search.in_step}
     allowed |= {axis: doubt.lag_ci95 for axis, doubt in doubted_axes.items()}
     lags = fitted_lags(free, config, result, around, allowed, unmeasured)
-    unseen = {
-        axis: search.unseen(Arm.of(result.arm.axes[axis], result.arm.delay_of(axis)))
+    lag_sds = {
+        axis: search.lag_sds(Arm.of(result.arm.axes[axis], result.arm.delay_of(axis)))
         for axis, search in searched.items()
-        if search.in_step
     }
-    for axis in searched:
-        _, sd = unseen.get(axis, (0.0, None))
-        result = changed(result, ("arm", "axes", axis, "unseen_lag_sd"), sd if sd is None else rounded(sd))
+    for axis, sds in lag_sds.items():
+        for name in ("seen", "unseen"):
+            sd = rounded(getattr(sds, name)) if sds else None
+            result = changed(result, ("arm", "axes", axis, f"{name}_lag_sd"), sd)
     tuned = _with_provenance(result, free, by_key, {} if interrupted else lags, names)
-    doubted += _unseen_notes(searched, unseen, result)
+    doubted += _unseen_notes(searched, lag_sds, result)
     doubted += lag_steps({axis: search.plain for axis, search in arms.items()}, tuned)
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
     if interrupted:
@@ -450,16 +450,17 @@ def _tuned_on(config: FusionConfig) -> list[str]:
 
 
 def _unseen_notes(
-    arms: Mapping[str, ArmSearch], unseen: Mapping[str, tuple[float, float]], config: FusionConfig
+    arms: Mapping[str, ArmSearch], lag_sds: Mapping[str, LagSds | None], config: FusionConfig
 ) -> list[str]:
     """A sentence for sensors in step with commands, where arms that say the same of all measurements are far apart."""
     off = dict[tuple[str, float], list[str]]()
-    for axis, (sd, lag_sd) in unseen.items():
+    for axis, (_, unseen, apart) in ((axis, sds) for axis, sds in lag_sds.items() if sds):
         names, phase, screen = arms[axis].sensors, arms[axis].phase, config.arm.screen_of(axis)
-        is_noise = sd < min(config.sensors[name].sd_of(axis) or 0.0 for name in names)
-        if phase is not None and lag_sd > _UNSEEN * config.arm.update_period and not is_noise:
+        is_noise = apart < min(config.sensors[name].sd_of(axis) or 0.0 for name in names)
+        if phase is not None and unseen > _UNSEEN * config.arm.update_period and not is_noise:
             late = round(1e3 * phase * config.arm.update_period)
-            off.setdefault((" and ".join(names), late), []).append(f"{sd * screen.scale:.2g} {screen.unit} on {axis}")
+            size = f"{apart * screen.scale:.2g} {screen.unit} on {axis}"
+            off.setdefault((" and ".join(names), late), []).append(size)
     return [
         f"{names}: {late} ms after each command, which is one instant of each step; of the rest nothing tells: at the"
         f" commands arms that are as likely differ by about {', '.join(sizes)}, which error bars count"
