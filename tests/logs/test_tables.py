@@ -558,6 +558,27 @@ def test_a_growing_file_read_at_any_moment(tmp_path_factory: pytest.TempPathFact
     assert there.endswith("\n") != any("may be torn" in note for note in table.notes)
 
 
+@pytest.mark.parametrize("before", ["[", "run7 = [ "])
+def test_a_matrix_of_matlab_is_a_table(before: str, tmp_path: Path) -> None:
+    """Its names stand above it, several words each, with blanks between them."""
+    rows = ";\n".join(f"  {n}   {0.01 * n:.3f}   {n * n}  {-n}.5" for n in range(30))
+    found = csv(tmp_path, f" No   Time     Demand Angle   Link 2 Angle\n\n{before}{rows}]\n")
+    assert list(found.columns) == ["No", "Time", "Demand Angle", "Link 2 Angle"]
+    assert found.notes == ()
+    assert found.rows == 30
+    np.testing.assert_array_equal(found.plain("Link 2 Angle")[0], [float(f"{-n}.5") for n in range(30)])
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_names_above_lines_of_properties_are_the_header(separator: str, tmp_path: Path) -> None:
+    """As TwinCAT exports a scope: what a column is called, and below it its type, address and scale, line by line."""
+    lines = ["Name;lift", "File;C:\\lift.csv", "", "Name;SetPos;ActPos", "Data-Type;REAL64;REAL64", "SampleTime;2;2"]
+    lines += ["SymbolName;MAIN.s;MAIN.a", "Port;852;852", "Offset;0;0", "ScaleFactor;1;1", "", "4;1.5;1.25"]
+    found = csv(tmp_path, "\n".join([*lines, "6;1.75;1.5", "8;2;1.75", ""]).replace(";", separator))
+    assert list(found.columns) == ["Name", "SetPos", "ActPos"]
+    np.testing.assert_array_equal(found.plain("ActPos")[0], [1.25, 1.5, 1.75])
+
+
 def test_a_header_that_lacks_one_name_names_the_columns_that_it_can(tmp_path: Path) -> None:
     """The last has none; of R's row names, in quotes, the first; where rows are counted it may be either: refused."""
     rows = [f"{0.1 * n:.1f};{n * n}.5;7" for n in range(20)]

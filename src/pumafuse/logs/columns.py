@@ -27,8 +27,12 @@ from . import dates
 
 Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
 
-DAYS = "_days"  # the unit of stamps that Excel or MATLAB's datenum counts, from a day of its own on
-_EXCEL_1970, _MATLAB_1970, _BETWEEN = 25_569.0, 719_529.0, 3e5  # 1970-01-01; days, above which they are MATLAB's
+DAYS, TICKS = "_days", "_ticks"  # units of stamps that a program counts from a day of its own on
+# Their length [s], 1970-01-01 by the two programs, and above which number they are the second one's.
+_SINCE = {
+    DAYS: (86400.0, 25_569.0, 719_529.0, 3e5),  # Excel, MATLAB's datenum
+    TICKS: (1e-7, 116_444_736e9, 621_355_968e9, 3.5e17),  # FILETIME of Windows and TwinCAT, .NET's DateTime
+}
 LOG_TIME = "log_time"  # when a row was recorded
 NAMES = "name"  # the list beside another one that says what its elements are
 # Seconds and nanoseconds in a struct: ROS 2, ROS 1, Foxglove's JSON schemas, google.protobuf.Timestamp.
@@ -109,10 +113,11 @@ class Table:
         if (dated := self._dates(name, column)) is not None:
             return self._within_reach(name, self._of_clock(name, dated[0])), dated[1]
         self._refuse_words(name, self._plain_column(name))
-        if unit == DAYS:
-            days, note = self.plain(name)
-            since = _MATLAB_1970 if np.nanmedian(days) > _BETWEEN else _EXCEL_1970
-            return self._within_reach(name, units.nanoseconds((days - since) * 86400.0)), note
+        if unit in _SINCE:
+            number, note = self.plain(name)
+            size, since, another, between = _SINCE[unit]
+            since = another if np.nanmedian(number) > between else since
+            return self._within_reach(name, units.nanoseconds((number - since) * size)), note
         exponent = 9 - 3 * units.TIMES.index(unit or self._ending(name, units.TIMES, "s"))
         return self._of_numbers(name, 10**exponent)
 

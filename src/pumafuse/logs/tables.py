@@ -74,6 +74,8 @@ JSON_LINES = (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz")
 _DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\r\n]|$)"  # between separators
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 # A list in one cell, as Python and numpy print it: [0.5, -1.2], [0.5 -1.2], array('d', [0.5]), ['elbow', 'wrist'].
+# The first line of a matrix: its row ends with a semicolon, and the next one with that or with the matrix.
+_MATRIX = re.compile(rb"(?m)^[ \t]*(\w+[ \t]*=)?[ \t]*\[(?=[^\]\n]*;[ \t]*\r?\n[^\];\n]*[;\]])")
 _BARE_LIST = re.compile(rb"(?<=[,;\t]) *(\[\s*[-+.\d][^\[\]\"]*\])")
 _LIST = r"^(array\()?('\w', *)?[\[(]\s*(['\"]|[-+.\d])[^\0]*[\])]$"
 _OPEN = re.compile(r'(?:^|[,;\t ])"[^"]*$')  # a cell that begins with a quote and has no other
@@ -385,6 +387,7 @@ def _listed(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     """The table in a CSV text, what was left out of it, and, where only some columns are read, the names of all."""
+    text = _unbracketed(text)
     if (match := _BARE_LIST.search(text, 0, _HEAD)) and b'"' not in text[: match.start()]:
         text = _BARE_LIST.sub(rb'"\1"', text)
     text = _transforms_apart(text) if text.startswith(_TRANSFORMS) else text
@@ -442,6 +445,13 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
     if table.num_rows == 0:  # not the kind of table that it should be
         raise RunError(f"{path}: the table has no rows; {note}")
     return table, names, [note, *notes]
+
+
+def _unbracketed(text: bytes) -> bytes:
+    """A matrix as MATLAB writes it, a row in each line, without brackets and semicolons; any other text as it is."""
+    if (match := _MATRIX.search(text, 0, _HEAD)) is None:
+        return text
+    return text[: match.start()] + re.sub(rb"(?m)[ \t]*(;|\][ \t]*;?)[ \t]*(?=\r?$)", b"", text[match.end() :])
 
 
 def _unlabelled(path: Path, text: bytes) -> tuple[bytes, list[str]]:
@@ -586,6 +596,10 @@ def _layout(text: bytes) -> _Layout:
     rows_below = lines[first - 1].startswith(_ECHO) or _begins(lines, first, separator)
     if first > 0 and len(names) == len(_cells(lines[first], separator)) and rows_below:
         return _Layout(separator, _point(text, separator), first, names, broken=broken)
+    if (between := _properties(lines, full)) is not None:
+        named, rows = between
+        separator, above = _separator(lines[rows]), sum(n < rows for n in full) - 1
+        return _Layout(separator, _point(text, separator), rows, _cells(lines[named], separator), above=above)
     separator = _separator(lines[first])
     header = -1 if _is_headless(lines, first, separator) else _header(lines, full)
     rows = next((n for n in full if n > header), header)
@@ -596,7 +610,11 @@ def _layout(text: bytes) -> _Layout:
     cells = _cells(lines[header], of_rows)
     is_other = (first < header or not _is_text(cells)) and _begins(lines, rows, of_rows) and len(cells) != width
     if header < 0 or is_other:
-        separator, names, skipped, top, units = of_rows, list(map(_column, range(width))), rows, rows, False
+        above = [n for n in full if n < rows][-1:]
+        wide = re.split(r"\s{2,}|\t", lines[above[0]].strip()) if above and of_rows == " " else []
+        is_header = len(wide) == width and _is_text(wide)  # names of several words, each above its column
+        names, top = (wide, above[0]) if is_header else (list(map(_column, range(width))), rows)
+        separator, skipped, units = of_rows, rows, False
     else:
         separator = _separator(lines[header])
         cells = _cells(lines[header], separator)
@@ -605,6 +623,17 @@ def _layout(text: bytes) -> _Layout:
         names = cells if names is None and len(cells) > _WIDE else names
         skipped = header - units + (names is not None)
     return _Layout(separator, _point(text, separator), skipped, names, units, sum(n < top for n in full), broken)
+
+
+def _properties(lines: Sequence[str], full: Sequence[int]) -> tuple[int, int] | None:
+    """The line of names and that of the first row, where between them columns have properties, as TwinCAT writes them.
+
+    None where no line begins with ``Name``, or the first row is right below it.
+    """
+    named = next((n for n in reversed(full) if re.match(r'"?Name"?[;,\t]', lines[n])), len(lines))
+    rows = next((n for n in full if n > named and re.match(r'"?[+-]?[\d.]+"?[;,\t]', lines[n])), 0)
+    cells = [len(_cells(lines[n], _separator(lines[rows]))) for n in (named, rows) if n < len(lines)]
+    return (named, rows) if rows > named + 1 and len({*cells}) == 1 else None
 
 
 def _whole_lines(lines: Sequence[str]) -> tuple[list[str], bool]:
