@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
+from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
 import bag_files
@@ -1462,6 +1463,9 @@ def test_where_nothing_follows_no_columns_are_exchanged(tmp_path: Path) -> None:
         # days of Excel and of MATLAB
         (lambda n: {"Time": 45_678.25 + n * 0.004 / 86400}, "Time", "days", "range"),
         (lambda n: {"time": 739_000.5 + n * 0.008 / 86400}, "time", "days", "range"),
+        # 100 ns of Windows and of .NET
+        (lambda n: {"stamped": 133_500_000_000_000_000 + 40_000 * n}, "stamped", "ticks", "range"),
+        (lambda n: {"time": 638_500_000_000_000_000 + 20_000 * n + n % 3}, "time", "ticks", "range"),
     ],
 )
 def test_clocks_are_those_that_make_sense_of_the_table(
@@ -1715,10 +1719,12 @@ def test_what_moves_alike_much_later_measures_nothing_in_a_table_without_a_heade
         assert "which numbers are the commands?" in one_line(RunError, lambda: survey(tmp_path / "walk.csv"))
 
 
-def test_rows_that_a_clock_of_ticks_gets_may_vary(tmp_path: Path) -> None:
-    """Three to five rows of a logger in each tick of 5 ms; a table of commands and measurements without a header."""
-    rows = np.random.default_rng(1).choice([3, 4, 5], 2000, p=[0.17, 0.58, 0.25])
-    t = np.repeat(0.36 + 0.005 * np.arange(2000), rows)
+@pytest.mark.parametrize("jitter", [0.0, 0.05])
+def test_rows_that_a_clock_of_ticks_gets_may_vary(jitter: float, tmp_path: Path) -> None:
+    """Three to five rows of a logger in each tick of about 5 ms; commands and measurements without a header."""
+    rng = np.random.default_rng(1)
+    rows = rng.choice([3, 4, 5], 2000, p=[0.17, 0.58, 0.25])
+    t = np.repeat(0.36 + 0.005 * (np.arange(2000) + jitter * rng.uniform(-1.0, 1.0, 2000)), rows)
     np.savetxt(tmp_path / "shoulder.csv", np.column_stack([t, path(t)[:, 0], path(t - LAG)[:, 0]]), "%.6f", ",")
     (part,) = parts_of(tmp_path / "shoulder.csv")
     assert part.clock is not None and part.clock.time.column == "column 1"
@@ -1985,6 +1991,58 @@ def test_of_lists_of_trials_the_first_trial_is_used(told: str, seen: str, tmp_pa
     assert [one.part.label for one in found.roles.streams] == ["monday[0]", "monday[0]"]
     assert found.roles.command.part.notes == ("5 other tables, a run each, left out: monday[1] …",)
     assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.01)]
+
+
+@pytest.mark.parametrize(("told", "seen"), [("PosTgt", "PosAct"), ("pos_tar", "actPos"), ("setpoint", "readback")])
+def test_of_tables_of_one_file_each_with_stamps_of_its_own_the_first_is_used(
+    told: str, seen: str, tmp_path: Path
+) -> None:
+    """As of sheets with a trial each, by names that say who is who. Those that share the stamps are one run."""
+    t = 0.02 * np.arange(400)
+
+    def trial(number: int, late: float) -> dict[str, list[float]]:
+        turn = path(t + 3.0 * number)[:, 1]
+        stamps = np.where(t > 0.0, t + late, 0.0)
+        return {"t": stamps.tolist(), told: turn.tolist(), seen: np.interp(t - LAG, t, turn).tolist()}
+
+    log = tmp_path / "trials.json"
+    log.write_text(json.dumps({f"speed {n}": trial(n, 1e-3 * n) for n in range(4)}))
+    found = survey(log)
+    assert [one.part.label for one in found.roles.streams] == ["speed 0", "speed 0"]
+    assert found.roles.command.part.notes == ("3 other tables, a run each, left out: speed 1 …",)
+    assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.01)]
+    log.write_text(json.dumps({arm: trial(n, 0.0) for n, arm in enumerate(("left", "right"))}))
+    assert [(part.label, part.notes) for part in parts_of(log)] == [("left", ()), ("right", ())]
+
+
+def test_two_actual_positions_are_not_each_other_s_commands(tmp_path: Path) -> None:
+    """A counter of steps and an encoder, and nothing that says what the axis was told."""
+    t, u, z = recorded_at_once()
+    columns = {"t_s": t, "rotor.PosAct": u[:, 0], "enc.fActPosition": z[:, 0]}
+    write(tmp_path / "log.csv", columns)
+    assert "which numbers are the commands?" in one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+
+
+def test_a_long_name_of_a_file_tells_of_a_load_and_not_what_is_in_it(tmp_path: Path) -> None:
+    """Of columns without names; a short one, load_cell, does."""
+    t = 0.01 * np.arange(900)
+    for name, signals in (("no-load-sine-3Hz.txt", 2), ("temp-wave-no-2.txt", 2), ("load_cell.txt", 0)):
+        np.savetxt(tmp_path / name, np.column_stack([t, path(t)[:, 0], path(t - LAG)[:, 0]]), "%.5f")
+        (part,) = parts_of(tmp_path / name)
+        assert len(part.signals) == signals
+
+
+@pytest.mark.parametrize("first", [0, 5])
+def test_without_names_what_rises_in_fractions_beside_a_count_is_the_clock(first: int, tmp_path: Path) -> None:
+    """In an array of MATLAB and in a text: rows are counted in front, then stamped every 8 ms."""
+    t = 0.008 * np.arange(700)
+    columns = np.column_stack([np.arange(700) + first, t, path(t)[:, 0], path(t - LAG)[:, 0]])
+    savemat(tmp_path / "run.mat", {"run": columns})
+    np.savetxt(tmp_path / "run.txt", columns, "%.5f")
+    for name, column in (("run.mat", "run[1]"), ("run.txt", "column 2")):
+        found = survey(tmp_path / name)
+        assert found.roles.command.part.clock.time.column == column
+        assert [one.lag for one in found.relations.values()] == [pytest.approx(LAG, abs=0.01)]
 
 
 def test_a_clock_may_be_any_column_that_alone_goes_on(log: Path) -> None:

@@ -50,7 +50,7 @@ _FEWEST_ROWS, _MANY_ROWS = 10, 100  # so many tell a clock by nothing but that t
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows, or of blocks, of a clock that are not before the row or block above
 _BLOCK = 20  # rows; who writes from several threads writes some of them out of order
-_OF_TICK = 0.02  # of a tick, by which ticks of a clock differ: stamps of 15.6 ms that are written with 4 decimals
+_OF_TICK = 0.2  # of a tick, by which ticks of a clock differ: those of a loop that sleeps
 _MOST_LEFT = 0.5  # share of what a clock has told, from which it may begin anew
 _MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
 RANGES: dict[Kind, tuple[str, str, float]] = {  # small and large unit, and beyond which number it is the large one
@@ -64,6 +64,7 @@ _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18,
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
 _SLOW, _LONGEST_STROKE = 0.05, 60.0  # of these, from which the unit may be a finer one; s that a robot's stroke takes
 _DAYS = ((2e4, 8e4), (7e5, 8e5))  # since 1899 or, as MATLAB counts, since the year 0: from 1954 or 1917 on
+_TICKS = ((1.2e17, 1.6e17), (6.27e17, 6.67e17))  # since 1601 or, as .NET counts, since the year 1: from 1981 or 1988 on
 _FINEST_DAY = 2.5e-5  # days, 2 s: rows of a clock that counts seconds are never so near
 _EVEN = 0.1  # share by which most steps of a counter may differ from the usual one
 _LONGEST_WAIT = 3.0  # packets, that a row waits: of rows that come in bursts by themselves some wait longer
@@ -211,7 +212,10 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
 
 
 def _of_one_run(parts: Sequence[Part]) -> list[Part]:
-    """The parts of a log; of files of the same columns, or of trials, that each hold a whole run the first alone."""
+    """The parts of a log; of files or sheets of the same columns, or of trials, each a whole run, the first alone.
+
+    Tables of one file that share the stamps were written together, as of two arms: these are one run.
+    """
 
     def columns(part: Part) -> set[str]:
         return {*part.left_out, *(signal.column for signal in part.signals)}
@@ -220,10 +224,17 @@ def _of_one_run(parts: Sequence[Part]) -> list[Part]:
         roles = {names.column_role(signal.name) for signal in part.signals}
         return len(roles) > 1 and not roles.isdisjoint(_TOLD)
 
+    def is_together(part: Part, first: Part) -> bool:
+        if part.clock is None or first.clock is None or not formats.has_tables(part.file):
+            return True
+        return np.array_equal(part.clock.stamp, first.clock.stamp)
+
     def is_another(part: Part, first: Part) -> bool:
-        trial, first_trial = _TRIAL.match(part.topic), _TRIAL.match(first.topic)
-        if part.file == first.file and (trial is None or first_trial is None or trial[1] != first_trial[1]):
-            return trial is not None and first_trial is not None  # it may have other columns
+        trials = [match[1] for match in map(_TRIAL.match, (part.topic, first.topic)) if match]
+        if part.file == first.file and len({*trials}) > 1:
+            return True  # it may have other columns
+        if part.file == first.file and len(trials) < 2 and is_together(part, first):
+            return False
         return part is not first and columns(part) == columns(first)
 
     first = next(filter(is_whole, parts), None)
@@ -272,7 +283,7 @@ def _gathered(files: Sequence[Path]) -> list[Path]:
 
 def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
     signals, left_out, times, paths = list[Signal](), dict[str, str](), list[str](), list(_numeric_paths(table))
-    joints, counts = _joints(table, paths), {name for name in table.columns if _counts(table, name) is not None}
+    joints, counts = _joints(table, paths), {name for name in _columns(table) if _counts(table, name) is not None}
     rows = _axes_in_rows(table)
     told = attitudes_in(table, paths) if rows == [{}] else []
     attitudes = [attitude for attitude in told if attitude.turns]
@@ -310,8 +321,8 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
     for attitude in attitudes:
         left_out |= {} if attitude.role_words in beside else dict.fromkeys(attitude.columns.columns, "turning")
     clock, why_none = _clock(table, signals, sorted(counts))
-    if clock is None or (rate and clock.counts):
-        clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts)
+    if clock is None or clock.counts:
+        clock = _counted(table, rate) if rate else _rising(table, _stroke(signals), counts) or clock
     used = () if clock is None else tuple(clock.time.columns)
     if clock:
         sums = _velocities([signal for signal in signals if signal.column not in used], clock.stamp)
@@ -745,11 +756,16 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
 
 def _rising(table: Table, stroke: float, counts: Container[str]) -> Clock | None:
     """The one column but counts that goes on from row to row, whatever it is called; None of none or several."""
-    within = table.columns if len(table.columns) > 1 else _numeric_paths(table)  # of one array its elements
-    rising = [name for name in _risers(table, within, below=_axes_in_rows(table) != [{}]) if name not in counts]
+    risers = _risers(table, _columns(table), below=_axes_in_rows(table) != [{}])
+    rising = [name for name in risers if name not in counts]
     clock = _clock_of(table, rising[0], stroke) if len(rising) == 1 else None
     what = f"is {rising[0]} the clock of {table.path.name}? It alone rises from row to row" if clock else ""
     return clock and replace(clock, doubt=clock.doubt or what)
+
+
+def _columns(table: Table) -> Iterable[str]:
+    """The columns of a table; of one array its elements."""
+    return table.columns if len(table.columns) > 1 else _numeric_paths(table)
 
 
 def _risers(table: Table, columns: Iterable[str], *, below: bool = False) -> list[str]:
@@ -842,6 +858,8 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
             return unit, "range", ""
     if interval < _FINEST_DAY and any(low <= middle <= high for low, high in _DAYS):
         return "days", "range", ""
+    if not span and any(low <= middle <= high for low, high in _TICKS):
+        return "ticks", "range", ""
     for unit, most in _INTERVALS.items():
         second = most / _INTERVALS["s"]
         if span and 1.0 / _ALIKE_SPANS < float(np.ptp(finite)) / second / span < _ALIKE_SPANS:
@@ -927,6 +945,8 @@ def _validity(table: Table) -> dict[str, Any]:
 def _first_run(table: Table) -> dict[str, Any]:
     """Which rows are the first run, where a column tells several apart."""
     for name in filter(table.columns.__contains__, names.EPISODES):
+        if pa.types.is_nested(table.columns[name].type):  # an array of signals may be called run, too
+            continue
         values = pc.unique(table.columns[name].drop_null())
         value: Any = values[0].as_py() if 1 < len(values) <= table.rows // _FEWEST_ROWS else None
         if isinstance(value, int | str | float):

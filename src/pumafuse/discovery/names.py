@@ -24,8 +24,8 @@ _DEVICES = words_in("tracker camera vision sensor range laser mocap vicon optitr
 _ROLES: dict[Role, frozenset[str]] = {
     "reference": words_in("truth reference ref ground gt groundtruth referencia referenz riferimento"),
     "command": words_in(
-        "command commands commanded cmd goal goals target targets desired des demand demanded setpoint setpoints set sp"
-        " soll sol sollwert planned action actions control ctrl input inputs com wanted reqd requested"
+        "command commands commanded cmd goal goals target targets tgt tar desired des demand demanded setpoint"
+        " setpoints set sp soll sol sollwert planned action actions control ctrl input inputs com wanted reqd requested"
         " consigna consigne comando deseado desejado controle"
     ),
     "sensor": _DEVICES
@@ -38,7 +38,7 @@ _ROLES: dict[Role, frozenset[str]] = {
 # In the name of a topic or file these are something else.
 _OF_COLUMNS = words_in("set sp pv process fb current cur curr present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
-_SEEN = words_in("target targets")  # commands, but of a sensor beside words of what cameras look at, and by
+_SEEN = words_in("target targets tgt tar")  # commands, but of a sensor beside words of what cameras look at, and by
 _DRIVES = words_in("control ctrl input inputs controle")  # commands, or what a controller puts into motors or rotors
 _PATHS = words_in("traj trajectory")  # of columns, commands where no other word says what they are
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
@@ -69,6 +69,8 @@ _NO_POSITIONS = _QUANTITIES | words_in(
     " latency duration header stamp nanosec layout frame done reward task episode tick time timestamp reset lat lon"
     " latitude longitude good innov"
 )
+_OF_RUNS = words_in("load temp")  # in a long name of a file how it was made: with a load, or to be overwritten
+_OF_QUANTITY = 2  # words: measured_load, load_cell
 _FINGERS = words_in("index rotation")  # of a hand: beside words of roles, at the end, these are joints
 _ERRORS = words_in("error err errs")
 _SPREADS = _ERRORS | words_in("std sd sigma covariance")  # in the unit of a position, and none
@@ -81,7 +83,8 @@ _WHOLE = {
 _TRANSLATIONS = {"tx": "x", "ty": "y", "tz": "z"}
 _NOW = words_in("current cur curr")  # of motors, but of the present beside
 _MEASURED = _ROLES["sensor"] - _NOW  # what is measured is a motor's current: CurrentFeedback
-_POSITIONS = words_in("position positions pos pose angle theta x y z roll pitch yaw")
+_PLACES = words_in("position positions pos angle")  # beside which act is actual, and no action
+_POSITIONS = _PLACES | words_in("pose theta x y z roll pitch yaw")
 _TIME_UNITS = {
     **dict.fromkeys(words_in("seconds secs sec s"), "s"),
     **dict.fromkeys(words_in("milliseconds millis msecs msec ms"), "ms"),
@@ -135,7 +138,7 @@ def words(name: str) -> list[str]:
     """The words of a name in lower case: ``goalPose_x`` is goal, pose, x; ``QTarget2`` is q, target, 2.
 
     Numbers of devices stay with them: ``camera2`` is one word. ``refx`` is ref, x, and ``velcmd`` is vel, cmd. ``H2C``
-    is one, too. Accents are left out.
+    is one, too. ``PosAct`` is pos, actual. Accents are left out.
     """
     apart = _HUMP.sub("_", _ACCENT.sub("", unicodedata.normalize("NFD", name)))
     whole = [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
@@ -145,6 +148,8 @@ def words(name: str) -> list[str]:
         for word, match in zip(whole, glued, strict=True)
         for part in (filter(None, match.groups()) if match else [word])
     ]
+    if not _PLACES.isdisjoint(parts):
+        parts = ["actual" if word == "act" else word for word in parts]
     numbered = [re.fullmatch(r"([a-z]+)(\d+)", word) for word in parts]
     return [
         part
@@ -249,11 +254,12 @@ def no_position(column: str) -> str | None:
 def no_position_by_place(label: str, columns: Iterable[str]) -> str | None:
     """What the columns of a file or topic are by its name, if they have no words of their own and are no positions.
 
-    That is a quantity alone: runs are called after gains, tasks and robots, ``kp12``, ``delta_task2``.
+    That is a quantity alone: runs are called after gains, tasks, robots and loads, ``kp12``, ``no-load-sine-2``.
     """
     silent = all(axis_of(column, []) == "position" and not role_words(column) for column in columns)
     why = no_position(label) if silent else None
-    return why if why in _QUANTITIES and not has_word(label, _POSITIONS) else None
+    is_run = why in _OF_RUNS and len(words(label)) > _OF_QUANTITY
+    return why if why in _QUANTITIES and not is_run and not has_word(label, _POSITIONS) else None
 
 
 def family(column: str, columns: Container[str]) -> tuple[str, str, str]:
