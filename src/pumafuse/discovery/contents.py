@@ -70,6 +70,7 @@ _EVEN = 0.1  # share by which most steps of a counter may differ from the usual 
 _LONGEST_WAIT = 3.0  # packets, that a row waits: of rows that come in bursts by themselves some wait longer
 _ROUNDED, _FLOAT32 = 1.5e-6, 1.2e-7  # s, of stamps in us; share, of stamps in float32
 _ALIKE_SPANS = 1.2  # factor between the spans that two clocks of a table tell
+_BOTH_WAYS = 0.5  # steps back for each step on, from which a column is no clock
 _GUESSED, _ANOTHER = ("interval", "motion"), "another clock"  # by which the unit of a clock is known: hardly, or well
 _SHARED = 0.5  # of the time that two tables tell, which both do if they are of one time: units are 1000 apart
 _OF_STEP = 0.01  # by which no step of a clock that was counted differs from the others
@@ -561,11 +562,12 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
     """
     notes, stroke, coarse = list[str](), _stroke(signals), 0.0
     called = sorted(_stamp_columns(table), key=lambda name: (name == LOG_TIME, "header" not in names.words(name)))
+    in_units = [name for name in table.columns if ending(leaf(name)) in TIMES and name not in called]
     nameless = next(iter(table.columns), "") in (tables.FIRST, "X_Value")
 
     def candidates() -> Iterator[Clock | None]:
         yield from (_clock_of(table, name, stroke) for name in called)
-        yield from (_clock_of(table, name, stroke) for name in table.columns if ending(leaf(name)) in TIMES)
+        yield from (_clock_of(table, name, stroke) for name in in_units)
         yield from (_clock_of(table, name, stroke) for name in table.columns if table.is_dated(name))
         if nameless and not called:
             yield _nameless_clock(table, stroke)
@@ -574,8 +576,10 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
     for clock in filter(None, candidates()):
         source = Source(clock.stamp, {signal.name: signal.plain for signal in signals}, table.path.name)
         if not signals or not (stands := standing_clock(source)):
-            others = filter(None, (_clock_of(table, name, stroke) for name in called if name not in clock.time.columns))
-            return _numbered(table, _spread(table, _or_another(table, clock, others), counts), counts), notes
+            apart = ((name, _clock_of(table, name, stroke)) for name in (*called, *in_units))
+            others = {name: other for name, other in apart if other and name not in clock.time.columns}
+            clock = _or_another(table, clock, (other for name, other in others.items() if name in called))
+            return _numbered(table, _spread(table, clock, others.values(), counts), counts), notes
         notes.append(f"{clock.time.column} is no clock: {stands}")
         coarse = coarse or float(np.ptp(clock.stamp[clock.stamp != NO_STAMP])) / 1e9
     return None, notes
@@ -584,7 +588,7 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
 def _or_another(table: Table, clock: Clock, others: Iterable[Clock]) -> Clock:
     """A clock, with a question where another one in the table tells another time; the other one if this one is even."""
     for other in others:
-        spans = [float(np.ptp(timed.stamp[timed.stamp != NO_STAMP])) / 1e9 for timed in (clock, other)]
+        spans = [_span(timed) for timed in (clock, other)]
         if max(spans) > _ALIKE_SPANS * min(spans) > 0.0:
             steps = np.diff([clock.stamp, other.stamp])
             counted = (np.ptp(steps, axis=1) <= _OF_STEP * np.median(steps, axis=1)).tolist() == [True, False]
@@ -596,8 +600,15 @@ def _or_another(table: Table, clock: Clock, others: Iterable[Clock]) -> Clock:
     return clock
 
 
-def _spread(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
-    """A clock whose rows come in packets spread by what counts them, or with a question."""
+def _span(clock: Clock) -> float:
+    return float(np.ptp(clock.stamp[clock.stamp != NO_STAMP])) / 1e9
+
+
+def _spread(table: Table, clock: Clock, others: Iterable[Clock], counts: Sequence[str]) -> Clock:
+    """A clock whose rows come in packets spread by what counts them, another one that stamps each, or with a question.
+
+    The other one lasts as long, as that of a loop beside the stamps of a camera's frames.
+    """
     if (sent := packets(clock.stamp)) is None or _axes_in_rows(table) != [{}]:
         return clock
     each, every = sent
@@ -606,6 +617,10 @@ def _spread(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
         even = Clock.of(table, structs.replace(clock.time, counter=counter), f"{clock.basis}, spread by {counter}")
         if float(np.ptp(clock.stamp - even.stamp)) / 1e9 < _LONGEST_WAIT * every:
             return replace(even, notes=(*even.notes, f"{what}: stamped by {counter}, along the earliest arrivals"))
+    for other in others:
+        if packets(other.stamp) is None and 1.0 / _ALIKE_SPANS < _span(other) / _span(clock) < _ALIKE_SPANS:
+            said = f"{what}, by {clock.time.column}: stamped by {other.time.column}"
+            return replace(other, notes=(*other.notes, said))
     return replace(clock, doubt=f"{what}, and no column counts them: when was each made?")
 
 
@@ -728,12 +743,15 @@ def _ends(clock: Clock) -> FloatArray:
 
 
 def _runs(stamp: TimeArray) -> bool:
-    """Whether stamps go on from row to row, or where many rows are out of order from some rows to the next."""
+    """Whether stamps go on from row to row, or where many rows are out of order from some rows to the next.
+
+    What hardly changes, and goes back as often as on, is a duration.
+    """
     steps = np.diff(stamp)
     if not len(steps) or not steps.any():
         return False
     if (steps >= 0).mean() >= _IN_ORDER:
-        return True
+        return bool(np.count_nonzero(steps < 0) <= _BOTH_WAYS * np.count_nonzero(steps > 0))
     blocks = [np.median(block) for block in np.array_split(stamp, len(stamp) // _BLOCK or 1)]
     return len(blocks) >= _FEWEST_ROWS and bool((np.diff(blocks) > 0).mean() >= _IN_ORDER)
 
