@@ -406,6 +406,7 @@ def test_columns_beside_the_commands_are_called_by_what_stands_before_their_axes
     [
         ("{}", "{}_lowpass"),
         ("{}_raw", "{}_smoothed"),
+        ("raw_seen_{}", "seen_{}"),
         ("encoder_{}", "encoder_{}_filt"),
         ("measured_{}", "ekf_{}"),
         ("pv_{}", "estimated_{}"),
@@ -431,7 +432,7 @@ def test_of_raw_and_filtered_numbers_of_one_quantity_the_raw_ones_are_the_sensor
         assert found.roles is not None and len(found.run.sensors) == 1
         lag = LAG if name == "both" else 0.02
         assert {round(one.lag, 2) for one in found.relations.values()} == {lag}
-        said = [why for _, why in found.roles.left_out if "is filtered by its name: " in why]
+        said = [why for _, why in found.roles.left_out if "is not raw by its name: " in why]
         assert len(said) == (name == "both")
 
 
@@ -1585,6 +1586,33 @@ def test_rows_in_packets_are_spread_by_what_counts_them(log: Path, tmp_path: Pat
     assert "counter" in drafts(found, *guess(found), tmp_path)["run.toml"]
     write(log / "camera.csv", {"received_s": sent, **axes})
     assert any("camera.csv: rows arrive" in one and "no column counts them" in one for one in asked(survey(log)))
+
+
+def test_of_two_clocks_the_one_that_stamps_each_row_is_taken(tmp_path: Path) -> None:
+    """A loop that also writes the stamp of the last frame, which many rows share; durations of a loop are no clock."""
+    t, u, z = recorded_at_once()
+    frame = 0.1 * np.floor(t / 0.1 + 0.5)
+    stamps = {"image_stamp_us": np.round(frame * 1e6), "steady_us": np.round(t * 1e6)}
+    stamps["cycle_time_ms"] = 15.0 + np.arange(len(t)) // 40 % 2
+    found = surveyed(tmp_path, stamps | xyz(u, "goal_{}_m") | xyz(z, "actual_{}_m"))
+    assert [one.lag for one in found.relations.values()] == pytest.approx(3 * [LAG], abs=5e-3)
+    assert not any("rows arrive" in one or "which is the clock" in one for one in asked(found))
+
+
+def test_a_sensor_that_moves_against_the_commands_is_said_to(tmp_path: Path) -> None:
+    """A column that nothing names, mounted the other way round: not that it follows by a correlation of -1."""
+    t, u, z = recorded_at_once()
+    text = refusal(tmp_path, {"t_s": t, "goal_bend": u[:, 0], "potentiometer": -40.0 * z[:, 0]})
+    assert "it moves against the commands (correlation -1.00), as errors do, or a sensor of scale -1" in text
+
+
+def test_units_that_are_neither_lengths_nor_angles_are_asked_by_their_name(tmp_path: Path) -> None:
+    """Ticks of an encoder are no mm by their range; what is in brackets is said, but no label of a list."""
+    t, u, z = recorded_at_once()
+    numbers = {"goal lift [ticks]": 5e4 * u[:, 0], "actual lift [ticks]": 5e4 * z[:, 0]}
+    (question,) = (one for one in asked(surveyed(tmp_path, {"t_s": t} | numbers)) if "are the numbers of" in one)
+    assert "Names say ticks, which is no length and no angle" in question
+    assert not names.other_unit_of("position[elbow]") and not names.other_unit_of("x [mm]")
 
 
 def test_stamps_that_were_counted_are_said(tmp_path: Path) -> None:

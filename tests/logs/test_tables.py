@@ -313,12 +313,14 @@ def test_columns_without_a_name_are_called_by_their_place(text: str, names: list
         (['"[0.5 -1e-2\n]"', '"[ 2.  nan]"', '"[]"'], [[0.5, -0.01], [2.0, None], [None]]),
         (["\"array('d', [0.5, -1e-2])\"", "\"array('d', [2])\"", ""], [[0.5, -0.01], [2.0], None]),
         (["[0.5, -1e-2]", "[2, 3]", ""], [[0.5, -0.01], [2.0, 3.0], None]),
+        (["0.5 -1e-2", "2 nan", ""], [[0.5, -0.01], [2.0, None], None]),
+        (["2026-11-25 10:00:00", "7 of 9", ""], ["2026-11-25 10:00:00", "7 of 9", None]),
         (["\"('elbow', 'wrist')\"", "\"['a b' 'c']\"", ""], [["elbow", "wrist"], ["a b", "c"], None]),
         (['"(1) approach, slowly"', '"[2] grasp"', ""], ["(1) approach, slowly", "[2] grasp", None]),
     ],
 )
 def test_a_cell_may_hold_a_list(tmp_path: Path, cells: list[str], state: list[object]) -> None:
-    """As Python and numpy print it; what is no list stays text."""
+    """As Python and numpy print it, or numbers with blanks between; what is no list stays text."""
     table = csv(tmp_path, "".join(f"{n},{cell},7\n" for n, cell in enumerate(cells)).join(["t_s,state,b\n", ""]))
     assert table.columns["state"].to_pylist() == state
     assert table.plain("b")[0].tolist() == [7.0, 7.0, 7.0] and not table.notes

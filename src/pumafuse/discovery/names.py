@@ -46,14 +46,16 @@ _OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a t
 FILTERED = words_in(
     "filt filter filtered lpf lowpass smooth smoothed kf ekf ukf kalman denoised est estimate estimated"
 )  # of columns that are computed from raw ones
+RAW = words_in("raw")
 PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
 _SILENT = (
     _OF_ROLES
     | FILTERED
     | PARTS
     | _PATHS
+    | RAW
     | words_in(
-        "raw pose poses position positions pos point points data translation transform value values scalar scalars"
+        "pose poses position positions pos point points data translation transform value values scalar scalars"
         " joint jnt dof qpos controller robot arm tool tcp ee flange coordinates axis posicion posicao posizione"
     )
 )
@@ -103,6 +105,7 @@ _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|cm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
 _OTHER_UNIT = re.compile(r"[\[(] *([kM]?Pa|m?bar|psi|rpm|k?N|N[. *]?m|m[AV]|k?Hz|%) *[\])]$", re.IGNORECASE)
+_IN_BRACKETS = re.compile(r" [\[(] *([^\W\d][^\])]*?)\W*[\])]$")  # counts [counts?]; no label of a list
 _BRACKETED = re.compile(rf"[\[(] *(mm|cm|m|um|in|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 # Joints in metres, where others turn.
@@ -195,7 +198,7 @@ def column_role(column: str) -> Role | None:
 
 def quantity(label: str, column: str) -> set[str]:
     """The words of a place, and the devices of a column there, that are the same of raw and filtered numbers."""
-    return {*words(label), *_DEVICES.intersection(words(column))} - FILTERED - {"raw"}
+    return {*words(label), *_DEVICES.intersection(words(column))} - FILTERED - RAW
 
 
 def has_word(name: str, vocabulary: frozenset[str]) -> bool:
@@ -291,6 +294,12 @@ def unit_of(column: str) -> str:
         return "deg"
     *before, last = words(column) or [""]  # also that of `x [mm]`
     return _UNITS.get(last, "") if before and (last != _IN or _BRACKETED.search(column)) else ""
+
+
+def other_unit_of(column: str) -> str:
+    """What a name says in brackets, if that is no unit of a position, ``counts``; empty without one."""
+    match = None if unit_of(column) else _IN_BRACKETS.search(column)
+    return match[1] if match else ""
 
 
 def with_inches(columns: Iterable[str]) -> dict[str, str]:

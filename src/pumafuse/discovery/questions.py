@@ -13,9 +13,10 @@ from ..errors import printable
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run
 from ..units import MS
+from . import names
 from .following import ABOUT_ONE, LATEST, Following
 from .guesses import SensorGuess
-from .roles import MOST_LAG, SAME, another_clock
+from .roles import MOST_LAG, SAME, Stream, another_clock
 from .survey import FOLLOWS, Survey
 
 _OTHER_UNIT = 3.0  # factor by which a sensor may move less or more than its command
@@ -109,7 +110,9 @@ def questions(survey: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[st
         guessed = {printable(stream.part.label): stream for stream in streams if stream.guessed}
         units = sorted({signal.unit for stream in guessed.values() for some in stream.axes.values() for signal in some})
         if guessed:
-            yield f"are the numbers of {', '.join(guessed)} in {' and '.join(units)}? No name says it (run.toml)"
+            others = ", ".join(sorted({unit for stream in guessed.values() if (unit := _other_unit(stream))}))
+            says = f"Names say {others}, which is no length and no angle" if others else "No name says it"
+            yield f"are the numbers of {', '.join(guessed)} in {' and '.join(units)}? {says} (run.toml)"
         for stream, why in roles.left_out:
             if stream.name in run.sensors or stream.role == "command" or "follow" in why or "its commands" in why:
                 yield f"{printable(stream.name)} is not used on {', '.join(stream.axes)}: {why}"
@@ -128,6 +131,12 @@ def _moves_as_far(run: Run, name: str, axis: str, following: Following) -> bool:
     # Of steps, which a span cuts, how far both go tells a gain better.
     gains = abs(following.slope), run.measured[name].travel(axis) / max(run.command.travel(axis), 1e-12)
     return any(1.0 / ABOUT_ONE < gain < ABOUT_ONE for gain in gains)
+
+
+def _other_unit(stream: Stream) -> str:
+    """What names of a stream's columns say in brackets instead of a unit of positions; empty where none does."""
+    signals = (signal for some in stream.axes.values() for signal in some)
+    return printable(next(filter(None, (names.other_unit_of(signal.column) for signal in signals)), ""))
 
 
 def _sure(doubtful: list[str], else_: str = "a guess") -> str:

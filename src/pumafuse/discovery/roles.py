@@ -276,27 +276,37 @@ def _none_leads(parts: Sequence[Part], streams: Sequence[Stream]) -> str:
 
 
 def _raw(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
-    """Sources without the axes of filtered sensors of which the raw one is there, too."""
+    """Sources without the axes of filtered sensors of which the raw one is there, too.
+
+    What moves as far as another that alone is called raw was computed from it.
+    """
     kept = list[Stream]()
     for stream in streams:
         column = next(iter(stream.axes.values()))[0].column
         beside = dict[str, str]()
         for other in streams if stream.role == "sensor" else ():
             raw, apart = next(iter(other.axes.values()))[0].column, stream.part.label != other.part.label
-            filtered, not_raw = (
-                names.has_word(f"{some.part.stem} {name}" if apart else name, names.FILTERED)
-                for some, name in ((stream, column), (other, raw))
-            )
+            texts = [f"{some.part.stem} {name}" if apart else name for some, name in ((stream, column), (other, raw))]
+            filtered, not_raw = (names.has_word(text, names.FILTERED) for text in texts)
+            beside_raw = [names.has_word(text, names.RAW) for text in texts] == [False, True]
+            filtered = filtered or (beside_raw and _as_wide(stream, other))
             same = names.quantity(stream.part.stem, column) == names.quantity(other.part.stem, raw)
             if other.role == "sensor" and filtered and not not_raw and same:
                 beside |= {axis: raw if not apart else other.part.label for axis in stream.axes if axis in other.axes}
         if beside:
             raw = ", ".join(map(printable, dict.fromkeys(beside.values())))
-            why = f"{printable(column)} is filtered by its name: {raw} beside it is raw, and is the sensor"
+            why = f"{printable(column)} is not raw by its name: {raw} beside it is, and is the sensor"
             left_out.append((replace(stream, axes={axis: stream.axes[axis] for axis in beside}), why))
         if axes := {axis: some for axis, some in stream.axes.items() if axis not in beside}:
             kept.append(replace(stream, axes=axes))
     return kept
+
+
+def _as_wide(stream: Stream, other: Stream) -> bool:
+    """Whether the axes that two have cover ranges of the same size, apart from their ends."""
+    both = [(stream.source.values[axis], other.source.values[axis]) for axis in stream.axes if axis in other.axes]
+    widths = [[float(np.subtract(*np.nanquantile(value, [0.95, 0.05]))) for value in pair] for pair in both]
+    return all(1.0 / ABOUT_ONE < width / max(raw, 1e-12) < ABOUT_ONE for width, raw in widths)
 
 
 def _once(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
@@ -681,7 +691,9 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     speeds = speeds_follow(command.source, stream.source)
     if speeds is not None and speeds.correlation >= SAME and -_AT_ONCE < speeds.lag < LATEST:
         return f"{speeds.lag * 1e3:.0f} ms late, by its speed", ""
-    most = max((relation.correlation for relation in relations), default=0.0)
+    most, least = (end((relation.correlation for relation in relations), default=0.0) for end in (max, min))
+    if not alike and least <= -SAME:
+        return "", f"it moves against the commands (correlation {least:+.2f}), as errors do, or a sensor of scale -1"
     if not alike:
         return "", f"it does not follow the commands (correlation {most:+.2f} at most)"
     if len(behind) < len(alike):

@@ -73,9 +73,10 @@ FIRST = "column 1"  # what the first column is called, if it has no name
 JSON_LINES = (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz")
 _DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\r\n]|$)"  # between separators
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
-# A list in one cell, as Python and numpy print it: [0.5, -1.2], [0.5 -1.2], array('d', [0.5]), ['elbow', 'wrist'].
 # The first line of a matrix: its row ends with a semicolon, and the next one with that or with the matrix.
 _MATRIX = re.compile(rb"(?m)^[ \t]*(\w+[ \t]*=)?[ \t]*\[(?=[^\]\n]*;[ \t]*\r?\n[^\];\n]*[;\]])")
+# A list in one cell, as Python and numpy print it: [0.5, -1.2], [0.5 -1.2], array('d', [0.5]), ['elbow', 'wrist']; or
+# numbers with blanks between them.
 _BARE_LIST = re.compile(rb"(?<=[,;\t]) *(\[\s*[-+.\d][^\[\]\"]*\])")
 _LIST = r"^(array\()?('\w', *)?[\[(]\s*(['\"]|[-+.\d])[^\0]*[\])]$"
 _OPEN = re.compile(r'(?:^|[,;\t ])"[^"]*$')  # a cell that begins with a quote and has no other
@@ -371,10 +372,11 @@ def _listed(column: pa.ChunkedArray) -> pa.ChunkedArray:
     if not pa.types.is_string(column.type):
         return column
     first = next(iter(pc.utf8_trim_whitespace(column.drop_null()[:1]).to_pylist()), "")
-    if not (match := re.match(_LIST, first)):
+    match, cells = re.match(_LIST, first), first.split()
+    if not match and (len(cells) < 2 or not all(re.match(NUMBER, cell) for cell in cells)):
         return column
     inside = pc.replace_substring_regex(pc.utf8_trim_whitespace(column), _AROUND_LIST, "")
-    words = match[3] in ("'", '"')
+    words = match is not None and match[3] in ("'", '"')
     lists = pc.split_pattern_regex(inside, _BETWEEN_WORDS if words else _BETWEEN).combine_chunks()
     elements = lists.flatten()
     if words:
@@ -443,7 +445,8 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
         f" {wrong[0].expected_columns}, first in line {wrong[0].number}"
     )
     if table.num_rows == 0:  # not the kind of table that it should be
-        raise RunError(f"{path}: the table has no rows; {note}")
+        advice = "name each cell in the header, or take the header out: columns are called column 1, column 2, … then"
+        raise RunError(f"{path}: the table has no rows; {note}; {advice}")
     return table, names, [note, *notes]
 
 
