@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from pumafuse.filter.response import response
 from pumafuse.tuning.identifiability import correlations, covariance, shared_times
-from pumafuse.tuning.parameters import Parameter, parameters, with_own_delays
+from pumafuse.tuning.parameters import Parameter, parameters, set_own_delays
 from tuning_runs import fit_stage, outage, quietly, replaced, scenario, with_outliers, with_sensors
 
 ARM = pf.ArmModel.load("puma560-internal")
@@ -61,7 +61,7 @@ def test_pairs_beyond_nine_tenths_are_named() -> None:
     The other axis's delay is known, so that this one has its own.
     """
     sim = with_outliers(1)
-    config = with_own_delays(sim.config, ["tangential"])
+    config = set_own_delays(sim.config, ["tangential"])
     found = fit_stage(sim.run, config, ("noise", "delay", "plant"), "axes.tangential.delay_ms", "disturbance_sd_mm")
     inside = [one for one in found.free if one.at_bound(found.best.config) is None]
     information = found.likelihood.derivatives(found.best.config, inside, found.best.outcomes).information
@@ -100,7 +100,7 @@ def test_one_latency_is_fixed_of_each_connected_group(
     """
     sensors = {name: pf.Sensor(sd=sd) for name, sd in (("poor", 1e-3), ("third", 2e-3), ("good", 1e-4))}
     arm = replaced(ARM, axes=dict.fromkeys("tv", ARM.axes["radial"]))
-    config = with_own_delays(pf.FusionConfig(arm=arm, sensors=sensors), "tv")
+    config = set_own_delays(pf.FusionConfig(arm=arm, sensors=sensors), "tv")
     sensors_of = {"t": of_t.split(), "v": of_v.split()}
     founds = shared_times(
         sensors_of, moving, parameters(config, config, sensors_of, ("delay", "latency"), fixed), config

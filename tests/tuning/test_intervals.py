@@ -13,7 +13,7 @@ import pumafuse as pf
 from pumafuse.tuning.intervals import ConfidenceInterval, Profile, _Side, _views, confidence_intervals, lag_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise, maximise_with_gates, point
-from pumafuse.tuning.parameters import Fit, changed, rounded, with_own_delays
+from pumafuse.tuning.parameters import Fit, changed, rounded, set_own_delays
 from pumafuse.tuning.summary import fitted_lags
 from tuning_runs import contains, fit_stage, free_of, intervals_of, outage, scenario, spoiled, spoiled_arm
 
@@ -181,7 +181,7 @@ def test_an_axis_has_the_information_of_the_others_on_a_shared_parameter() -> No
     """
     sim = outage(2)
     names = ["axes.vertical.delay_ms", "sensors.vision.latency_ms"]
-    config = with_own_delays(sim.config, ["vertical"])
+    config = set_own_delays(sim.config, ["vertical"])
     likelihood = Likelihood([sim.run], config, ["vision"])
     free = [one for one in free_of(likelihood, config, ("delay", "latency")) if one.key in names]
     best = maximise(likelihood, config, free)
@@ -189,16 +189,16 @@ def test_an_axis_has_the_information_of_the_others_on_a_shared_parameter() -> No
     found, outcomes = confidence_intervals(likelihood, best, free)[delay.key], best.outcomes
 
     def highest(value: float) -> float:
-        fixed, near = delay.put(best.config, value), latency.get(best.config)
+        fixed, near = delay.set(best.config, value), latency.number(best.config)
         cost = minimize_scalar(
-            lambda at: -likelihood.evaluate(latency.put(fixed, at), outcomes).log_likelihood,
+            lambda at: -likelihood.evaluate(latency.set(fixed, at), outcomes).log_likelihood,
             bounds=(near - 0.02, near + 0.02),
             method="bounded",
         )
         return -float(cost.fun)
 
     assert found.open == (False, False)
-    top = highest(delay.get(best.config))
+    top = highest(delay.number(best.config))
     for end in found.ci95:
         assert top - highest(end) == pytest.approx(0.5 * ROOT**2, rel=0.2)
 
@@ -225,7 +225,7 @@ def test_ends_beside_many_parameters_are_where_their_profile_has_dropped() -> No
                 rest = [other for other in rest if other is not one and other.at_bound(best.config) is None]
                 for end, is_open in zip(found[one.key].ci95, found[one.key].open, strict=True):
                     if found[one.key].profiled and not is_open:
-                        start = one.put(best.config, end)
+                        start = one.set(best.config, end)
                         there = maximise(likelihood, start, rest, outcomes=outcomes, tolerance=exactly)
                         left_out = sum(other.log_prior(there.config) for other in free if other not in rest)
                         drop = best.log_posterior - there.log_posterior - left_out
@@ -248,7 +248,7 @@ def test_an_interval_contains_the_result() -> None:
         low, high = confidence_intervals(likelihood, peak, free)[one.key].ci95
         for aside in (0.5 * low, 2.0 * high, one.bounds[0] if one.vanishes else low):
             value = one.clipped(rounded(aside))
-            there = point(likelihood, one.put(peak.config, value), free, peak.outcomes)
+            there = point(likelihood, one.set(peak.config, value), free, peak.outcomes)
             found = confidence_intervals(likelihood, there, free)[one.key]
             assert found.open[0] or found.ci95[0] < value, one.key
             assert found.open[1] or value < found.ci95[1], one.key
@@ -259,7 +259,7 @@ def test_a_profile_begins_at_its_maximum_also_beside_a_bound_and_a_prior() -> No
     """A camera's noise put at its least, far from what it is configured as: nothing has dropped there yet."""
     found = fit_stage(outage(1).run, outage(1).config)
     one = next(one for one in found.free if one.sensor == "vision" and one.prior is not None)
-    least = one.put(found.best.config, one.bounds[0])
+    least = one.set(found.best.config, one.bounds[0])
     assert one.at_bound(least) == "lower" and one.log_prior(least) < -4.0
     best = point(found.likelihood, least, found.free)
     view = _views(found.likelihood, best, found.free)[one.axis]

@@ -9,7 +9,7 @@ import pumafuse as pf
 from pumafuse.tuning.intervals import lag_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import derivatives, point
-from pumafuse.tuning.parameters import with_own_delays
+from pumafuse.tuning.parameters import set_own_delays
 from pumafuse.tuning.summary import fitted_lags
 from tuning_runs import free_of, outage, replaced, scenario
 
@@ -20,7 +20,7 @@ def test_it_is_the_covariance_of_delay_and_plant() -> None:
     Or, where that is more, the scatter of the score over 20 pieces of the run between two of its inverses.
     """
     sim = outage(2)
-    config = with_own_delays(sim.config, ["vertical"])
+    config = set_own_delays(sim.config, ["vertical"])
     likelihood = Likelihood([sim.run], config)
     free = [one for one in free_of(likelihood, config, ("delay", "plant")) if one.axis == "vertical"]
     best = point(likelihood, config, free)
@@ -74,7 +74,7 @@ def test_an_end_is_open_only_where_nothing_can_go_there() -> None:
     """A delay of 0 alone cannot be less, so that end is open; with the plant free both ends are there."""
     found = scenario("panel-tracker-outage", 0.1, 0.02)
     sim = pf.simulate(replaced(found, arm=replaced(found.arm, delay=0.0)), 2)
-    config = with_own_delays(sim.config, ["vertical"])
+    config = set_own_delays(sim.config, ["vertical"])
     likelihood = Likelihood([sim.run], config)
     free = [one for one in free_of(likelihood, config, ("delay", "plant")) if one.axis == "vertical"]
     free = [replace(one, bounds=(0.0, 0.3)) if one.fit == "delay" else one for one in free]

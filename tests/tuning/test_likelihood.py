@@ -257,7 +257,7 @@ def test_the_score_is_the_derivative_of_the_log_likelihood(order: int) -> None:
     bare, found = likelihood.derivatives(config, free, at.outcomes), derivatives(likelihood, at, free)
     steep = 0
     for number, one in enumerate(free):
-        here, step = one.coordinate(one.get(config)), 1e-6 if one.log else 1e-7  # past no edge of what adapts
+        here, step = one.coordinate(one.number(config)), 1e-6 if one.log else 1e-7  # past no edge of what adapts
         up, down = (
             point(likelihood, moved(config, [one], [here + sign * step]), free, at.outcomes) for sign in (1, -1)
         )
@@ -300,7 +300,7 @@ def test_scores_and_information_are_those_of_the_joint_gaussian() -> None:
     inverse = np.linalg.inv(covariance)
     d_mean, d_covariance = [], []
     for one in free:
-        at, step = one.coordinate(one.get(config)), 1e-3 if one.log else 2e-5
+        at, step = one.coordinate(one.number(config)), 1e-3 if one.log else 2e-5
         (m_up, K_up), (m_down, K_down) = (jointly(one.move(config, at + sign * step)) for sign in (1, -1))
         d_mean.append((m_up - m_down) / (2.0 * step))
         d_covariance.append(inverse @ (K_up - K_down) / (2.0 * step))

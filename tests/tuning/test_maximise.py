@@ -20,7 +20,7 @@ from tuning_runs import (
 
 
 def coordinates(free: Sequence[Parameter], config: pf.FusionConfig) -> np.ndarray:
-    return np.array([one.coordinate(one.get(config)) for one in free])
+    return np.array([one.coordinate(one.number(config)) for one in free])
 
 
 def still_to_gain(likelihood: Likelihood, at: Point, free: Sequence[Parameter]) -> float:
@@ -55,7 +55,7 @@ def test_a_search_ends_at_a_maximum(seed: int, fit: Sequence[Fit]) -> None:
     assert len(seen) > 3 and (np.diff([one.log_posterior for one in seen]) > 0.0).all()
     for one in free:
         low, high = one.bounds
-        assert all(low * (1.0 - 1e-12) <= one.get(at.config) <= high * (1.0 + 1e-12) for at in seen)
+        assert all(low * (1.0 - 1e-12) <= one.number(at.config) <= high * (1.0 + 1e-12) for at in seen)
     again = point(likelihood, best.config, free, outcomes)
     assert seen[-1].log_posterior == best.log_posterior == again.log_posterior > start.log_posterior + 100.0
     assert still_to_gain(likelihood, best, free) < 0.01

@@ -18,17 +18,17 @@ from pumafuse.tuning.parameters import (
     is_fixed,
     kinds_of,
     parameters,
-    with_arm,
-    with_disturbance,
-    with_drifts,
-    with_own_delays,
+    set_arm,
+    set_disturbance,
+    set_drifts,
+    set_own_delays,
 )
 from tuning_runs import replaced, with_process
 
 ARM = pf.ArmModel.load("puma560-internal")  # tangential is second order, radial and vertical are first
 TRACKER, CAMERA = pf.Sensor(sd=5e-5, latency=0.008), pf.Sensor(sd={"radial": 4e-4, "vertical": 3e-4}, latency=0.045)
 SHARED = pf.FusionConfig(arm=ARM, sensors={"tracker": TRACKER, "camera": CAMERA, "spare": pf.Sensor(sd=1.0)})
-CONFIG = with_drifts(with_own_delays(SHARED, ARM.axes))
+CONFIG = set_drifts(set_own_delays(SHARED, ARM.axes))
 SENSORS = {"tangential": ["tracker"], "radial": ["tracker", "camera"], "vertical": ["camera"]}
 
 
@@ -46,7 +46,7 @@ def of(key: str, config: pf.FusionConfig = CONFIG) -> Parameter:
 
 
 def snapshot(config: pf.FusionConfig) -> dict[str, float]:
-    return {one.key: one.get(config) for one in everything(config=config)}
+    return {one.key: one.number(config) for one in everything(config=config)}
 
 
 def test_what_can_be_fitted() -> None:
@@ -57,7 +57,7 @@ def test_what_can_be_fitted() -> None:
     assert keys["noise"] == sds | {f"process.{axis}.{key}" for axis in SENSORS for key in noises}
     assert keys["delay"] == {f"axes.{axis}.delay_ms" for axis in SENSORS}
     assert {one.key for one in parameters(SHARED, SHARED, SENSORS, ["delay"])} == {"delay_ms"}
-    some = with_own_delays(SHARED, ["radial"])
+    some = set_own_delays(SHARED, ["radial"])
     assert {one.key for one in parameters(some, some, SENSORS, ["delay"])} == {"delay_ms", "axes.radial.delay_ms"}
     second = {"axes.tangential.natural_frequency_rad_s", "axes.tangential.damping"}
     assert keys["plant"] == {*second, "axes.radial.time_constant_ms", "axes.vertical.time_constant_ms"}
@@ -88,7 +88,7 @@ def test_a_noise_is_believed_within_a_factor_and_not_below_what_is_resolved() ->
     free = {one.key: one for one in parameters(CONFIG, CONFIG, SENSORS, FITS, (), fine | coarse, {at: 4e-5})}
     noise = free["sensors.tracker.sd_mm.radial"]
     for factor, log in ((1.0, 0.0), (1.9, -0.5), (1.0 / 1.9, -0.5), (1.9**2, -2.0)):
-        assert noise.log_prior(noise.put(CONFIG, factor * 4e-5)) == pytest.approx(log, abs=1e-9)
+        assert noise.log_prior(noise.set(CONFIG, factor * 4e-5)) == pytest.approx(log, abs=1e-9)
     assert all(one.prior is None for one in free.values() if one.is_noise and one is not noise)
     unbounded = of("sensors.camera.sd_mm.radial").bounds
     assert free["sensors.camera.sd_mm.radial"].bounds == (2e-5, unbounded[1])
@@ -112,8 +112,8 @@ def test_a_parameter_is_under_its_key_in_the_files(key: str, tmp_path: Path) -> 
     """With a new value it is written under its key in the key's unit; no other parameter has changed."""
     one = of(key)
     value = one.value(0.3 * one.range[0] + 0.7 * one.range[1])
-    changed = one.put(CONFIG, value)
-    assert one.get(changed) == value
+    changed = one.set(CONFIG, value)
+    assert one.number(changed) == value
     assert {name: number for name, number in snapshot(changed).items() if name != key} == {
         name: number for name, number in snapshot(CONFIG).items() if name != key
     }
@@ -121,12 +121,12 @@ def test_a_parameter_is_under_its_key_in_the_files(key: str, tmp_path: Path) -> 
     file = "arm.toml" if key.startswith("axes.") else "fusion.toml"
     written = in_file(tomllib.loads((tmp_path / file).read_text()), key)
     assert written == pytest.approx(value / one.unit, rel=1e-12)
-    assert one.get(pf.FusionConfig.load(tmp_path / "fusion.toml")) == pytest.approx(value, rel=1e-12)
+    assert one.number(pf.FusionConfig.load(tmp_path / "fusion.toml")) == pytest.approx(value, rel=1e-12)
 
 
 def test_what_may_be_none() -> None:
     """A process noise, a disturbance's sd and a drifting bias's; no sensor's noise and no time."""
-    disturbed = reduce(lambda config, axis: with_disturbance(config, axis, 1e-3, 0.3), SENSORS, CONFIG)
+    disturbed = reduce(lambda config, axis: set_disturbance(config, axis, 1e-3, 0.3), SENSORS, CONFIG)
     none = {one.path[-1] for one in everything(config=disturbed) if one.vanishes}
     walk = {"input_noise", "drift", "maneuver_noise", "maneuver_drift"}
     assert none == {*walk, "disturbance_sd", "bias_drift_sd"}
@@ -183,7 +183,7 @@ def test_an_unknown_kind_is_refused_with_the_nearest() -> None:
 def test_an_arm_has_the_lag_that_its_plant_shows(axis: str) -> None:
     """Of either order: it is behind a ramp by ∫ (1 − step response) dt."""
     time = np.linspace(0.0, 2.0, 200_001)
-    slower = with_arm(CONFIG, axis, Arm.of(ARM.axes[axis], 0.0)._replace(lag=0.07))
+    slower = set_arm(CONFIG, axis, Arm.of(ARM.axes[axis], 0.0)._replace(lag=0.07))
     for config, lag in ((CONFIG, ARM.axes[axis].plant.lag), (slower, 0.07)):
         plant = config.arm.axes[axis].plant
         assert type(plant) is type(ARM.axes[axis].plant)

@@ -15,7 +15,7 @@ from pumafuse.model.arm import AxisModel, Gain
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.arms import Arm, Measured, Recording
 from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.plain import Doubt, PlainArm, doubts, lag_steps, plain_arm, with_plain_arm
+from pumafuse.tuning.plain import Doubt, PlainArm, doubts, lag_steps, plain_arm, set_plain_arm
 from pumafuse.tuning.stage import Plan, run_stage
 from pumafuse.tuning.summary import fitted_lags
 from pumafuse.tuning.tune import Pipeline
@@ -89,7 +89,7 @@ def test_a_right_arm_is_not_refuted_and_a_wrong_one_is() -> None:
     one = doubts(plain, slow)["tangential"]  # the vertical axis hardly moves
     assert one.refutes
     assert one.plain.arm.total == pytest.approx(config.arm.lag_of("tangential"), abs=0.02)
-    assert "tangential" not in doubts(plain, with_plain_arm(slow, "tangential", one.plain.arm))
+    assert "tangential" not in doubts(plain, set_plain_arm(slow, "tangential", one.plain.arm))
 
 
 @pytest.mark.long
@@ -113,7 +113,7 @@ def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_t
     slow = replaced(config.arm.axes[first], delay=config.arm.delay_of(first) + 0.08 - config.arm.lag_of(first))
     slow = replaced(config, arm=replaced(config.arm, axes={**config.arm.axes, first: slow}))
     free = [one for one in free_of(Likelihood([simulated.run], slow), slow, ["delay"]) if one.axis == first]
-    replaced_arm = with_plain_arm(slow, others[0], Arm(0.03, 0.025))
+    replaced_arm = set_plain_arm(slow, others[0], Arm(0.03, 0.025))
     arm = PlainArm(Arm(0.03, 0.025), (0.05, 0.06), Arm(0.054, 0.001), 1e-3, *[Measured([], T, [])] * 2)
     doubted = {axis: Doubt(arm, off=1.5e-3, lag=0.08) for axis in config.arm.axes}
 
@@ -267,7 +267,7 @@ def test_an_arm_that_takes_the_place_of_another_is_kept() -> None:
     simulated = pf.simulate(scenario("panel-vision", 0.25, 0.02), 2)
     config, kinds = simulated.config, ("noise", "delay", "plant")
     first = quietly(lambda: run_stage([simulated.run], config, Plan(kinds, []))).best.config
-    held = with_plain_arm(config, "tangential", Arm(0.031, 0.042))
+    held = set_plain_arm(config, "tangential", Arm(0.031, 0.042))
     again = [Plan(kinds, ["axes.tangential"])]
     second = Pipeline([simulated.run], held, again, lambda _, __: None)
     quietly(second.fit)

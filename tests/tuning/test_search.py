@@ -13,7 +13,7 @@ from pumafuse.filter.response import response
 from pumafuse.tuning.arms import Arm
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise_with_gates, point
-from pumafuse.tuning.parameters import Parameter, changed, moved, with_arm
+from pumafuse.tuning.parameters import Parameter, changed, moved, set_arm
 from tuning_runs import (
     fit_stage,
     outage,
@@ -98,7 +98,7 @@ def test_a_wrong_delay_and_a_wrong_lag_change_nothing() -> None:
         config = replaced(sim.config, arm=replaced(sim.config.arm, delay=delay * sim.config.arm.delay))
         for axis, model in config.arm.axes.items():
             arm = Arm.of(model, config.arm.delay)
-            config = with_arm(config, axis, arm._replace(lag=lag * arm.lag))
+            config = set_arm(config, axis, arm._replace(lag=lag * arm.lag))
         found.append(fit_stage(sim.run, config, ("noise", "delay", "plant")).best.config)
     for other in found[1:]:
         assert other.arm.delay == pytest.approx(found[0].arm.delay, abs=1e-6)

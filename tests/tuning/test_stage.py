@@ -12,7 +12,7 @@ from pumafuse.tuning.intervals import ConfidenceInterval
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import point
 from pumafuse.tuning.parameters import parameters
-from pumafuse.tuning.stage import Stage, without_unseen_noise
+from pumafuse.tuning.stage import Stage, drop_unseen_noise
 from tuning_runs import (
     fit_stage,
     intervals_of,
@@ -31,7 +31,7 @@ AXES = ("tangential", "vertical")
 
 def numbers(stage: Stage) -> dict[str, float]:
     """The fitted values by key, in its unit."""
-    return {one.key: one.get(stage.best.config) / one.unit for one in stage.free}
+    return {one.key: one.number(stage.best.config) / one.unit for one in stage.free}
 
 
 @pytest.mark.parametrize(("seen_after", "lasts"), [(0.019, False), (0.0004, True)])
@@ -51,7 +51,7 @@ def test_noise_that_no_measurement_sees_is_none(seen_after: float, lasts: bool) 
     config = pf.FusionConfig(arm=arm, process=process, sensors={"encoder": pf.Sensor(sd=1e-5)})
     likelihood = Likelihood([run], config)
     free = parameters(config, config, likelihood.sensors, ["noise"])
-    best = without_unseen_noise(likelihood, point(likelihood, config, free), free)
+    best = drop_unseen_noise(likelihood, point(likelihood, config, free), free)
     assert (best.config.process["elbow"].maneuver_noise > 0.0) is lasts
     highest = pf.fuse(run, best.config)["elbow"].position_sd[200:].max()
     assert lasts or highest < 1e-3
@@ -240,6 +240,6 @@ def test_what_is_fixed_stays_to_the_last_bit_and_the_rest_moves() -> None:
     assert {one.drift for one in best.process.values()} == {1.234e-4}
     assert best.arm.axes["vertical"].plant == config.arm.axes["vertical"].plant
     for one in found.free:
-        assert one.get(best) != one.get(config), one.key
+        assert one.number(best) != one.number(config), one.key
     assert "axes.tangential.damping" in numbers(found)
     assert any(one.fit == "delay" for one in found.free)

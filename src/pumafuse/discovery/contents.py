@@ -307,8 +307,8 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
             signals.append(signal_or_why)
         elif signal_or_why:
             left_out[name] = signal_or_why
-    inches, points = names.with_inches(paths), _points(paths)
-    signals = [_placed(signal, told) for signal in _without_quaternions(signals, left_out)]
+    inches, points = names.inches_in(paths), _points(paths)
+    signals = [_placed(signal, told) for signal in _drop_quaternions(signals, left_out)]
     signals = [_among_others(signal, inches, points) for signal in signals]
     called = [signal.column for signal in signals if not _is_nameless(signal.column)]
     if signals and (why := names.no_position_by_place(source.stem, called)):
@@ -336,7 +336,7 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
         source,
         rows=table.rows,
         clock=clock,
-        signals=_with_units([signal for signal in signals if signal.column not in used]),
+        signals=_set_units([signal for signal in signals if signal.column not in used]),
         left_out={path: why for path, why in left_out.items() if path not in accounted},
         notes=(*why_none, *(() if clock is None else clock.notes), *source.notes, *table.notes, *notes),
         attitudes=tuple(attitude for attitude in attitudes if attitude.role_words in beside),
@@ -407,7 +407,7 @@ def _likeliest(columns: Sequence[str]) -> list[str]:
     return list(columns) if len(columns) <= _MOST_READ else names.likeliest_first(columns)[:_MOST_READ]
 
 
-def _without_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
+def _drop_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
     """Columns that are no quaternion, which are four of one list, or numbered, of length 1 in each row."""
     lists = dict[str, list[Signal]]()
     for signal in signals:
@@ -519,7 +519,7 @@ def _signal(
     return Signal(path, axis, unit or of_type, basis, values, where=where)
 
 
-def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
+def _set_units(signals: list[Signal]) -> tuple[Signal, ...]:
     """Signals without a unit get the likeliest one for their own range; a source's sensors may tell a better one."""
     in_units = list[Signal]()
     for signal in signals:

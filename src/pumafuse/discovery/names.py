@@ -302,7 +302,7 @@ def other_unit_of(column: str) -> str:
     return match[1] if match else ""
 
 
-def with_inches(columns: Iterable[str]) -> dict[str, str]:
+def inches_in(columns: Iterable[str]) -> dict[str, str]:
     """Columns of which ``in`` at the end is a unit, under names that say so: ``x_cmd_in``, and ``x_in`` beside that.
 
     Alone, or beside ``x_out``, this may be an input.

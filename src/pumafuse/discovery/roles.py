@@ -225,7 +225,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     no_measurement = "what the controller itself reports: no measurement of where the tool is"
     left_out += [(report, no_measurement) for report in reports]
     sensors = [sensor for sensor in sensors if sensor not in reports]
-    return _with_units(Roles(command, sensors, references[0] if references else None, left_out))
+    return _set_units(Roles(command, sensors, references[0] if references else None, left_out))
 
 
 def told_as_speeds(roles: Roles) -> str:
@@ -825,7 +825,7 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
     ]
 
 
-def _with_units(roles: Roles) -> Roles:
+def _set_units(roles: Roles) -> Roles:
     """Units that are guesses made to fit, one of a kind for each source, by the axes that somebody measures."""
     command, reference = _angles_by_name(roles), roles.reference
     others = [sensor for sensor in (reference, *reversed(roles.sensors)) if sensor is not None]

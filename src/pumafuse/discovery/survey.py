@@ -83,7 +83,7 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
         framed = own_frames(run)
         run = _along_axes(run, framed)
         run, related = _followed(run, relations(run))
-        without_early = _without_early(Survey(log, run, related, manifest=manifest, own_frames=framed))
+        without_early = _drop_early(Survey(log, run, related, manifest=manifest, own_frames=framed))
         return replace(without_early, interpolation=interpolation(without_early))
     parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
@@ -166,7 +166,7 @@ def early(survey: Survey, name: str) -> dict[str, float]:
     return {axis: -relation.lag for axis, relation in sure.items() if relation.lag < least}
 
 
-def _without_early(survey: Survey) -> Survey:
+def _drop_early(survey: Survey) -> Survey:
     """Without the axes of a sensor that move before their commands, where it surely follows those of others."""
     run, unused = survey.run, dict[tuple[str, str], str]()
     for name, source in run.sensors.items():

@@ -346,7 +346,7 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         keys["start"] = {axis: keys["start"][key] for key, axis in start.items()}
         kinds = {axis: kind_of(key) for key, axis in start.items()}
     if "pose" in keys:
-        keys = _with_pose(keys, where, path)
+        keys = _set_pose(keys, where, path)
     fields_of_kind = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes", "kinds"}
     named = [key for key in keys if key not in fields_of_kind]
     axes = {axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in named}
@@ -369,7 +369,7 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     return toml.struct({**keys, **more, "axes": axes}, kind, where, path)
 
 
-def _with_pose(keys: dict[str, Any], where: str, path: str) -> dict[str, Any]:
+def _set_pose(keys: dict[str, Any], where: str, path: str) -> dict[str, Any]:
     """The keys of a source with what its ``pose`` stands for: x, y and z in m, and an orientation."""
     pose = keys["pose"]
     if not isinstance(pose, str) or not pose:

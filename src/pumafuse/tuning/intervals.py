@@ -109,7 +109,7 @@ def confidence_intervals(
     def of(parameter: Parameter) -> ConfidenceInterval:
         low, high = (_end(views[parameter.axis], best, parameter, sign, drawn) for sign in (-1.0, 1.0))
         peak = parameter.value(parameter.at(best.config))
-        value, at = parameter.clipped(rounded(parameter.get(result))), parameter.at_bound(result)
+        value, at = parameter.clipped(rounded(parameter.number(result))), parameter.at_bound(result)
         log = parameter.log and not (
             parameter.vanishes and low.value <= max(parameter.bounds[0], _NEXT_TO_NONE * high.value)
         )
@@ -179,7 +179,7 @@ class _End(NamedTuple):
 def _end(view: _View, best: Point, parameter: Parameter, sign: float, drawn: bool) -> _End:
     """The lower (−1) or upper (+1) end of an interval."""
     if parameter.at_bound(best.config) == ("lower" if sign < 0.0 else "upper"):
-        return _End(parameter.get(best.config), True, True, [])
+        return _End(parameter.number(best.config), True, True, [])
     side = _Side(view, best, parameter, sign)
     end, profiled = side.end()
     value = parameter.clipped(side.value(end))
@@ -314,7 +314,7 @@ class _Side:
         return at + (distance - last) * slope
 
     def _along(self, distance: float, others: FloatArray) -> FusionConfig:
-        config = self._parameter.put(self._best.config, self._parameter.clipped(self.value(distance)))
+        config = self._parameter.set(self._best.config, self._parameter.clipped(self.value(distance)))
         return moved(config, self._others, np.clip(others, *self._range))
 
     def _drop(self, distance: float) -> float:

@@ -32,8 +32,8 @@ from .arm_search import GATE, ArmSearch, Chosen, Freedom, chosen_arms
 from .arms import BENDS, Arm
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
-from .parameters import changed, rounded, with_arm, with_noise, with_shared_delay
-from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
+from .parameters import changed, rounded, set_arm, set_noise, set_shared_delay
+from .plain import LONGEST, Doubt, doubts, lag_steps, set_plain_arm
 from .posterior import Model, Quantity
 
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
@@ -269,9 +269,9 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     sooner = {axis: by for survey in surveys for axis, by in early(survey, trusted).items()}
     if sooner and not {axis for survey in surveys for name, axis in survey.relations if name == trusted} - set(sooner):
         raise TuneError(f"{every[0].name}: {too_early(trusted, max(sooner.values()))}")
-    likelihood = Likelihood(every, _with_right_stamps(config, trusted), [trusted])
+    likelihood = Likelihood(every, _set_right_stamps(config, trusted), [trusted])
     moving = [axis for axis in excited_axes(likelihood, likelihood.config) if axis not in sooner]
-    searches = dict(zip(moving, in_threads(lambda axis: _search(likelihood, axis), moving), strict=True))
+    searches = dict(zip(moving, in_threads(lambda axis: _arm_search(likelihood, axis), moving), strict=True))
     lost = [axis for axis, search in searches.items() if search.plain is None]
     config, lags = _arm(likelihood.config, {axis: searches[axis] for axis in moving if axis not in lost}, trusted)
     if endless := [axis for axis, lag in lags.items() if lag.lag > LONGEST]:
@@ -280,11 +280,11 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     for axis, doubt in doubts({axis: searches[axis].plain for axis in lags}, config).items():
         lags[axis] = _doubted(lags[axis], doubt, doubt.sentence(config, axis))
         if doubt.refutes:
-            config = with_plain_arm(config, axis, doubt.plain.arm)
+            config = set_plain_arm(config, axis, doubt.plain.arm)
     looked_at = [each for _, each in guesses] if len(every) == 1 else []
     pairs = {name: one_guess.pair for each in looked_at for name, one_guess in each.items() if one_guess.pair}
     best, sensors, said = _sensors(every, config, trusted, pairs)
-    lags, clock = _with_courses(likelihood, config, lags, searches)
+    lags, clock = _set_courses(likelihood, config, lags, searches)
     still = [axis for axis in config.arm.axes if axis not in moving and axis not in sooner]
     notes = [*turned, *likelihood.notes, *said, *likelihood.overruns(config.arm)]
     notes += [f"{axis}: does not move, or {trusted} does not measure it" for axis in still]
@@ -388,7 +388,7 @@ def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> st
     return min(config.sensors, key=rank)
 
 
-def _with_right_stamps(config: FusionConfig, trusted: str) -> FusionConfig:
+def _set_right_stamps(config: FusionConfig, trusted: str) -> FusionConfig:
     """The configuration with the trusted sensor's stamps right, and the others' latencies as much shorter."""
     late = config.sensors[trusted].latency
     for name, sensor in config.sensors.items():
@@ -399,7 +399,7 @@ def _with_right_stamps(config: FusionConfig, trusted: str) -> FusionConfig:
 # ---- axes -----------------------------------------------------------------------------------------------------------
 
 
-def _search(likelihood: Likelihood, axis: str) -> ArmSearch:
+def _arm_search(likelihood: Likelihood, axis: str) -> ArmSearch:
     """The arm of one axis."""
     config, names = likelihood.config, likelihood.sensors[axis]
     least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
@@ -416,10 +416,10 @@ def _arm(
     (chosen, delay), lags = chosen_arms(searches, searches), dict[str, AxisLag]()
     for axis, choice in chosen.items():
         arm = Arm(*(rounded(number) for number in choice.arm))
-        config = with_noise(with_arm(config, axis, arm), axis, searches[axis].noise, [trusted])
+        config = set_noise(set_arm(config, axis, arm), axis, searches[axis].noise, [trusted])
         lags[axis] = _axis_lag(searches[axis], choice._replace(arm=arm), trusted, config.arm.axes[axis].kind)
     shares = [axis for axis, choice in chosen.items() if choice.shares]
-    return with_shared_delay(config, shares, rounded(delay)) if delay is not None else config, lags
+    return set_shared_delay(config, shares, rounded(delay)) if delay is not None else config, lags
 
 
 def _notes(lag: AxisLag, gains: tuple[float, float]) -> list[str]:
@@ -586,7 +586,7 @@ class _Trend(NamedTuple):
     wander: float  # 0 where it is no more than chance
 
 
-def _with_courses(
+def _set_courses(
     likelihood: Likelihood, config: FusionConfig, lags: Mapping[str, AxisLag], searches: Mapping[str, ArmSearch]
 ) -> tuple[dict[str, AxisLag], tuple[float | None, float | None]]:
     """The lags with their courses over the longest run, and drift and wandering of a clock that all axes share."""

@@ -17,7 +17,7 @@ from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
 from .arms import PROMISE
 from .likelihood import Derivatives, Likelihood, Point, in_threads
-from .parameters import Parameter, coordinates, moved, with_axis_of
+from .parameters import Parameter, coordinates, moved, set_axis_of
 from .steps import bounded_step
 
 _ITERATIONS = 60
@@ -152,7 +152,7 @@ def maximise_by_axis(
 
     best, axes = start, list(likelihood.sensors)
     for axis, config in zip(axes, in_threads(of, axes), strict=True):
-        best = with_axis_of(best, config, axis)
+        best = set_axis_of(best, config, axis)
     peak = point(likelihood, best, free)
     notify(peak)
     return peak

@@ -117,12 +117,12 @@ class Parameter:
             node = cast("dict[str, Any]", node).get(name) if isinstance(node, dict) else getattr(node, name, None)
         return node
 
-    def get(self, config: FusionConfig) -> float:
+    def number(self, config: FusionConfig) -> float:
         """The number in a configuration [SI]; the prior's mean where it is not configured."""
         value = self.configured(config)
         return self.value(cast("tuple[float, float]", self.prior)[0]) if value is None else value
 
-    def put(self, config: FusionConfig, value: float) -> FusionConfig:
+    def set(self, config: FusionConfig, value: float) -> FusionConfig:
         """The configuration with another number [SI]."""
         return changed(config, self.path, value)
 
@@ -136,7 +136,7 @@ class Parameter:
 
     def at(self, config: FusionConfig) -> float:
         """The coordinate of the number in a configuration."""
-        return self.coordinate(self.get(config))
+        return self.coordinate(self.number(config))
 
     def value(self, coordinate: float) -> float:
         """The number at a coordinate [SI]."""
@@ -144,7 +144,7 @@ class Parameter:
 
     def move(self, config: FusionConfig, coordinate: float) -> FusionConfig:
         """The configuration with this number at ``coordinate``."""
-        return self.put(config, self.value(coordinate))
+        return self.set(config, self.value(coordinate))
 
     def at_bound(self, config: FusionConfig) -> Literal["lower", "upper"] | None:
         """The bound at which the number lies in a configuration, if any."""
@@ -176,7 +176,7 @@ class Parameter:
             return replace(line, bounds=(quickest(config), line.bounds[1]))
         if self.log or "sag" in path:
             return line
-        middle, (low, high) = line.get(config), self.bounds
+        middle, (low, high) = line.number(config), self.bounds
         if self.fit == "delay":
             return replace(line, bounds=(0.0, max(longest_delay(config.arm.update_period), middle)))
         if self.fit == "scale" or path[-1] == "intercept":  # shares of it: a scale of 0 is none
@@ -287,7 +287,7 @@ def _belongs(parameter: Parameter, config: FusionConfig, axes: Iterable[str]) ->
     if parameter.fit == "delay":
         shares = [axis for axis in axes if config.arm.axes[axis].delay is None]
         return bool(shares) if parameter.axis is None else parameter.axis not in shares
-    return parameter.configured(config) is not None and (parameter.path[-1] != "play" or parameter.get(config) > 0.0)
+    return parameter.configured(config) is not None and (parameter.path[-1] != "play" or parameter.number(config) > 0.0)
 
 
 def kinds_of(fit: Iterable[str]) -> list[Fit]:
@@ -332,7 +332,7 @@ def is_fixed(key: str, fixed: Iterable[str]) -> bool:
     return False
 
 
-def with_drifts(config: FusionConfig, fixed: Sequence[str] = ()) -> FusionConfig:
+def set_drifts(config: FusionConfig, fixed: Sequence[str] = ()) -> FusionConfig:
     """The configuration with a drifting bias of every sensor, by default as large as its noise; none that is fixed."""
     for name, sensor in config.sensors.items():
         if any(sensor.bias_drift_sd_of(axis) for axis in config.arm.axes):
@@ -380,21 +380,21 @@ def rings(config: FusionConfig, axis: str) -> bool:
     return isinstance(plant, SecondOrder) and plant.damping < _RINGS
 
 
-def with_own_delays(config: FusionConfig, axes: Iterable[str]) -> FusionConfig:
+def set_own_delays(config: FusionConfig, axes: Iterable[str]) -> FusionConfig:
     """The configuration with a delay of its own for each of these axes, the same as before."""
     for axis in axes:
         config = changed(config, ("arm", "axes", axis, "delay"), config.arm.delay_of(axis))
     return config
 
 
-def with_shared_delay(config: FusionConfig, axes: Iterable[str], delay: float) -> FusionConfig:
+def set_shared_delay(config: FusionConfig, axes: Iterable[str], delay: float) -> FusionConfig:
     """The configuration with one delay [s] of the arm for these axes."""
     for axis in axes:
         config = changed(config, ("arm", "axes", axis, "delay"), None)
     return changed(config, ("arm", "delay"), delay)
 
 
-def with_disturbance(
+def set_disturbance(
     config: FusionConfig, axis: str, sd: float, time: float, kind: Literal["matern", "ou"] = "matern"
 ) -> FusionConfig:
     """The configuration with a disturbance of an axis of this sd [m] and time [s]."""
@@ -407,7 +407,7 @@ def adapting(config: FusionConfig, axis: str) -> FusionConfig:
     return changed(config, ("process", axis, "adaptation"), config.process[axis].adaptation or _ADAPTATION)
 
 
-def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> FusionConfig:
+def set_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> FusionConfig:
     """The configuration with all numbers of one axis from another: its model, its process noise, its sensors' noise."""
     config = changed(config, ("arm", "axes", axis), other.arm.axes[axis])
     for name, sensor in other.sensors.items():
@@ -416,7 +416,7 @@ def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> Fusion
     return changed(config, ("process", axis), other.process[axis])
 
 
-def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
+def set_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     """The configuration with another arm of an axis, and a delay of its own; a load that is given stays."""
     model, sag = arm.model, config.arm.axes[axis].sag or Sag()
     if arm.beyond or arm.below:
@@ -426,7 +426,7 @@ def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     return changed(config, ("arm", "axes", axis, "delay"), arm.delay)
 
 
-def with_noise(config: FusionConfig, axis: str, noise: NoiseModel, sensors: Sequence[str]) -> FusionConfig:
+def set_noise(config: FusionConfig, axis: str, noise: NoiseModel, sensors: Sequence[str]) -> FusionConfig:
     """The configuration with what an arm leaves of an axis as its noise and that of these sensors."""
     process = Process(
         input_noise=0.0,
@@ -441,7 +441,7 @@ def with_noise(config: FusionConfig, axis: str, noise: NoiseModel, sensors: Sequ
     return changed(config, ("process", axis), process)
 
 
-def with_gates(config: FusionConfig, gated: FusionConfig, wider: float | None = None) -> FusionConfig:
+def set_gates(config: FusionConfig, gated: FusionConfig, wider: float | None = None) -> FusionConfig:
     """The configuration with the gates of another; with ``wider`` so many times as wide, each component for itself."""
     sensors: dict[str, Sensor] = {}
     for name, sensor in config.sensors.items():

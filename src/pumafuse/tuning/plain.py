@@ -16,7 +16,7 @@ from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
 from ..units import MS
 from .arms import Arm, Limits, Measured, NoiseModel, longest_delay
-from .parameters import rounded, with_arm
+from .parameters import rounded, set_arm
 
 _DELAYS = 61  # dead times that are looked at
 LAGS = np.geomspace(1e-3, 2.0, 14)  # s, of a first-order plant
@@ -257,6 +257,6 @@ def lag_steps(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> lis
     return notes
 
 
-def with_plain_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
+def set_plain_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     """The configuration with an axis's arm by least squares: of first order, with a gain that stays."""
-    return with_arm(config, axis, Arm(*(rounded(number) for number in arm)))
+    return set_arm(config, axis, Arm(*(rounded(number) for number in arm)))

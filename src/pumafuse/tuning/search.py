@@ -29,12 +29,12 @@ from .parameters import (
     changed,
     quickest,
     rings,
-    with_arm,
-    with_axis_of,
-    with_disturbance,
-    with_gates,
-    with_noise,
-    with_shared_delay,
+    set_arm,
+    set_axis_of,
+    set_disturbance,
+    set_gates,
+    set_noise,
+    set_shared_delay,
 )
 from .posterior import GAINS, GainKind, Mixture, Model
 
@@ -79,21 +79,21 @@ class Search:
 
         With ``one_delay`` all axes whose delay is free share one whatever the measurements say.
         """
-        config = self._with_arms(config, one_delay)
+        config = self._set_arms(config, one_delay)
         for parameter in self.free(config):
             if parameter.fit == "latency":
                 config = self._nearest_latency(config, parameter)
         points = list[Point]()
         for start in self._noise_models(config):
             if points:  # an arm that is likeliest under one noise is near that under another
-                start = self._with_arm_of(start, points[0].config)
-            points.append(self._with_delay(self._maximum(start)))
+                start = self._set_arm_of(start, points[0].config)
+            points.append(self._set_delay(self._maximum(start)))
         likeliest = self._likeliest(points)
         smooth = self._smoothly_disturbed(likeliest)
         if self._likeliest([*points, *smooth]) != likeliest:
             points += smooth
-        best = self._without_needless(self._from_wider_gates(self._likeliest(points, explains=True)))
-        likeliest = with_gates(best, config)
+        best = self._drop_needless(self._from_wider_gates(self._likeliest(points, explains=True)))
+        likeliest = set_gates(best, config)
         peak = maximise_with_gates(self.likelihood, likeliest, self.free(likeliest), self.notify)
         self._adapt(peak)
         for axis, why in self.reasons.items():
@@ -103,13 +103,13 @@ class Search:
 
     # ---- arms and latencies -----------------------------------------------------------------------------------------
 
-    def _with_arms(self, config: FusionConfig, one_delay: bool) -> FusionConfig:
+    def _set_arms(self, config: FusionConfig, one_delay: bool) -> FusionConfig:
         """The configuration with the likeliest arm of each axis; one delay for those that share it."""
         searched = {axis: search for axis, search in self.arms.items() if search.freedom.free}
         delayed = [axis for axis, search in searched.items() if "delay" in search.freedom.free]
         choices, delay = chosen_arms(searched, delayed, one_delay)
         for axis, choice in choices.items():
-            config, why = with_arm(config, axis, choice.arm), self.reasons[axis]
+            config, why = set_arm(config, axis, choice.arm), self.reasons[axis]
             why += _why(searched[axis].freedom, choice.mixture, choice.model)
             if (bent := searched[axis].bent) is not None:
                 why += bent.sentences(msgspec.structs.replace(bent.arm.model, kind=config.arm.axes[axis].kind))
@@ -117,22 +117,22 @@ class Search:
                 gain = "" if choice.worth is None else f" (own {choice.worth:+.1f})"
                 why.append(f"delay: {'shared' if choice.shares else 'its own'}{gain}")
         shares = [axis for axis, choice in choices.items() if choice.shares]
-        return config if delay is None else with_shared_delay(config, shares, delay)
+        return config if delay is None else set_shared_delay(config, shares, delay)
 
     def _nearest_latency(self, config: FusionConfig, latency: Parameter) -> FusionConfig:
         """The configuration with the likeliest latency of a sensor on a grid."""
-        middle, steps = latency.get(config), round((LATENCIES[1] - LATENCIES[0]) / _STEP)
+        middle, steps = latency.number(config), round((LATENCIES[1] - LATENCIES[0]) / _STEP)
         shifts: list[float] = np.linspace(*LATENCIES, 1 + steps).tolist()
-        tried = [latency.put(config, latency.clipped(middle + shift)) for shift in shifts]
+        tried = [latency.set(config, latency.clipped(middle + shift)) for shift in shifts]
         points = (point(self.likelihood, at, self.free(at)) for at in tried)
         return max(points, key=lambda peak: peak.log_posterior).config
 
-    def _with_arm_of(self, config: FusionConfig, other: FusionConfig) -> FusionConfig:
+    def _set_arm_of(self, config: FusionConfig, other: FusionConfig) -> FusionConfig:
         """The configuration with the arm of another, and with its numbers that all axes share."""
         config = msgspec.structs.replace(config, arm=other.arm)
         for parameter in self.free(other):
             if parameter.axis is None:
-                config = parameter.put(config, parameter.get(other))
+                config = parameter.set(config, parameter.number(other))
         return config
 
     # ---- noise ------------------------------------------------------------------------------------------------------
@@ -146,10 +146,10 @@ class Search:
         for number in range(3):
             model = config
             for axis, search in self.arms.items():
-                model = with_noise(model, axis, search.noise_models[number], search.sensors)
-            models.append(self._with_free_noise(config, model))
+                model = set_noise(model, axis, search.noise_models[number], search.sensors)
+            models.append(self._set_free_noise(config, model))
         distinct = [model for number, model in enumerate(models) if model not in models[:number]]
-        return [self._with_quiet(model) for model in distinct]
+        return [self._set_quiet(model) for model in distinct]
 
     def _smoothly_disturbed(self, config: FusionConfig) -> list[Point]:
         """The maximum with a smooth disturbance of axes that have none, from all that the arm leaves.
@@ -159,38 +159,38 @@ class Search:
         calm = [axis for axis in self.may_be_disturbed(config) if config.process[axis].disturbance_sd == 0.0]
         model = config
         for axis in calm:
-            model = with_disturbance(model, axis, self.arms[axis].spread, _SLOW)
+            model = set_disturbance(model, axis, self.arms[axis].spread, _SLOW)
         return [self._maximum(model, axes=calm)] if calm else []
 
-    def _with_free_noise(self, config: FusionConfig, model: FusionConfig) -> FusionConfig:
+    def _set_free_noise(self, config: FusionConfig, model: FusionConfig) -> FusionConfig:
         """The configuration with the noises of a model that are free."""
         for axis in self.may_be_disturbed(config):
             new = model.process[axis]
-            config = with_disturbance(config, axis, new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
+            config = set_disturbance(config, axis, new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
         for parameter in self.free(config):
             if parameter.fit == "noise" and (parameter.sensor or parameter.path[-1] in _WALKING):
                 none = parameter.vanishes and parameter.at_bound(model) == "lower"
-                config = parameter.put(config, 0.0 if none else parameter.clipped(parameter.get(model)))
+                config = parameter.set(config, 0.0 if none else parameter.clipped(parameter.number(model)))
         return config
 
     def may_be_disturbed(self, config: FusionConfig) -> list[str]:
         """The axes of which a disturbance is free."""
         for axis in self.likelihood.sensors:
-            config = with_disturbance(config, axis, 1.0, 1.0)
+            config = set_disturbance(config, axis, 1.0, 1.0)
         return [str(parameter.axis) for parameter in self.free(config) if parameter.path[-1] == "disturbance_sd"]
 
-    def _with_quiet(self, config: FusionConfig) -> FusionConfig:
+    def _set_quiet(self, config: FusionConfig) -> FusionConfig:
         """The configuration with a little of each free noise that is none in it, from which it can grow."""
         for parameter in self.free(config):
             if (
                 parameter.fit == "noise"
                 and parameter.vanishes
                 and parameter.axis in self.arms
-                and parameter.get(config) <= 30 * parameter.bounds[0]
+                and parameter.number(config) <= 30 * parameter.bounds[0]
             ):
                 share = _QUIET * (10.0 if parameter.path[-1].startswith("maneuver") else 1.0)
                 little = max(share * self.arms[str(parameter.axis)].spread, 30.0 * parameter.bounds[0])
-                config = parameter.put(config, parameter.clipped(little))
+                config = parameter.set(config, parameter.clipped(little))
         return config
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
@@ -207,7 +207,7 @@ class Search:
 
         gated, at = any(sensor.gate > 0.0 for sensor in config.sensors.values()), config
         for wider in (times or _narrower(config), 1.0) if gated else (1.0,):
-            at = with_gates(at, config, wider)
+            at = set_gates(at, config, wider)
             if shared := [parameter for parameter in free(at) if parameter.axis is None]:
                 at = maximise(self.likelihood, at, shared, self.notify, tolerance=_ROUGHLY).config
             of_axes = [parameter for parameter in free(at) if parameter.axis is not None]
@@ -216,7 +216,7 @@ class Search:
             at = maximise(self.likelihood, at, free(at), self.notify, tolerance=_ROUGHLY).config  # trades with noise
         return point(self.likelihood, at, self._of_axes(at))
 
-    def _with_delay(self, peak: Point) -> Point:
+    def _set_delay(self, peak: Point) -> Point:
         """The higher of a maximum without a delay and of what the same lag with a third of it as delay leads to.
 
         Delay and plant are a ridge with several tops. Its end is one, and last digits decided whether a search left it.
@@ -228,7 +228,7 @@ class Search:
                 axes = self.likelihood.axes if parameter.axis is None else [parameter.axis]
                 plants = {axis: Arm.of(config.arm.axes[axis], 0.0) for axis in axes}
                 delay = min(arm.lag for arm in plants.values()) / 3.0
-                config = parameter.put(config, delay)
+                config = parameter.set(config, delay)
                 for axis, arm in plants.items():
                     if axis in shaped:
                         plant = arm._replace(lag=arm.lag - delay).model.plant
@@ -272,7 +272,7 @@ class Search:
                 self.reasons[axis].append(f"disturbance: {best} {why}")
         return _best_by_axis(self.likelihood, peaks, scores)
 
-    def _without_needless(self, config: FusionConfig) -> FusionConfig:
+    def _drop_needless(self, config: FusionConfig) -> FusionConfig:
         """The configuration without the noises that are not worth their penalty, one kind after the other.
 
         Beside a disturbance it is twice as high: real arms jerk, and any noise that is large at that moment gains
@@ -283,7 +283,7 @@ class Search:
             without = config
             for parameter in self.free(config):
                 if parameter.path[-1] == field and parameter.key not in needed:
-                    without = parameter.put(without, parameter.bounds[0])
+                    without = parameter.set(without, parameter.bounds[0])
             if without == config:
                 continue
             peaks = [point(self.likelihood, config, self.free(config))]
@@ -328,7 +328,7 @@ def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom:
     """What of an axis's arm the free parameters leave open."""
     arm = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
     bends = {"play": 1e-3, "max_speed": 1.0, "beyond": -0.1}
-    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if arm.damping else 1.0, 0.1, **bends))
+    other = set_arm(config, axis, Arm(0.0, 0.1, 0.0 if arm.damping else 1.0, 0.1, **bends))
     here, elsewhere = (
         {parameter.path[-1] for parameter in free(at) if parameter.axis == axis} for at in (config, other)
     )
@@ -401,5 +401,5 @@ def _best_by_axis(likelihood: Likelihood, peaks: Sequence[Point], scores: Sequen
     table = np.array(scores)
     best = peaks[int(np.argmax(table.sum(axis=1)))].config
     for axis, highest in zip(likelihood.axes, np.argmax(table, axis=0), strict=True):
-        best = with_axis_of(best, peaks[int(highest)].config, axis)
+        best = set_axis_of(best, peaks[int(highest)].config, axis)
     return best

@@ -31,11 +31,11 @@ from .parameters import (
     changed,
     is_fixed,
     parameters,
+    set_disturbance,
+    set_drifts,
+    set_gates,
+    set_own_delays,
     smallest_sd,
-    with_disturbance,
-    with_drifts,
-    with_gates,
-    with_own_delays,
 )
 from .search import FreeOf, Search, arm_searches
 
@@ -98,15 +98,15 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
         return for_few(likelihood, [parameter for parameter in every if _may_vary(parameter, at, plan, excited)])
 
     start, notes = likelihood.config, list[str]()
-    own_delays = with_own_delays(start, excited)
+    own_delays = set_own_delays(start, excited)
     if any(parameter.fit == "delay" for parameter in free(own_delays)):
         start = own_delays
     if "bias" in plan.fit:
-        drifting = with_drifts(start)
+        drifting = set_drifts(start)
         fixed += lone_drifts(likelihood.sensors, free(drifting), config)
-        start = with_drifts(start, [combination.fixed for combination in fixed])
+        start = set_drifts(start, [combination.fixed for combination in fixed])
     if "noise" in plan.fit:
-        start, notes = with_large_biases(likelihood, start, plan.fixed)
+        start, notes = set_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
     arms = arm_searches(likelihood, start, free, plan.sd_prior)
@@ -119,11 +119,11 @@ def run_stage(runs: Sequence[Run], config: FusionConfig, plan: Plan, notify: Not
     search = Search(likelihood, free, arms, notify)
     best, orders = search.best(start, plan.one_delay)
     if "noise" in plan.fit:
-        biased, more = with_small_biases(likelihood, best, plan.fixed)
+        biased, more = set_small_biases(likelihood, best, plan.fixed)
         if more:
             best, notes = maximise_with_gates(likelihood, biased, free(biased), notify), [*notes, *more]
     best = _identified(likelihood, best, free, config, fixed, notify)
-    best = without_unseen_noise(likelihood, best, free(best.config))
+    best = drop_unseen_noise(likelihood, best, free(best.config))
     used = {name for names in likelihood.sensors.values() for name in names}
     still = [axis for axis in likelihood.sensors if axis not in excited]
     notes += [f"{axis}: does not move; only its noise at rest was fitted" for axis in still]
@@ -148,7 +148,7 @@ def refitted(stage: Stage, runs: Sequence[Run], config: FusionConfig, plan: Plan
     What they are numbers of stays: orders of plants, kinds of gains and of disturbances.
     """
     part = likelihood_of(runs, config, plan, until)
-    return maximise_with_gates(part, with_gates(config, part.config), stage.free).config
+    return maximise_with_gates(part, set_gates(config, part.config), stage.free).config
 
 
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:
@@ -209,22 +209,22 @@ def _identified(
     return best
 
 
-def without_unseen_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> Point:
+def drop_unseen_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> Point:
     """The point without the noise of plants that no measurement sees.
 
     A quick plant has forgotten by the next measurement what shook it at a command. So any such noise is as likely, and
     error bars in between have no bound.
     """
     for field in ("input_noise", "maneuver_noise"):
-        noises = [noise for noise in free if noise.path[-1] == field and noise.get(best.config) > noise.bounds[0]]
+        noises = [noise for noise in free if noise.path[-1] == field and noise.number(best.config) > noise.bounds[0]]
         none = best.config
         for noise in noises:
-            none = noise.put(none, 0.0)
+            none = noise.set(none, 0.0)
         lost = best.posteriors - point(likelihood, none, free).posteriors
         unseen = [noise for noise in noises if lost[likelihood.axes.index(str(noise.axis))] < _UNSEEN]
         without = best.config
         for noise in unseen:
-            without = noise.put(without, 0.0)
+            without = noise.set(without, 0.0)
         best = point(likelihood, without, free) if unseen else best
     return best
 
@@ -245,7 +245,7 @@ def hidden_disturbances(
         low, high = np.log(_WIDTHS) + np.log(misfit[axis])
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            disturbed = with_disturbance(best.config, axis, float(np.exp(middle)), Process().disturbance_time, "ou")
+            disturbed = set_disturbance(best.config, axis, float(np.exp(middle)), Process().disturbance_time, "ou")
             falls = best.axes[number] - alone.evaluate(disturbed).axes[number] > 1.0
             low, high = (low, middle) if falls else (middle, high)
         hidden[axis] = float(np.exp(low))
@@ -255,7 +255,7 @@ def hidden_disturbances(
 # ---- biases ---------------------------------------------------------------------------------------------------------
 
 
-def with_large_biases(
+def set_large_biases(
     likelihood: Likelihood, config: FusionConfig, fixed: Sequence[str]
 ) -> tuple[FusionConfig, list[str]]:
     """With a bias for each sensor that is so far off that nothing could be fitted to it, and a note for each."""
@@ -270,7 +270,7 @@ def with_large_biases(
     notes: list[str] = []
     for (name, kind), gap in gaps.items():
         if _may_be_biased(config, name, kind, fixed):
-            config, screen = _with_bias(config, name, kind, _ROOM * gap), SCREEN[kind]
+            config, screen = _set_bias(config, name, kind, _ROOM * gap), SCREEN[kind]
             notes.append(
                 f"sensor '{name}' is off by a constant of up to {gap * screen.scale:.4g} {screen.unit}: it was given a"
                 " bias to estimate"
@@ -278,7 +278,7 @@ def with_large_biases(
     return config, notes
 
 
-def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str]) -> tuple[FusionConfig, list[str]]:
+def set_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str]) -> tuple[FusionConfig, list[str]]:
     """With a bias for each sensor that contradicts a more accurate one by a constant, and a note for each."""
     config, notes = best.config, list[str]()
     used = {name for names in likelihood.sensors.values() for name in names}
@@ -288,7 +288,7 @@ def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str])
             if not _may_be_biased(config, name, kind, fixed):
                 continue
             before = likelihood.evaluate(config).log_likelihood
-            biased = [_with_bias(config, name, kind, width) for width in _BIAS_WIDTHS]
+            biased = [_set_bias(config, name, kind, width) for width in _BIAS_WIDTHS]
             gains = [likelihood.evaluate(biased_config).log_likelihood - before for biased_config in biased]
             best_width = int(np.argmax(gains))
             if gains[best_width] > _BIAS_GAIN:
@@ -308,7 +308,7 @@ def _may_be_biased(config: FusionConfig, name: str, kind: Kind, fixed: Sequence[
     return not biased and not is_fixed(f"sensors.{name}.{of_kind('bias_sd_mm', kind)}", fixed)
 
 
-def _with_bias(config: FusionConfig, name: str, kind: Kind, width: float) -> FusionConfig:
+def _set_bias(config: FusionConfig, name: str, kind: Kind, width: float) -> FusionConfig:
     """The configuration with a bias of this width [m or rad], to one digit, of a sensor on the axes of a kind."""
     new = float(f"{width:.0e}")
     if len(config.arm.kinds) > 1:

@@ -196,7 +196,7 @@ def fitted(
     parameter: Parameter, before: FusionConfig, after: FusionConfig, interval: ConfidenceInterval | None
 ) -> Fitted:
     """A parameter in the unit of its key; without its interval where none was computed."""
-    earlier, value = parameter.configured(before), parameter.get(after)
+    earlier, value = parameter.configured(before), parameter.number(after)
     ends: tuple[float | None, float | None] = (None, None)
     if interval is not None:
         low, high = interval.ci95

@@ -33,10 +33,10 @@ from .parameters import (
     kinds_of,
     parameters,
     rounded,
-    with_disturbance,
-    with_gates,
+    set_disturbance,
+    set_gates,
 )
-from .plain import LONGEST, Doubt, doubts, lag_steps, with_plain_arm
+from .plain import LONGEST, Doubt, doubts, lag_steps, set_plain_arm
 from .stage import Plan, Stage, likelihood_of, refitted, run_stage
 from .summary import (
     AxisLikelihood,
@@ -168,7 +168,7 @@ def tune(
         if refuted := [axis for axis, doubt in doubted_axes.items() if doubt.refutes]:
             held, start = replace(plan, fixed=[*fixed, *(f"axes.{axis}" for axis in refuted)]), config
             for axis in refuted:
-                start = with_plain_arm(start, axis, doubted_axes[axis].plain.arm)
+                start = set_plain_arm(start, axis, doubted_axes[axis].plain.arm)
             pipeline = Pipeline(runs, start, plans(start, held, trust), progress)
             pipeline.fit()
         if validate is not None:
@@ -203,7 +203,7 @@ def tune(
         for name in ("seen", "unseen"):
             sd = rounded(getattr(sds, name)) if sds else None
             result = changed(result, ("arm", "axes", axis, f"{name}_lag_sd"), sd)
-    tuned = _with_provenance(result, free, by_key, {} if interrupted else lags, names)
+    tuned = _set_provenance(result, free, by_key, {} if interrupted else lags, names)
     doubted += _unseen_notes(searched, lag_sds, result)
     doubted += lag_steps({axis: search.plain for axis, search in arms.items()}, tuned)
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
@@ -333,7 +333,7 @@ class Pipeline:
     def _is_beaten(self, axis: str, doubt: Doubt, config: FusionConfig) -> bool:
         """Whether the arm of least squares predicts the next measurement better, the noise being as it is."""
         likelihood = self.whole.of_axis(axis)
-        instead = with_plain_arm(config, axis, doubt.plain.arm)
+        instead = set_plain_arm(config, axis, doubt.plain.arm)
         return likelihood.innovation(instead) < _BEATEN * likelihood.innovation(config)
 
     def keep_the_better(self) -> None:
@@ -349,7 +349,7 @@ class Pipeline:
 
     def _for_use(self, config: FusionConfig) -> FusionConfig:
         for axis, sd in (pair for stage in self.stages for pair in stage.hidden.items()):
-            config = with_disturbance(config, axis, rounded(sd), Process().disturbance_time, "ou")
+            config = set_disturbance(config, axis, rounded(sd), Process().disturbance_time, "ou")
         for axis in (axis for stage in self.stages for axis in stage.adapts):
             config = adapting(config, axis)
         return config
@@ -369,18 +369,18 @@ class Pipeline:
 
     def _written(self, config: FusionConfig, number: Callable[[float], float]) -> FusionConfig:
         """A configuration with the numbers as they are to be written."""
-        best = with_gates(config, self.config)
+        best = set_gates(config, self.config)
         for parameter in (
             parameter for stage in self.stages for parameter in stage.free if parameter.configured(best) is not None
         ):
             none = parameter.vanishes and parameter.at_bound(best) == "lower"
-            best = parameter.put(best, 0.0 if none else parameter.clipped(number(parameter.get(best))))
+            best = parameter.set(best, 0.0 if none else parameter.clipped(number(parameter.number(best))))
         return best
 
 
 def _evaluated(likelihood: Likelihood, config: FusionConfig) -> Point:
     """The log-likelihood of a configuration under the gates that the likelihood was made with."""
-    return likelihood.evaluate(with_gates(config, likelihood.config))
+    return likelihood.evaluate(set_gates(config, likelihood.config))
 
 
 def _same(run: Run, other: Run) -> bool:
@@ -420,7 +420,7 @@ def _likelihoods(likelihood: Likelihood, before: FusionConfig, after: FusionConf
     return {axis: AxisLikelihood(components=n, before=value, after=two) for axis, n, value, two in numbers if n}
 
 
-def _with_provenance(
+def _set_provenance(
     config: FusionConfig,
     free: Sequence[Parameter],
     intervals: Mapping[str, ConfidenceInterval],
