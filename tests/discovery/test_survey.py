@@ -1764,7 +1764,9 @@ def test_an_empty_array_beside_others_is_left_out(tmp_path: Path) -> None:
     np.savez(tmp_path / "arm.npz", time=t, target=u, actual=z)
     np.save(tmp_path / "attitude.npy", np.zeros(0))
     parts = parts_of(tmp_path)
-    assert [note for one in parts for note in one.notes] == ["no table in it: nothing has rows of numbers"]
+    assert [note for one in parts for note in one.notes] == [
+        "no table in it: nothing has rows of numbers; save an array, or a list of records"
+    ]
     assert {one.file.name for one in parts if one.signals} == {"arm.npz"}
     with pytest.raises(RunError, match="no table in it"):
         parts_of(tmp_path / "attitude.npy")

@@ -164,7 +164,7 @@ def test_what_cannot_be_read_says_how_to_convert_it(tmp_path: Path, monkeypatch:
     assert "no table in it" in refusal("empty.json")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "run.npy").write_bytes(b"")
-    assert "run.npy (the file is empty)" in refusal("empty")
+    assert "run.npy (the file is empty; record or copy it again)" in refusal("empty")
     (tmp_path / "old.xls").write_bytes(b"")
     assert "save it as .xlsx" in refusal("old.xls")
     assert "has: command_t" in one_line(RunError, lambda: tables.read(tmp_path / "log.npz"))

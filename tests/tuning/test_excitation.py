@@ -28,8 +28,8 @@ def refused(runs: Sequence[pf.Run], **more: object) -> str:
 def test_no_run_and_no_measurement() -> None:
     """No run, or no measurement: none of a configured sensor, only gaps, all before the first command."""
     run, camera = outage(1).run, outage(1).run.sensors["vision"]
-    assert refused([]) == "no run to fit on"
-    nothing = "no measurement of a configured sensor lies within the runs: nothing to fit to"
+    assert refused([]) == "no run to fit on; give one at least"
+    nothing = "no measurement of a configured sensor lies within the runs: are names and clocks the same?"
     gaps = replace(camera, values={axis: np.full(len(value), np.nan) for axis, value in camera.values.items()})
     for sensors in ({}, {"eye": camera}, {"vision": gaps}, {"vision": delayed(-3600.0)(camera)}):
         assert refused([replace(run, sensors=sensors)]) == nothing
@@ -39,14 +39,17 @@ def test_a_run_given_twice_and_nothing_free() -> None:
     """Measurements must not count twice; fixing everything leaves nothing to fit."""
     run = outage(1).run
     assert refused([run, run]) == f"run '{run.name}' is given twice: its measurements would count twice; give it once"
-    assert refused([run], fit=["delay"], fix=["delay_ms"]) == "everything that could be fitted is fixed: nothing to fit"
+    assert (
+        refused([run], fit=["delay"], fix=["delay_ms"])
+        == "everything that could be fitted is fixed: nothing to fit; fix less"
+    )
 
 
 def test_too_few_measurements() -> None:
     """Fewer than 12 of an axis are refused, counted over all runs."""
     run, camera = outage(1).run, outage(1).run.sensors["vision"]
     few = replace(run, sensors={"vision": camera.rows(slice(0, 11))})
-    assert refused([few], validate=run) == "tangential: only 11 measurements; a fit needs at least 12"
+    assert refused([few], validate=run) == "tangential: only 11 measurements; record longer: a fit needs at least 12"
     assert len(fit_stage([few, few], outage(1).config).free) > 0
 
 

@@ -213,7 +213,7 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
 
 
 def _of_one_run(parts: Sequence[Part]) -> list[Part]:
-    """The parts of a log; of files or sheets of the same columns, or of trials, each a whole run, the first alone.
+    """The parts of a log, without further runs: of files or sheets with the same columns, and of trials, the first is kept.
 
     Tables of one file that share the stamps were written together, as of two arms: these are one run.
     """
@@ -262,15 +262,15 @@ def _files(log: Path) -> list[Path]:
     if (log / "meta" / "info.json").is_file():  # LeRobot: many files of many episodes
         inside = [path for path in inside if log / "data" in path.parents][:1]
     files = [path for path in inside if path.name.endswith(_TABLES + _TEXTS) or tables.is_recording(path)]
-    files = files or _gathered([path for path in inside if path.name.endswith(formats.ENDINGS)])
+    files = files or _arrays_joined([path for path in inside if path.name.endswith(formats.ENDINGS)])
     files = files or [path for path in inside if tables.holds_numbers(path)]
     if not files:
         raise RunError(f"{log}: no log in it that can be read; {_ACCEPTED}")
     return files
 
 
-def _gathered(files: Sequence[Path]) -> list[Path]:
-    """Files; for the arrays of a folder, of which one alone is a clock of others as long, the folder: a table."""
+def _arrays_joined(files: Sequence[Path]) -> list[Path]:
+    """Files, a folder of arrays as one table where just one of those that are as long runs like a clock."""
     kept = list(files)
     for folder in sorted({file.parent for file in files if file.suffix == formats.ARRAY}):
         with suppress(RunError):  # none of them is an array
@@ -350,7 +350,7 @@ def _points(paths: Iterable[str]) -> set[str]:
 
 
 def _among_others(signal: Signal, inches: Mapping[str, str], points: Container[str]) -> Signal:
-    """A column as the unit and the axis that others beside it tell."""
+    """A signal with the unit (inches) or the axis (of a point) that the names of columns beside it imply."""
     if signal.column in inches:
         return replace(signal, axis=names.axis_of(inches[signal.column], []), unit="inch", basis="name")
     element = _ELEMENT.fullmatch(signal.column)
@@ -370,7 +370,7 @@ def _is_nameless(column: str) -> bool:
 
 @np.errstate(over="ignore", invalid="ignore")  # of numbers that are none, nothing is a velocity
 def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
-    """Columns that add up to another by the clock, and to which: they are its velocity, and no positions."""
+    """The velocities among some columns, each with the position that it adds up to over time, by their names."""
     stamped = stamp != NO_STAMP
     steps = np.diff(stamp[stamped]) / 1e9
     rows = max(1, round(_OF_WAY / max(median(steps), 1e-6))) if len(steps) else 1
@@ -395,7 +395,7 @@ def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
 
 
 def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
-    """A column beside an orientation as the axis that it is by that."""
+    """A signal as x, y or z where an orientation beside it says which of them it is."""
     for attitude in attitudes:
         if axis := attitude.coordinates.get(signal.column):
             unit = {"unit": attitude.place_unit, "basis": "name"} if attitude.place_unit else {}
@@ -408,7 +408,7 @@ def _likeliest(columns: Sequence[str]) -> list[str]:
 
 
 def _drop_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> list[Signal]:
-    """Columns that are no quaternion, which are four of one list, or numbered, of length 1 in each row."""
+    """Signals without quaternions: four columns of one list, or four numbered ones, whose norm is 1 in each row."""
     lists = dict[str, list[Signal]]()
     for signal in signals:
         if (number := _NUMBER.search(signal.column)) is not None:
@@ -439,10 +439,10 @@ def _joints(table: Table, paths: Sequence[str]) -> dict[str, str]:
 
 
 def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
-    """Which rows are whose, where a column tells axes or sources of a table apart; else all, once.
+    """The rows of each axis or source, where a column tells which row is whose; else one choice, of all rows.
 
-    Such a column changes from row to row, or tells signals one below another. Of numbers it has to be called so:
-    ``id``. A ``status`` is none.
+    Such a column changes from row to row, or from one block of rows to the next. A column of numbers must be called
+    after what it tells apart (``id``, ``joint``); a ``status`` tells nothing apart.
     """
     for name, column in table.columns.items():
         whose = names.has_word(leaf(name), names.WHOSE)
@@ -487,7 +487,7 @@ def _called(column: str, where: Mapping[str, Any]) -> str:
 def _signal(
     table: Table, path: str, where: Mapping[str, Any], source: Part, labels: list[str], joint: str | None
 ) -> Signal | str:
-    """A column as positions, or why it is none; empty for text."""
+    """The signal in a column, or the reason why it holds no positions, empty for text."""
     try:
         values, _ = table.plain(path)
         values = values if (none := sentinel(values)) is None else without(values, none)
@@ -520,7 +520,7 @@ def _signal(
 
 
 def _set_units(signals: list[Signal]) -> tuple[Signal, ...]:
-    """Signals without a unit get the likeliest one for their own range; a source's sensors may tell a better one."""
+    """Signals with units: where no name says one, the likeliest for the range, which sensors may correct later."""
     in_units = list[Signal]()
     for signal in signals:
         if not signal.unit:
@@ -586,7 +586,7 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
 
 
 def _or_another(table: Table, clock: Clock, others: Iterable[Clock]) -> Clock:
-    """A clock, with a question where another one in the table tells another time; the other one if this one is even."""
+    """A clock with a question where another one tells another time; that other one if this one was only counted."""
     for other in others:
         spans = [_span(timed) for timed in (clock, other)]
         if max(spans) > _ALIKE_SPANS * min(spans) > 0.0:
@@ -605,9 +605,9 @@ def _span(clock: Clock) -> float:
 
 
 def _spread(table: Table, clock: Clock, others: Iterable[Clock], counts: Sequence[str]) -> Clock:
-    """A clock whose rows come in packets spread by what counts them, another one that stamps each, or with a question.
+    """A clock; where rows arrive in packets, another that stamps each row, or they are spread by a count, else a question.
 
-    The other one lasts as long, as that of a loop beside the stamps of a camera's frames.
+    The other clock lasts as long: that of a loop beside the stamps of a camera's frames.
     """
     if (sent := packets(clock.stamp)) is None or _axes_in_rows(table) != [{}]:
         return clock
@@ -625,7 +625,7 @@ def _spread(table: Table, clock: Clock, others: Iterable[Clock], counts: Sequenc
 
 
 def _numbered(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
-    """A clock with a question where its stamps are exactly what counts the rows over a rate: nobody measured them."""
+    """A clock with a question where its stamps are exactly a row count over a rate: they were not measured."""
     for name in counts if not (clock.time.counter or clock.doubt) else ():
         number, since = table.plain(name)[0], (clock.stamp - clock.stamp[0]) / 1e9
         number -= number[0]
@@ -718,7 +718,7 @@ def _clock_of(table: Table, name: str, stroke: float, span: float = 0.0) -> Cloc
 
 
 def _beside(part: Part, clock: Clock, parts: Iterable[Part]) -> Clock:
-    """A clock; where its unit is a guess in which no other table tells the same time, in one in which one does."""
+    """A clock in a unit in which it covers the time of another table, where its own unit is a guess and does not."""
     if not clock.basis.endswith(_GUESSED):
         return clock
     clocks = [(other.file, other.clock) for other in parts if other.clock]
@@ -757,7 +757,7 @@ def _runs(stamp: TimeArray) -> bool:
 
 
 def _nameless_clock(table: Table, stroke: float) -> Clock | None:
-    """The first column, which is called after no clock, if its numbers rise, but do not count rows."""
+    """The clock in the first column, which has no name, if its numbers rise and do not merely count rows."""
     first, *others = table.columns
     try:
         numbers = table.plain(first)[0]
@@ -773,7 +773,7 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
 
 
 def _rising(table: Table, stroke: float, counts: Container[str]) -> Clock | None:
-    """The one column but counts that goes on from row to row, whatever it is called; None of none or several."""
+    """The clock that is the only column to rise from row to row, counts apart; None where none or several do."""
     risers = _risers(table, _columns(table), below=_axes_in_rows(table) != [{}])
     rising = [name for name in risers if name not in counts]
     clock = _clock_of(table, rising[0], stroke) if len(rising) == 1 else None
@@ -787,9 +787,9 @@ def _columns(table: Table) -> Iterable[str]:
 
 
 def _risers(table: Table, columns: Iterable[str], *, below: bool = False) -> list[str]:
-    """Columns that go on from row to row, as clocks do; those alone that are called so, where there are any.
+    """The columns that rise from row to row as clocks do; if any of them has the name of a clock, only these.
 
-    With signals one ``below`` another they may begin anew.
+    With ``below`` a table may hold signals one below another, with a clock that begins anew for each.
     """
     risers = list[str]()
     for name in columns:
@@ -830,7 +830,7 @@ def _ticks(steps: FloatArray) -> bool:
 
 
 def _counted(table: Table, rate: float) -> Clock:
-    """Frames that come at a rate, by a column that counts them, or else each row."""
+    """The clock of frames that come at a given rate [Hz], numbered by a column that counts them or else by rows."""
     basis = f"at {rate:g} Hz, as given"
     for name in table.columns:
         with suppress(RunError):
@@ -846,7 +846,7 @@ def without_clock(part: Part) -> str:
 
 
 def unused(parts: Iterable[Part]) -> list[str]:
-    """What of a log is taken for nothing, each with the reason: first what has no clock, then columns, then files."""
+    """What a log holds and pumafuse does not use, with reasons: tables without a clock, then columns, then files."""
     parts = list(parts)
     reasons = [(part.label, without_clock(part)) for part in parts if part.signals and part.clock is None]
     reasons += [reason for part in parts for reason in part.left_out.items()]
@@ -895,7 +895,7 @@ def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str
 
 
 def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
-    """A table; of several runs in it the first, of a sensor's rows those that it calls valid; of tf each frame."""
+    """The parts of a table: of several runs the first, of a sensor its valid rows, of transforms each frame apart."""
     read = partial(tables.read, path, growing=True, topic=topic)
     px4 = path.suffix == ".ulg"
     if px4 and (not names.has_word(topic, _PX4_TOPICS) or names.has_word(topic, _PX4_OTHERS)):
@@ -922,9 +922,10 @@ def _tabled(path: Path, rate: float, topic: str = "") -> Iterator[Part]:
 
 
 def _by_frame(table: Table, source: Part) -> Iterator[tuple[Part, Table]]:
-    """Of transforms of many frames those that move as seen from a base, of tools where there are any, each as a part.
+    """A table of transforms as one part for each frame that moves as seen from a base; any other table as it is.
 
-    Joints turn links: these keep their place in the frame of the link before. Any other table as it is.
+    If frames of tools are among them, only these count. A joint turns its link, whose origin stays where it was in the
+    frame of the link before.
     """
     child = next((name for name in table.columns if name.endswith(_CHILD)), "")
     parent, translation = child.replace(_CHILD, "header.frame_id"), child.replace(_CHILD, "transform.translation.")
@@ -973,7 +974,7 @@ def _first_run(table: Table) -> dict[str, Any]:
 
 
 class _Info(msgspec.Struct):
-    """Of a data set of LeRobot its columns, each with ``names``: a list, or a table with a list in it."""
+    """The columns of a LeRobot data set, each with ``names``: a list, or a table with a list in it."""
 
     features: dict[str, dict[str, Any]]
 
@@ -1038,7 +1039,7 @@ def _wanted(topic: Topic) -> list[str]:
 
 
 def no_commands(parts: Iterable[Part]) -> str:
-    """What may be the commands and is none, and what to do, in words; empty without any."""
+    """Sentences on what looks like commands and cannot be used, with advice; empty where nothing does."""
     parts = list(parts)
     clockless = any(part.signals and part.clock is None for part in parts)
     advice = ["if rows come at a constant rate, give it to init as --rate HZ"] if clockless else list[str]()

@@ -51,7 +51,7 @@ def sketch(name: str, undecided: UndecidedError, folder: Path) -> str:
 
 
 def _either(parts: Sequence[Part], folder: Path) -> list[str]:
-    """Columns of which any may be the commands, or measure."""
+    """Lines for all columns, as any of them may hold the commands or the measurements."""
     lines = list[str]()
     clocked = [part for part in parts if part.clock is not None]
     streams = [stream for part in clocked for stream in streams_of(part) or [Stream(part.stem, None, "", part, {})]]

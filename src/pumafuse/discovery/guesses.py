@@ -88,7 +88,9 @@ def guess(
     run = survey.run
     period = period_of(run.command)
     if math.isnan(period):
-        raise RunError(f"{survey.log}: fewer than two commands with stamps of their own")
+        raise RunError(
+            f"{survey.log}: fewer than two commands with stamps of their own; give a log in which several are"
+        )
     relations = {  # the axes of a sensor in a frame of its own are others
         (name, axis): relation
         for (name, axis), relation in survey.relations.items()
@@ -215,7 +217,7 @@ def _gate(stamp: TimeArray, value: FloatArray) -> float:
 
 
 def _bias(survey: Survey, axis: str, following: Following, scale: float, others: Mapping[str, Following]) -> float:
-    """The prior sd of a sensor's bias: where its zero is far from the commands', or from a better sensor's; 0: none."""
+    """The prior sd of a sensor's bias; 0 where its zero is near that of the commands and of better sensors."""
     value = survey.run.command.values[axis]
     travel = float(np.nanmax(value) - np.nanmin(value))
     noise = _DIFFERENT * (following.scatter + following.misfit)

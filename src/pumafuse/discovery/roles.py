@@ -168,10 +168,10 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             raise RunError(f"{log}: {why}; {advice}")
         raise UndecidedError(log, f"{why}; {advice}", parts)
     named = dict[str, Stream]()
-    for apart_stream in _apart(streams[0]) if len(streams) == 1 else streams:
-        name = _free(apart_stream.name, named.keys())
+    for apart_stream in _apart_by_name(streams[0]) if len(streams) == 1 else streams:
+        name = _unused_name(apart_stream.name, named.keys())
         named[name] = replace(apart_stream, name=name)
-    streams = _looked_at(list(named.values()))
+    streams = _set_seen_targets(list(named.values()))
     if (chosen := _command(streams)) is None:
         raise UndecidedError(log, f"which numbers are the commands? {_none_leads(parts, streams)}", parts)
     command, why = chosen
@@ -213,7 +213,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         alike = f"{command.name}, {', '.join(unnamed)} move alike, as points of one body do"
         raise UndecidedError(log, f"which numbers are the commands? None is called so, and {alike}; {_SAY}", parts)
     may_measure = command.role != "reference"  # beside commands; another set point measures nothing
-    command, *kept = _in_order([command, *_once(_raw(kept, left_out), left_out)], left_out)
+    command, *kept = _in_order([command, *_drop_copies(_drop_filtered(kept, left_out), left_out)], left_out)
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
     sensors = [stream for stream in kept if stream.role == "sensor"]
     references = [stream for stream in kept if stream.role == "reference"]
@@ -275,8 +275,8 @@ def _none_leads(parts: Sequence[Part], streams: Sequence[Stream]) -> str:
     return f"{called}, and none runs ahead of others ({listed}); {no_commands(parts)}{_SAY}"
 
 
-def _raw(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
-    """Sources without the axes of filtered sensors of which the raw one is there, too.
+def _drop_filtered(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
+    """Sources without the axes of filtered sensors whose raw measurements are in the log, too.
 
     What moves as far as another that alone is called raw was computed from it.
     """
@@ -309,8 +309,8 @@ def _as_wide(stream: Stream, other: Stream) -> bool:
     return all(1.0 / ABOUT_ONE < width / max(raw, 1e-12) < ABOUT_ONE for width, raw in widths)
 
 
-def _once(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
-    """Sources without sensors that say again what another one of their table says: that is no second measurement."""
+def _drop_copies(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
+    """Sources without sensors that repeat the numbers of another one in their table: they measure nothing anew."""
     kept = list[Stream]()
     for stream in streams:
         beside = [other for other in kept if other.part.label == stream.part.label]
@@ -424,12 +424,12 @@ def streams_of(part: Part) -> list[Stream]:
     groups: dict[_Group, list[Signal]] = {}
     beside = {names.last(column) for column in (*(signal.column for signal in part.signals), *part.left_out)}
     for signal in part.signals:
-        called = _joined(names.role_words(signal.name))
+        called = _as_name(names.role_words(signal.name))
         listed, copy, measured = names.family(signal.column, beside)
         if copy or measured:
             signal = replace(signal, axis=names.axis_of(measured or signal.column.removesuffix(copy), []))
         groups.setdefault((called, listed, copy, bool(measured)), []).append(signal)
-    groups = {key: some for group in groups.items() for key, some in _seen_twice(*group)}
+    groups = {key: some for group in groups.items() for key, some in _repeated_apart(*group)}
     roles = Counter(key for key, *_ in groups)
     told = {signal.axis for some in groups.values() for signal in some if names.column_role(signal.name) == "command"}
     of_file, of_columns = names.role_of(part.stem), {names.column_role(group[0].name) for group in groups.values()}
@@ -451,19 +451,19 @@ def streams_of(part: Part) -> list[Stream]:
         name = name if len(groups) > 1 and name else prefix
         axes, attitude = _axes(signals), None
         if any(axis in CARTESIAN for axis in axes):
-            attitude = next((attitude for attitude in part.attitudes if key == _joined(attitude.role_words)), None)
+            attitude = next((attitude for attitude in part.attitudes if key == _as_name(attitude.role_words)), None)
         streams.append(Stream(name or "log", role, why, part, axes, attitude))  # pyright: ignore[reportArgumentType]
     return streams
 
 
 def _prefix(signals: Sequence[Signal], told: Set[str], taken: Set[str]) -> str:
-    """What columns beside commands are called: by what all of them have before axes that are told, else measured."""
-    prefixes = {signal.axis.removesuffix(axis) for signal in signals for axis in told if _ends(signal.axis, axis)}
-    return names.plain(prefixes.pop()) if len(prefixes) == 1 and prefixes != {""} else _free("measured", taken)
+    """The name of columns beside commands: what all of them have in front of commanded axes, else ``measured``."""
+    prefixes = {signal.axis.removesuffix(axis) for signal in signals for axis in told if _ends_with(signal.axis, axis)}
+    return names.plain(prefixes.pop()) if len(prefixes) == 1 and prefixes != {""} else _unused_name("measured", taken)
 
 
-def _seen_twice(key: _Group, signals: Sequence[Signal]) -> Iterator[tuple[_Group, list[Signal]]]:
-    """A group of columns, those apart that are axes of others under another word: ``x_poses`` beside ``x``."""
+def _repeated_apart(key: _Group, signals: Sequence[Signal]) -> Iterator[tuple[_Group, list[Signal]]]:
+    """A group of columns, and apart from it those that repeat its axes under another word: ``x_poses`` beside ``x``."""
     by_words = dict[tuple[str, ...], list[Signal]]()
     for signal in signals:
         silent = [word for word in names.words(leaf(signal.column)) if word not in names.words(signal.axis)]
@@ -477,21 +477,21 @@ def _seen_twice(key: _Group, signals: Sequence[Signal]) -> Iterator[tuple[_Group
     taken = {id(signal) for some in apart.values() for signal in some}
     yield key, [signal for signal in signals if id(signal) not in taken]
     for words, some in apart.items():
-        yield (key[0], _joined(words), *key[2:]), some
+        yield (key[0], _as_name(words), *key[2:]), some
 
 
-def _joined(words: Iterable[str]) -> str:
+def _as_name(words: Iterable[str]) -> str:
     """Words of roles as a name, each once."""
     return "_".join(dict.fromkeys(words))
 
 
 def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
-    """Columns by axis: parts of a sum together; others that would be called the same get a number."""
+    """Columns by axis: parts of a sum share their axis, and an axis whose name is taken gets a number."""
     by_axis: dict[str, list[Signal]] = {}
     for signal in signals:
         parts = {axis for axis, some in by_axis.items() if names.has_word(some[0].name, names.PARTS)}
         summed = parts if names.has_word(signal.name, names.PARTS) else set[str]()
-        by_axis.setdefault(_free(signal.axis, by_axis.keys() - summed), []).append(signal)
+        by_axis.setdefault(_unused_name(signal.axis, by_axis.keys() - summed), []).append(signal)
     return {
         axis: some
         for axis, some in by_axis.items()
@@ -499,8 +499,8 @@ def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
     }
 
 
-def _apart(stream: Stream) -> list[Stream]:
-    """The only stream of a log, taken apart where a word tells axes of two apart, and one of these runs ahead.
+def _apart_by_name(stream: Stream) -> list[Stream]:
+    """The only stream of a log, split by words in the names of its axes where one half then runs ahead of another.
 
     ``a_x`` and ``b_x``, ``q_d_0`` and ``q_0``, ``xd`` and ``x``; but words like x, y, z and numbers are axes.
     """
@@ -535,10 +535,10 @@ def _apart(stream: Stream) -> list[Stream]:
             every = sorted(set[tuple[str, ...]]().union(*shared.values()))
             ways.append([of(word, every), *(of(other, rests) for other, rests in shared.items())])
     best = max(ways, key=lambda way: _followers(way[0], way), default=[stream])
-    return best if len(best) > 1 and _followers(best[0], best)[0] else _led(stream)
+    return best if len(best) > 1 and _followers(best[0], best)[0] else _apart_by_motion(stream)
 
 
-def _led(stream: Stream) -> list[Stream]:
+def _apart_by_motion(stream: Stream) -> list[Stream]:
     """A stream of columns without names, taken apart where some follow others: as far, at the same level, later.
 
     Or at once, and noisier. Of two alone one may follow less closely, as no other could be taken for it. Where
@@ -599,8 +599,8 @@ def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream
     return rests != [()] or (len(stream.axes) == 2 and not any(map(names.is_turning, (word, other))))
 
 
-def _looked_at(streams: Sequence[Stream]) -> list[Stream]:
-    """Streams of which one that is called target, but moves after another that nothing names, is a sensor's."""
+def _set_seen_targets(streams: Sequence[Stream]) -> list[Stream]:
+    """Streams in which one called target is a sensor where it follows another stream that has no role by name."""
     looked_at = list[Stream]()
     for stream in streams:
         columns = [signal.column for signals in stream.axes.values() for signal in signals]
@@ -615,7 +615,7 @@ def _looked_at(streams: Sequence[Stream]) -> list[Stream]:
     return looked_at
 
 
-def _free(name: str, taken: Set[str]) -> str:
+def _unused_name(name: str, taken: Set[str]) -> str:
     """A name, with a number where it is taken: ``x``, ``x_2``."""
     numbered = (name if number == 1 else f"{name}_{number}" for number in count(1))
     return next(candidate for candidate in numbered if candidate not in taken)
@@ -676,8 +676,8 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not."""
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
-    command = _ranged(command, {*command.axes}) if stream.guessed else _fitted(command, stream)
-    relations = _relations(command, _fitted(stream, command))
+    command = _set_units_by_range(command, {*command.axes}) if stream.guessed else _set_units_by_travel(command, stream)
+    relations = _relations(command, _set_units_by_travel(stream, command))
     alike = [relation for relation in relations if relation.correlation >= SAME]
     behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
     gains, fewest = [relation.slope for relation in behind], len(relations) / 2
@@ -744,10 +744,10 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     """Axes of a stream by the names that the commands give them, by name or else by how they move; or why none is."""
     fits = {axis: signals for axis, signals in stream.axes.items() if axis in command.axes}
     fits = {axis: signals for axis, signals in fits.items() if _same_kind(command, axis, stream, axis)}
-    few, told = len(command.axes) * len(stream.axes) <= _MOST_PAIRS, _bare(command.axes)
+    few, told = len(command.axes) * len(stream.axes) <= _MOST_PAIRS, _without_shared_words(command.axes)
     others = [axis for axis in stream.axes if axis not in fits and axis not in command.axes]
     free = [axis for axis in command.axes if axis not in fits]
-    named = {(name, axis) for name, axis in product(others, free) if _ends(name, told[axis])}  # as p_RS_R_x is x
+    named = {(name, axis) for name, axis in product(others, free) if _ends_with(name, told[axis])}  # as p_RS_R_x is x
     # Of joints names tell enough; coordinates may be another frame's.
     few = few and not (_OF_POSE.isdisjoint(told.values()) and {axis for _, axis in named} == {*free})
     follows = dict[tuple[str, str], float]()
@@ -795,13 +795,13 @@ def _turned_point(
     return {} if speeds is None or speeds.correlation < SAME else point
 
 
-def _ends(axis: str, words: str) -> bool:
+def _ends_with(axis: str, words: str) -> bool:
     """Whether the name of an axis ends with some words."""
     return f"_{axis}".endswith(f"_{words}")
 
 
-def _bare(axes: Iterable[str]) -> dict[str, str]:
-    """Axes without the words that all begin with: ``left_arm_wrist`` and ``left_arm_elbow`` are wrist and elbow."""
+def _without_shared_words(axes: Iterable[str]) -> dict[str, str]:
+    """Axes without the words that all of them begin with: ``left_arm_wrist``, ``left_arm_elbow`` are wrist, elbow."""
     apart = {axis: axis.split("_") for axis in axes}
     places = zip(*(words[:-1] for words in apart.values()), strict=False)
     shared = sum(1 for _ in takewhile(lambda alike: len({*alike}) == 1, places))
@@ -815,7 +815,7 @@ def _same_kind(command: Stream, axis: str, stream: Stream, other: str) -> bool:
 
 
 def _renamed(streams: Sequence[Stream]) -> list[Stream]:
-    """Streams in which axes that the commands only number are called as the first other stream does."""
+    """Streams whose axes have the names that the first other stream gives them where the commands only number them."""
     command, *others = streams
     called = {axis: other.axes[axis][0].axis for other in reversed(others) for axis in other.axes}
     free = {axis: name for axis, name in called.items() if _NUMBERED.fullmatch(axis) and name not in command.axes}
@@ -826,16 +826,16 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
 
 
 def _set_units(roles: Roles) -> Roles:
-    """Units that are guesses made to fit, one of a kind for each source, by the axes that somebody measures."""
+    """Roles whose guessed units make commands and measurements move equally far, one unit a kind and source."""
     command, reference = _angles_by_name(roles), roles.reference
     others = [sensor for sensor in (reference, *reversed(roles.sensors)) if sensor is not None]
     sure = [other for other in others if not other.guessed]
     for sensor in sure:  # the first sensor has the last word
-        command = _fitted(command, sensor)
+        command = _set_units_by_travel(command, sensor)
     if not sure:
-        command = _ranged(command, {axis for other in others for axis in other.axes})
-    sensors = [_fitted(sensor, command) for sensor in roles.sensors]
-    reference = None if reference is None else _fitted(reference, command)
+        command = _set_units_by_range(command, {axis for other in others for axis in other.axes})
+    sensors = [_set_units_by_travel(sensor, command) for sensor in roles.sensors]
+    reference = None if reference is None else _set_units_by_travel(reference, command)
     return replace(roles, command=command, sensors=sensors, reference=reference)
 
 
@@ -846,11 +846,11 @@ def _angles_by_name(roles: Roles) -> Stream:
         seen = [some for stream in roles.measured.values() for some in stream.axes.get(axis, ())]
         turning = [some for some in seen if names.turns(some.column, some.axis) and kind_of(f"_{some.unit}") == "angle"]
         if turning and signals[0].basis == "range" and roles.command.kind(axis) == "length":
-            axes[axis] = _in(signals, "_rad")
+            axes[axis] = _set_guessed_unit(signals, "_rad")
     return replace(roles.command, axes=axes)
 
 
-def _ranged(stream: Stream, measured: Set[str]) -> Stream:
+def _set_units_by_range(stream: Stream, measured: Set[str]) -> Stream:
     """A stream whose guessed units are the likeliest for the range of those of its axes that are measured."""
     axes = dict(stream.axes)
     for kind in KINDS:
@@ -860,11 +860,11 @@ def _ranged(stream: Stream, measured: Set[str]) -> Stream:
             signal.plain for axis in of_kind.keys() & measured for signal in of_kind[axis] if signal.basis == "range"
         ]
         unit = large if max(map(usual_size, plain), default=0.0) > most else small
-        axes |= {axis: _in(signals, unit) for axis, signals in of_kind.items()} if plain else {}
+        axes |= {axis: _set_guessed_unit(signals, unit) for axis, signals in of_kind.items()} if plain else {}
     return replace(stream, axes=axes)
 
 
-def _fitted(stream: Stream, anchor: Stream) -> Stream:
+def _set_units_by_travel(stream: Stream, anchor: Stream) -> Stream:
     """A stream whose guessed units, one of each kind, are those in which it moves as far as another."""
     made, anchored = dict(stream.axes), anchor.source
     shared = [axis for axis in anchor.axes if axis in made and any(signal.basis == "range" for signal in made[axis])]
@@ -874,15 +874,15 @@ def _fitted(stream: Stream, anchor: Stream) -> Stream:
             continue
 
         def misfit(unit: str, of_kind: Sequence[str] = axes) -> float:
-            moved = replace(stream, axes={axis: _in(stream.axes[axis], unit) for axis in of_kind}).source
+            moved = replace(stream, axes={axis: _set_guessed_unit(stream.axes[axis], unit) for axis in of_kind}).source
             ratios = [max(moved.travel(axis), 1e-12) / max(anchored.travel(axis), 1e-12) for axis in of_kind]
             return abs(float(np.median(np.log(ratios))))
 
         told = dict.fromkeys(f"_{signal.unit}" for axis in axes for signal in anchor.axes[axis])  # maybe cm
         unit = min((*told, *GUESSED[kind]), key=misfit)
-        made |= {axis: _in(made[axis], unit) for axis in axes}
+        made |= {axis: _set_guessed_unit(made[axis], unit) for axis in axes}
     return replace(stream, axes=made)
 
 
-def _in(signals: Sequence[Signal], unit: str) -> list[Signal]:
+def _set_guessed_unit(signals: Sequence[Signal], unit: str) -> list[Signal]:
     return [replace(signal, unit=unit.removeprefix("_")) if signal.basis == "range" else signal for signal in signals]

@@ -140,7 +140,7 @@ def _followed(run: Run, related: _Relations) -> tuple[Run, _Relations]:
 
 
 def _without_lag(related: _Relations) -> dict[str, str]:
-    """Sources of which an axis surely moves alike, but as late as lags are looked for: that is no following."""
+    """Sources with an axis that surely moves alike, but at the longest lag of the search, each with a sentence."""
     late: dict[str, list[str]] = {}
     for (name, axis), relation in related.items():
         if relation.lag >= LATEST and _is_sure(relation):
@@ -167,7 +167,7 @@ def early(survey: Survey, name: str) -> dict[str, float]:
 
 
 def _drop_early(survey: Survey) -> Survey:
-    """Without the axes of a sensor that move before their commands, where it surely follows those of others."""
+    """The survey without axes of sensors that move before their commands, if other axes of that sensor follow."""
     run, unused = survey.run, dict[tuple[str, str], str]()
     for name, source in run.sensors.items():
         ahead, by_axis = early(survey, name), survey.of_source(name)

@@ -245,7 +245,9 @@ def _fit_all(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[
     try:
         fits = [pair for batch in parallel(delayed(fit_steps)(batch) for batch in batches) for pair in batch]
     except BrokenProcessPool:
-        raise TrialsError("a worker process died (out of memory?) while trials were fitted") from None
+        raise TrialsError(
+            "a worker process died (out of memory?) while trials were fitted; use fewer, or --samples"
+        ) from None
     if paper:
         fits = [
             (fit_as_published(trial, first), fit_as_published(trial, second))

@@ -177,7 +177,8 @@ def verify(
         results.extend(_part(part, config, jumps if number == 1 else ()))
     if not results:
         raise RunError(
-            f"run '{run.name}': no source has {_FEWEST} measurements of a commanded axis after the first command"
+            f"run '{run.name}': no source has {_FEWEST} measurements of a commanded axis after the"
+            " first command; record for longer, both by one clock"
         )
     return results
 
@@ -223,7 +224,7 @@ def _verify_axis(
     recovery = configured.recovery or RECOVERY
     farthest = abs(measured.recordings[0].start) + np.abs(measured.responses(configured)[0]).max()
     if not (farthest <= _FARTHEST and configured.lag <= _SLOWEST):  # also where it is not a number
-        raise ConfigError(f"axis '{axis}': a start level, gain or plant of no size that an arm has")
+        raise ConfigError(f"axis '{axis}': a start level, gain or plant of no size that an arm has; check their units")
     measured, start_from = _set_start(measured, configured, axis in run.start)
     count = len(measured.recordings[0].time)
     measured = _drop_spikes(measured, configured)

@@ -88,7 +88,7 @@ def _placed(run: Run, frame: Frame) -> Placed:
     command = segments(run)[0][0].command
     _, level = known_rows(command.stamp, np.column_stack([command.values["x"], command.values["y"]]))
     if not len(level):
-        raise RunError(f"{command.label}: no command has both x and y")
+        raise RunError(f"{command.label}: no command has both x and y; log both in one row")
     return placed_at(frame, float(level[0, 0]), float(level[0, 1]), where)
 
 

@@ -126,7 +126,7 @@ class Table:
         number, note = self.plain(name) if name else (np.arange(self.rows, dtype=np.float64), None)
         time = number / rate
         if (np.abs(time) >= REACH_NS / 1e9).any():
-            raise RunError(f"{self.path}: at {rate:g} Hz a row is stamped beyond the year 2115")
+            raise RunError(f"{self.path}: at {rate:g} Hz a row is stamped beyond the year 2115; check rate_hz")
         return units.nanoseconds(time), note
 
     def is_dated(self, name: str) -> bool:
@@ -159,7 +159,7 @@ class Table:
     def column(self, path: str) -> pa.ChunkedArray:
         """The column of a name or a field path, nothing converted. One that has the whole path as its name wins."""
         if path not in self.columns and self.names.count(path) > 1:
-            raise RunError(f"{self.path}: two columns are named '{path}'")
+            raise RunError(f"{self.path}: two columns are named '{path}'; give one another name")
         return find(self.columns, path, str(self.path))
 
     def _of_numbers(self, name: str, per_unit: int) -> tuple[TimeArray, str | None]:
@@ -196,7 +196,7 @@ class Table:
         if pa.types.is_floating(column.type):
             column = pc.if_else(pc.is_finite(column), column, pa.scalar(None, column.type))
             if pc.any(pc.not_equal(column, pc.round(column))).as_py():
-                raise self._refusal(name, "is beside another of one time: it must be whole")
+                raise self._refusal(name, "is beside another of one time: write it in whole numbers")
         return _filled(self._cast(name, column, pa.int64()), NO_STAMP), note
 
     def _of_clock(self, name: str, column: pa.ChunkedArray) -> TimeArray:

@@ -65,12 +65,12 @@ def _tables(path: Path, _written: int) -> _Tables:
         if path.is_dir():
             tables = _of_value(_loaded(path))
         elif path.is_file() and not path.stat().st_size:
-            raise RunError(f"{path}: the file is empty")
+            raise RunError(f"{path}: the file is empty; record or copy it again")
         else:
             with path.open("rb") as file:
                 tables = {SHEETS: _sheets, ".ulg": _topics}.get(path.suffix, _arrays)(path, file)
     if not tables:
-        raise RunError(f"{path}: no table in it: nothing has rows of numbers")
+        raise RunError(f"{path}: no table in it: nothing has rows of numbers; save an array, or a list of records")
     return {"": next(iter(tables.values()))} if len(tables) == 1 else tables
 
 
@@ -139,7 +139,7 @@ def _of_numbers(path: Path, loaded: Mapping[str, npt.NDArray[Any]]) -> Arrays:
 
 
 def _loaded(folder: Path) -> Arrays:
-    """The arrays of a folder by the names of their files; a file that is none is for others to say."""
+    """The arrays of a folder by the names of their files, without files that numpy cannot read."""
     arrays = Arrays()
     for path in sorted(folder.glob(f"*{ARRAY}")):
         with contextlib.suppress(ValueError, OSError, EOFError):
@@ -168,7 +168,7 @@ def _matlab(path: Path, file: BinaryIO) -> Any:
 
 
 def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
-    """Values that are tables of their own: each of a list of trials; those of a struct without arrays beside them."""
+    """The values that make a table each, by path: trials of a list, and structs within a struct without arrays."""
     if _are_trials(value):
         for index, item in enumerate(value):
             yield from _apart(item, f"{name}[{index}]")
@@ -192,7 +192,7 @@ def _apart(value: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _are_trials(value: Any) -> bool:
-    """Whether a list is of records with lists, some of them longer: runs, and no rows with the joints of an arm."""
+    """Whether a list holds runs: records with lists longer than it is itself. Rows with lists of joints are shorter."""
     records = cast(Sequence[Any], value if isinstance(value, list) else [])
     if len(records) < 2 or not all(isinstance(record, Mapping) for record in records):
         return False

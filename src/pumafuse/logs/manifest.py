@@ -338,7 +338,7 @@ def stamps_of(run: Path) -> dict[str, tuple[int, int]]:
 def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry:
     """A source from its table; every key that is none of the source's fields is an axis."""
     if not isinstance(table, dict):
-        raise ConfigError(f"{where}: {path}: expected a table")
+        raise ConfigError(f"{where}: {path}: expected a table, as in [{path}]")
     keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
     kinds: dict[str, Any] = {}
     if isinstance(keys.get("start"), dict):
@@ -360,7 +360,7 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         _check_noise(keys["noise"], kind, where, f"{path}.noise")
     of_whole_rows = next((key for key in ("orientation", "noise", "arrived") if key in keys), None)
     if of_whole_rows and any(column.get("where") for columns in axes.values() for column in columns):
-        raise ConfigError(f"{where}: {path}.{of_whole_rows}: axes with rows of their own have none")
+        raise ConfigError(f"{where}: {path}.{of_whole_rows}: axes with rows of their own have none; leave it out")
     for key in [key for key in ("time", "arrived") if key in keys]:
         keys[key] = _time(keys[key], where, f"{path}.{key}")
     if "where" in keys:
@@ -398,7 +398,9 @@ def _check_orientation(table: Any, axes: dict[str, list[Any]], where: str, path:
             f" 'xyz' (about axes that stay), not '{entry.convention}'"
         )
     if entry.convention and not entry.euler and not (entry.quaternion and entry.convention == "abb"):
-        raise ConfigError(f"{where}: {path}.convention: only Euler angles have one, and a quaternion of ABB's")
+        raise ConfigError(
+            f"{where}: {path}.convention: only Euler angles have one, and a quaternion of ABB's; leave it out"
+        )
     if not entry.quaternion:
         _check_unit(table, ANGLES, where, path)
         if column := next((name for name in entry.columns if Column(name, entry.unit).kind != "angle"), None):
@@ -412,7 +414,7 @@ def _check_noise(table: Any, kind: type[SourceEntry], where: str, path: str) -> 
     if bool(noise.sd) == bool(noise.variance):
         raise ConfigError(f"{where}: {path}: expected one of sd = 'error_mm' and variance = 'pose.covariance[0]'")
     if kind is not SourceEntry:
-        raise ConfigError(f"{where}: {path}: only rows of sensors have a noise")
+        raise ConfigError(f"{where}: {path}: only rows of sensors have a noise; leave it out")
 
 
 def _joints(table: Any, beside: Iterable[str], where: str, path: str) -> dict[str, Any]:
@@ -441,7 +443,7 @@ def _columns(table: Any, where: str, path: str) -> list[Any]:
         toml.check(column, Column, where, path)
         _check_unit(column, POSITIONS, where, path)
         if column.get("turn_deg") and msgspec.convert(column, Column).kind != "angle":
-            raise ConfigError(f"{where}: {path}.turn_deg: the column is no angle")
+            raise ConfigError(f"{where}: {path}.turn_deg: the column is no angle; leave turn_deg out")
     return columns
 
 

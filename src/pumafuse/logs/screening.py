@@ -32,9 +32,9 @@ _MOSTLY = 1.5  # times that each value comes, on the mean: half of them, or more
 
 
 def lost(position: FloatArray) -> BoolArray:
-    """In which rows x, y and z are all zero, as a sensor in a frame of its own writes them that lost its target, (n,).
+    """The rows in which x, y and z are all zero, as a sensor writes them when it has lost its target, (n,).
 
-    Nothing is in the middle of a sensor.
+    In the sensor's own frame that place is inside the sensor, where no target can be.
     """
     return (position == 0.0).all(axis=1)
 

@@ -305,7 +305,7 @@ def _of_text(path: Path, growing: bool, choice: Choice | None) -> _Text:
     with pa.input_stream(str(path)) as stream:  # decompressed
         text = stream.read(_MOST_TEXT + 1)
     if not text:
-        raise RunError(f"{path}: the file is empty")
+        raise RunError(f"{path}: the file is empty; record or copy it again")
     if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):  # what PowerShell redirects into a file
         text = text.decode("utf-16").encode()
     if len(text) > _MOST_TEXT:
@@ -331,7 +331,7 @@ def _refuse_deep_lines(path: Path, text: bytes) -> None:
     ends = np.concatenate([[-1], np.flatnonzero(codes == ord("\n")), [len(codes)]])
     for line in np.flatnonzero(np.diff(ends) > _LONG_LINE).tolist():
         if np.cumsum(_STEPS[codes[ends[line] + 1 : ends[line + 1]]], dtype=np.int64).max() > _DEEPEST:
-            raise RunError(f"{path}: line {line + 1} is nested more than {_DEEPEST} deep: no log")
+            raise RunError(f"{path}: line {line + 1} is nested more than {_DEEPEST} deep: no log; write rows of JSON")
 
 
 def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
@@ -340,7 +340,7 @@ def _refuse_deep_columns(path: Path, table: pa.Table) -> None:
         level = [kind.field(index).type for kind in level for index in range(kind.num_fields)]
         if not level:
             return
-    raise RunError(f"{path}: nested more than {_DEEPEST} deep: no log")
+    raise RunError(f"{path}: nested more than {_DEEPEST} deep: no log; write rows of JSON")
 
 
 def _of_csv(path: Path, text: bytes, choice: Choice | None) -> _Text:
@@ -469,16 +469,16 @@ def _unlabelled(path: Path, text: bytes) -> tuple[bytes, list[str]]:
 
 
 def _labels(head: str) -> tuple[str, ...]:
-    """The labels that most lines of a text have, two at least, a number in front being without; none of any other."""
+    """The two or more labels that most lines of a text have, empty for a number in front; none for other texts."""
     rows = _labelled(head)
     names, count = Counter(names for names, _ in rows).most_common(1)[0] if rows else ((), 0)
     return names if 2 * count > len(rows) and len(list(filter(None, names))) > 1 else ()
 
 
 def _labelled(text: str) -> list[tuple[tuple[str, ...], list[str]]]:
-    """Of each full line of a text labels and values, none behind several cells without labels.
+    """The labels and values of each line of a text that is not blank, a label with the unit behind its value.
 
-    A label has the unit that follows its value.
+    A line that begins with several cells without labels has none.
     """
     rows = list[tuple[tuple[str, ...], list[str]]]()
     for line in filter(str.strip, text.splitlines()):
@@ -640,7 +640,7 @@ def _properties(lines: Sequence[str], full: Sequence[int]) -> tuple[int, int] | 
 
 
 def _whole_lines(lines: Sequence[str]) -> tuple[list[str], bool]:
-    """Lines of a text, those together in which a cell in quotes goes on; and whether there are such."""
+    """Lines of a text, joined where a cell in quotes goes on in the next one; and whether any were."""
     lines_whole, is_open = list[list[str]](), False
     for line in lines:
         odd = line.count('"') % 2 == 1

@@ -72,9 +72,9 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
     """
     for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True):
         if 0 < count < FEWEST:
-            raise TuneError(f"{axis}: only {count} measurements; a fit needs at least {FEWEST}")
+            raise TuneError(f"{axis}: only {count} measurements; record longer: a fit needs at least {FEWEST}")
     if not likelihood.count.any():
-        raise TuneError("no measurement of a configured sensor lies within the runs: nothing to fit to")
+        raise TuneError("no measurement of a configured sensor lies within the runs: are names and clocks the same?")
     axes: list[str] = []
     for axis, names in likelihood.sensors.items():
         noise = min(likelihood.scatter.get((name, axis), 0.0) for name in names)

@@ -252,7 +252,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     """
     every = [in_axes(run, None)[0] for run in ([runs] if isinstance(runs, Run) else runs)]
     if not every:
-        raise TuneError("no run to look at")
+        raise TuneError("no run to look at; give one at least")
     measured = [{REFERENCE: run.reference, **run.sensors} if run.reference else run.sensors for run in every]
     every = [replace(run, sensors=sources, reference=None) for run, sources in zip(every, measured, strict=True)]
     elsewhere = {name: own_frame.words for run in every for name, own_frame in own_frames(run).items()}
@@ -367,7 +367,7 @@ def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> st
         TuneError: There is none.
     """
     if not config.sensors:
-        raise TuneError("no sensor and no reference: nothing to compare the commands with")
+        raise TuneError("no sensor and no reference to compare the commands with; add one to run.toml")
     if asked is not None:
         if asked not in config.sensors:
             raise UnknownNameError("the runs", "sensor", asked, config.sensors)

@@ -251,7 +251,7 @@ def _check(
         PumafuseError: No run, one twice, or a name to fix or a word to share that means nothing.
     """
     if not runs:
-        raise TuneError("no run to fit on")
+        raise TuneError("no run to fit on; give one at least")
     for number, run in enumerate(runs):
         if any(_same(run, other) for other in runs[:number]):
             raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice; give it once")
@@ -304,7 +304,7 @@ class Pipeline:
             config = stages[-1].best.config
         if not any(stage.free for stage in stages):
             why = [str(combination) for stage in stages for combination in stage.not_identifiable]
-            raise TuneError("; ".join([*why, "everything that could be fitted is fixed: nothing to fit"]))
+            raise TuneError("; ".join([*why, "everything that could be fitted is fixed: nothing to fit; fix less"]))
         self.best, self.stages = config, stages
         self.notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
         self.keep_the_better()
