@@ -81,10 +81,7 @@ def check_follows(found: Survey, folder: Path) -> tuple[pf.Run, pf.FusionConfig]
 
 @pytest.mark.parametrize(
     ("names", "order"),
-    [
-        (("q_w", "q_x", "q_y", "q_z"), "wxyz"),
-        (("flangeQuatX", "flangeQuatY", "flangeQuatZ", "flangeQuatW"), "xyzw"),
-    ],
+    [(("q_w", "q_x", "q_y", "q_z"), "wxyz"), (("flangeQuatX", "flangeQuatY", "flangeQuatZ", "flangeQuatW"), "xyzw")],
 )
 def test_quaternions_are_known_by_their_names(names: Sequence[str], order: str, tmp_path: Path) -> None:
     """In whatever order they stand, and of whatever sign: the tool turns as scipy has it."""
@@ -136,8 +133,7 @@ def test_the_pose_of_universal_robots_is_a_rotation_vector(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("names", "letters", "prefix"),
-    [(("A", "B", "C"), "ZYX", "X Y Z"), (("roll", "pitch", "yaw"), "xyz", "x y z")],
+    ("names", "letters", "prefix"), [(("A", "B", "C"), "ZYX", "X Y Z"), (("roll", "pitch", "yaw"), "xyz", "x y z")]
 )
 def test_euler_angles_beside_a_place_are_an_orientation(
     names: Sequence[str], letters: str, prefix: str, tmp_path: Path

@@ -9,14 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pumafuse.identification.anova import (
-    Dependence,
-    dependences,
-    factors_of,
-    outlying,
-    scatter,
-    welch,
-)
+from pumafuse.identification.anova import Dependence, dependences, factors_of, outlying, scatter, welch
 from pumafuse.identification.trials import Trial
 
 TIME = np.arange(10) * 0.01

@@ -42,9 +42,7 @@ class Arm:
             return 1.0 - np.exp(-t / TAU)
         root = np.sqrt(1.0 - ZETA**2)
         return np.where(
-            time > 0.0,
-            1.0 - np.exp(-ZETA * OMEGA * t) / root * np.sin(OMEGA * root * t + np.arctan2(root, ZETA)),
-            0.0,
+            time > 0.0, 1.0 - np.exp(-ZETA * OMEGA * t) / root * np.sin(OMEGA * root * t + np.arctan2(root, ZETA)), 0.0
         )
 
     def campaign(self, seed: int, axis: str = "radial") -> list[Trial]:

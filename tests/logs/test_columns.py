@@ -215,12 +215,7 @@ def test_a_struct_of_seconds_and_nanoseconds_is_a_stamp(names: tuple[str, str]) 
 
 
 @pytest.mark.parametrize(
-    "cells",
-    [
-        ["2024-01-01T00:00:00Z", "1.5"],
-        ["2024-01-01T00:00:00", "2024-01-01T00:00:00Z"],
-        ["12:00:00", "1.5"],
-    ],
+    "cells", [["2024-01-01T00:00:00Z", "1.5"], ["2024-01-01T00:00:00", "2024-01-01T00:00:00Z"], ["12:00:00", "1.5"]]
 )
 def test_stamps_written_in_two_ways_are_refused(cells: list[str]) -> None:
     """Dates and numbers, and dates with and without a zone, would be of two clocks; both rows are named."""
@@ -305,10 +300,7 @@ def test_a_number_of_nines_may_be_a_position(numbers: list[float]) -> None:
     assert note is None
 
 
-@pytest.mark.parametrize(
-    "cell",
-    ["2024-02-30T00:00:00", "2024-01-01T25:00:00", "1800-01-01T00:00:00"],
-)
+@pytest.mark.parametrize("cell", ["2024-02-30T00:00:00", "2024-01-01T25:00:00", "1800-01-01T00:00:00"])
 def test_dates_that_are_none_are_refused(cell: str) -> None:
     """A day, an hour or a century too many is one line with the column."""
     assert "'t'" in one_line(RunError, lambda: one_column([cell]).stamps("t"))

@@ -34,10 +34,7 @@ QUATERNION = TURNED.as_quat()
 KUKA, FANUC = (TURNED.as_euler(letters, degrees=True) for letters in ("ZYX", "xyz"))
 FORMS = {
     "xyzw": (columns("qx qy qz qw", QUATERNION), '{ quaternion = ["qx", "qy", "qz", "qw"] }'),
-    "wxyz": (
-        columns("a b c d", QUATERNION[:, [3, 0, 1, 2]]),
-        '{ quaternion = ["a", "b", "c", "d"], order = "wxyz" }',
-    ),
+    "wxyz": (columns("a b c d", QUATERNION[:, [3, 0, 1, 2]]), '{ quaternion = ["a", "b", "c", "d"], order = "wxyz" }'),
     "abb": (
         columns("q1 q2 q3 q4", QUATERNION[:, [3, 0, 1, 2]]),
         '{ quaternion = ["q1", "q2", "q3", "q4"], convention = "abb" }',

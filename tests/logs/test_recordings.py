@@ -297,11 +297,7 @@ def test_the_process_that_reads_imports_what_pumafuse_does(monkeypatch: pytest.M
 
 
 def _mcap(
-    path: Path,
-    *records: Any,
-    definition: str = "float64 data\n",
-    language: str = "ros2msg",
-    encoding: str = "cdr",
+    path: Path, *records: Any, definition: str = "float64 data\n", language: str = "ros2msg", encoding: str = "cdr"
 ) -> Path:
     """An MCAP file with a channel and records, as no writer would write them."""
     builder = RecordBuilder()

@@ -116,9 +116,7 @@ def test_commands_alone_are_not_all() -> None:
 
 @settings(max_examples=150)
 @given(
-    st.sampled_from(["late block", "swapped", "twice", "shuffled", "gaps"]),
-    st.integers(0, 10_000),
-    st.floats(0.0, 0.9),
+    st.sampled_from(["late block", "swapped", "twice", "shuffled", "gaps"]), st.integers(0, 10_000), st.floats(0.0, 0.9)
 )
 def test_rows_out_of_order_are_no_clock(what: str, seed: int, jitter: float) -> None:
     """Blocks that come late, neighbours that change places, rows that come twice, any order within half a second."""

@@ -117,10 +117,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[], dict[str, Any]]]] = {
         axis("state[1]"),
         lambda: {"t_ns": STAMP, "state": pa.array([[] if np.isnan(x) else [0.0, x, 1.0] for x in X])},
     ),
-    "lists of fixed size": (
-        axis("observation.state[1]"),
-        lambda: {"t_ns": STAMP, "observation.state": fixed(X)},
-    ),
+    "lists of fixed size": (axis("observation.state[1]"), lambda: {"t_ns": STAMP, "observation.state": fixed(X)}),
     "names with dots and brackets": (
         axis("a.b[1]"),
         lambda: {"t_ns": STAMP, "a.b[1]": nullable(X), "a.b": pa.array([[0.0, 0.0]] * ROWS)},
@@ -161,10 +158,7 @@ def test_elements_are_found_by_their_names_in_any_order(tmp_path: Path) -> None:
     same(read(tmp_path, command, {"t_ns": STAMP, "name": names, "position": positions}).command, STAMP, elbow=wanted)
 
 
-@pytest.mark.parametrize(
-    ("unit", "kind", "factor"),
-    [("um", "length", 1e6), ("mrad", "angle", 1e3)],
-)
+@pytest.mark.parametrize(("unit", "kind", "factor"), [("um", "length", 1e6), ("mrad", "angle", 1e3)])
 def test_a_unit_beside_the_column_is_the_unit_of_its_name(tmp_path: Path, unit: str, kind: str, factor: float) -> None:
     named = read(tmp_path, f'time = "t_ns"\na = "x_{unit}"', {"t_ns": STAMP, f"x_{unit}": X})
     beside = read(tmp_path, f'time = "t_ns"\na = {{ column = "x", unit = "{unit}" }}', {"t_ns": STAMP, "x": X})
@@ -384,10 +378,7 @@ def test_seconds_without_their_nanoseconds_are_refused_with_the_line_to_write(
     same(read(tmp_path, f'{line}\nx = "x_m"', columns, name).command, stamp, x=x)
 
 
-@pytest.mark.parametrize(
-    ("tick", "rate", "rows"),
-    [(1e-3, 4000.0, 5624), (0.015625, 1000.0, 7019), (1.0, 1.0, 0)],
-)
+@pytest.mark.parametrize(("tick", "rate", "rows"), [(1e-3, 4000.0, 5624), (0.015625, 1000.0, 7019), (1.0, 1.0, 0)])
 def test_a_coarse_clock_is_told(tick: float, rate: float, rows: int) -> None:
     """Whole ms at 4 kHz, jiffies, Windows: fused, and the rows that share a stamp are counted."""
     stamp, x = moving(tick, rate=rate)

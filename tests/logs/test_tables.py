@@ -115,8 +115,7 @@ def test_words_are_missing_and_noted_once(tmp_path: Path, cell: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "far", "missing"),
-    [("1", "word", True), ("", "2.5", False), ("2024-01-01", "2.5", False)],
+    ("first", "far", "missing"), [("1", "word", True), ("", "2.5", False), ("2024-01-01", "2.5", False)]
 )
 def test_a_cell_beyond_the_first_block_may_be_of_another_kind(
     tmp_path: Path, first: str, far: str, missing: bool

@@ -12,11 +12,7 @@ from pumafuse.tuning.likelihood import Derivatives, Likelihood, Point
 from pumafuse.tuning.maximise import derivatives, maximise, point
 from pumafuse.tuning.parameters import Fit, Parameter, moved
 from pumafuse.tuning.steps import bounded_step
-from tuning_runs import (
-    free_of,
-    outage,
-    spoiled_arm,
-)
+from tuning_runs import free_of, outage, spoiled_arm
 
 
 def coordinates(free: Sequence[Parameter], config: pf.FusionConfig) -> np.ndarray:

@@ -13,17 +13,7 @@ from pumafuse.tuning.maximise import maximise, point
 from pumafuse.tuning.parameters import quickest
 from pumafuse.tuning.search import _penalised  # pyright: ignore[reportPrivateUsage]
 from pumafuse.tuning.stage import Plan, Stage, run_stage
-from tuning_runs import (
-    contains,
-    fit_stage,
-    free_of,
-    intervals_of,
-    later,
-    quietly,
-    replaced,
-    with_process,
-    with_sensors,
-)
+from tuning_runs import contains, fit_stage, free_of, intervals_of, later, quietly, replaced, with_process, with_sensors
 
 PERIOD, COUNT = 0.02, 2000
 

@@ -147,7 +147,7 @@ class Signal:
 
     @property
     def name(self) -> str:
-        """What it is called: by its column, and by what says which rows are its own."""
+        """Its name: that of its column, behind what tells which rows are its own."""
         return _called(self.column, self.where)
 
     @property
@@ -308,16 +308,13 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
         elif signal_or_why:
             left_out[name] = signal_or_why
     inches, points = names.inches_in(paths), _points(paths)
-    signals = [_placed(signal, told) for signal in _drop_quaternions(signals, left_out)]
-    signals = [_among_others(signal, inches, points) for signal in signals]
+    signals = [_placed(signal, told, inches, points) for signal in _drop_quaternions(signals, left_out)]
     called = [signal.column for signal in signals if not _is_nameless(signal.column)]
     if signals and (why := names.no_position_by_place(source.stem, called)):
         left_out |= {signal.name: f"{why}, as {source.label} is called" for signal in signals}
         signals = []
-    notes = list[str]()
-    if len(table.names) > _MOST_READ:
-        read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
-        notes = [f"{table.path.name}: of {len(table.names)} columns {read}"]
+    read = f"the {len(table.columns)} are read whose names tell most; say in run.toml which others are meant"
+    notes = [f"{table.path.name}: of {len(table.names)} columns {read}"] if len(table.names) > _MOST_READ else []
     beside = [names.role_words(signal.column) for signal in signals if signal.axis in CARTESIAN]
     for attitude in attitudes:
         left_out |= {} if attitude.role_words in beside else dict.fromkeys(attitude.columns.columns, "turning")
@@ -344,17 +341,9 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
 
 
 def _points(paths: Iterable[str]) -> set[str]:
-    """Lists of three that are called p, as control engineers call a place where q are joints: x, y and z."""
+    """The lists named p with three elements, x, y and z: control engineers write p for places and q for joints."""
     lists = Counter(match[1] for path in paths if (match := _ELEMENT.fullmatch(path)))
     return {name for name, size in lists.items() if size == len(CARTESIAN) and names.words(name)[:1] == ["p"]}
-
-
-def _among_others(signal: Signal, inches: Mapping[str, str], points: Container[str]) -> Signal:
-    """A signal with the unit (inches) or the axis (of a point) that the names of columns beside it imply."""
-    if signal.column in inches:
-        return replace(signal, axis=names.axis_of(inches[signal.column], []), unit="inch", basis="name")
-    element = _ELEMENT.fullmatch(signal.column)
-    return replace(signal, axis=CARTESIAN[int(element[2])]) if element and element[1] in points else signal
 
 
 def is_nameless(signals: Iterable[Signal], clock: Clock) -> bool:
@@ -394,13 +383,16 @@ def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
     }
 
 
-def _placed(signal: Signal, attitudes: Iterable[Attitude]) -> Signal:
-    """A signal as x, y or z where an orientation beside it says which of them it is."""
-    for attitude in attitudes:
-        if axis := attitude.coordinates.get(signal.column):
-            unit = {"unit": attitude.place_unit, "basis": "name"} if attitude.place_unit else {}
-            return replace(signal, axis=axis, **unit)
-    return signal
+def _placed(signal: Signal, attitudes: Iterable[Attitude], inches: Mapping[str, str], points: Container[str]) -> Signal:
+    """A signal with the axis or the unit that columns beside it imply: an orientation, inches, or a list of x, y, z."""
+    beside = next((attitude for attitude in attitudes if signal.column in attitude.coordinates), None)
+    if beside is not None:
+        unit = {"unit": beside.place_unit, "basis": "name"} if beside.place_unit else {}
+        signal = replace(signal, axis=beside.coordinates[signal.column], **unit)
+    if signal.column in inches:
+        return replace(signal, axis=names.axis_of(inches[signal.column], []), unit="inch", basis="name")
+    element = _ELEMENT.fullmatch(signal.column)
+    return replace(signal, axis=CARTESIAN[int(element[2])]) if element and element[1] in points else signal
 
 
 def _likeliest(columns: Sequence[str]) -> list[str]:
@@ -420,7 +412,7 @@ def _drop_quaternions(signals: Sequence[Signal], left_out: dict[str, str]) -> li
 
 
 def _joints(table: Table, paths: Sequence[str]) -> dict[str, str]:
-    """What joints are called, by the column of their position, where columns beside say it.
+    """The names of joints, by the column of their position, where another column holds these names.
 
     These are ``joint_names`` of a trajectory or its controller, and ``name0`` as ``rostopic echo -p`` writes it.
     """
@@ -464,7 +456,7 @@ def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
 
 
 def _begins_anew(table: Table, columns: Iterable[str], rows: IntArray) -> bool:
-    """Whether one of some columns goes on as a clock does, but for some rows, in each of which it begins anew."""
+    """Whether one of some columns runs like a clock that begins anew in just these rows."""
     for name in columns:
         with suppress(RunError):
             values = table.stamps(name)[0] if table.is_dated(name) else table.plain(name)[0]
@@ -474,13 +466,13 @@ def _begins_anew(table: Table, columns: Iterable[str], rows: IntArray) -> bool:
 
 
 def _labelled(path: str, listed: list[str]) -> str:
-    """An element of a list by what the log calls it, behind the list's own name; empty where it does not."""
+    """The name of a list with the log's name for one of its elements; empty where the log names no elements."""
     label = names.label_of(path, listed)
     return "" if label is None else f"{leaf(path).partition('[')[0]}_{label}"
 
 
 def _called(column: str, where: Mapping[str, Any]) -> str:
-    """A column by its name, and by what says which rows are its own: ``elbow_position``, ``joint_11_position``."""
+    """The name of a column behind what tells its rows: ``elbow_position``, ``joint_11_position``."""
     return "_".join([*(key if isinstance(key, str) else f"joint_{key}" for key in where.values()), column])
 
 
@@ -533,7 +525,7 @@ def _set_units(signals: list[Signal]) -> tuple[Signal, ...]:
 
 
 def usual_size(plain: FloatArray) -> float:
-    """How large the numbers of a column are, a few that leap away apart."""
+    """The usual size of the numbers in a column: a quantile that a few which leap away do not change."""
     return float(np.nanquantile(np.abs(plain), _USUALLY))
 
 
@@ -855,7 +847,7 @@ def unused(parts: Iterable[Part]) -> list[str]:
 
 
 def _no_clock(table: Table, name: str) -> str:
-    """Why a column that is called as stamps are is no clock."""
+    """Why a column with the name of a clock is none."""
     try:
         table.stamps(name, unit="_s")
     except RunError as error:
@@ -951,7 +943,7 @@ def _by_frame(table: Table, source: Part) -> Iterator[tuple[Part, Table]]:
 
 
 def _validity(table: Table) -> dict[str, Any]:
-    """Which rows are valid, where a column of 0 and 1, or of false and true, says it."""
+    """The choice of valid rows, where a column of 0 and 1, or of false and true, flags them; else empty."""
     for name, column in table.columns.items():
         is_flag = pa.types.is_boolean(column.type) or pa.types.is_integer(column.type)
         if is_flag and names.has_word(name, names.VALID):
@@ -962,7 +954,7 @@ def _validity(table: Table) -> dict[str, Any]:
 
 
 def _first_run(table: Table) -> dict[str, Any]:
-    """Which rows are the first run, where a column tells several apart."""
+    """The choice of rows of the first run, where a column numbers several runs; else empty."""
     for name in filter(table.columns.__contains__, names.EPISODES):
         if pa.types.is_nested(table.columns[name].type):  # an array of signals may be called run, too
             continue
@@ -980,7 +972,7 @@ class _Info(msgspec.Struct):
 
 
 def _labels(path: Path) -> dict[str, list[str]]:
-    """What the elements of lists are called, by column, in a data set of LeRobot."""
+    """The names of the elements of lists, by column, in a LeRobot data set."""
     labels, info = dict[str, list[str]](), _Info({})
     with suppress(msgspec.MsgspecError, OSError, StopIteration):
         about = (above / "meta" / "info.json" for above in path.resolve().parents[:4])
@@ -1015,7 +1007,7 @@ def _recorded(path: Path) -> Iterator[Part]:
 
 
 def _unread(topic: Topic) -> str:
-    """Why a topic or entity is not read; empty of one that may have positions."""
+    """Why a topic or entity is not read; empty where it may hold positions."""
     kind = topic.type.rpartition("/")[2]
     if kind in _VELOCITIES:
         return _ARE_VELOCITIES

@@ -104,7 +104,7 @@ def _levels(arm: ArmGuess) -> dict[str, float]:
 
 
 def _unused(roles: Roles, folder: Path) -> Iterator[str]:
-    """In comments what is in a log and not used, and why."""
+    """Comments that list what a log holds and the draft does not use, with reasons."""
     for stream, why in roles.left_out:
         table = ["reference"] if stream.role == "reference" else ["sensors", stream.name]
         unused = [f"# {line}" for line in _source(table, stream, folder)[1:]]
@@ -146,7 +146,7 @@ def _columns(stream: Stream) -> list[str]:
 
 
 def _pose(stream: Stream) -> str:
-    """Where a message has its whole pose, if its axes and its orientation are this; else empty."""
+    """The path of a pose in messages, if a stream's axes and orientation are all of that pose; else empty."""
     columns = stream.attitude.columns.quaternion if stream.attitude else None
     if columns is None or tuple(stream.axes) != CARTESIAN:
         return ""

@@ -34,7 +34,7 @@ _SURELY = 2.0  # half intervals, from which a sensor is earlier than the densest
 
 @dataclass(frozen=True)
 class AxisGuess:
-    """An axis: lag [s] behind the held command, plant, and noise [m or rad]."""
+    """First numbers of an axis: lag [s] behind the held command, plant, and noise [m or rad]."""
 
     kind: Kind  # whether it is a length or an angle
     follows: str  # the sensor from which it is known; empty: none
@@ -50,7 +50,7 @@ class AxisGuess:
 
 @dataclass(frozen=True)
 class ArmGuess:
-    """Update period and delay [s], and the axes."""
+    """First numbers of an arm: update period and delay [s], and its axes."""
 
     period: float
     delay: float
@@ -117,7 +117,7 @@ def guess(
 def _against_each_other(
     run: Run, relations: Mapping[tuple[str, str], Following], registered: Mapping[str, float]
 ) -> tuple[str, dict[str, float], dict[str, Pair]]:
-    """The earliest source, or the reference; how much later each is [s]; each beside the densest."""
+    """The reference, else the earliest source; the latency of each beside it [s]; each aligned with the densest."""
     lags: dict[str, list[float]] = {}
     for (name, _), relation in relations.items():
         lags.setdefault(name, []).append(relation.lag)

@@ -63,7 +63,7 @@ class Attitude:
 
     @property
     def is_open(self) -> bool:
-        """Whether no name says where w is."""
+        """Whether names leave open which column is w."""
         return bool(self.columns.quaternion and self.doubt)
 
     @property

@@ -36,7 +36,7 @@ class OwnFrame:
 
     @property
     def words(self) -> str:
-        """The same as a sentence without its subject."""
+        """The reasons as a sentence without its subject."""
         turned = "mirrored" if math.isnan(self.angle) else f"turned by about {self.angle * DEG:.0f}°"
         return (
             f"looks to stand in a frame of its own, {turned}: speeds follow (correlation"
@@ -71,7 +71,7 @@ def speeds_follow(command: Source, source: Source) -> Following | None:
 
 
 def _axes(command: Source, source: Source) -> list[str]:
-    """Those of x, y and z that both have."""
+    """The axes among x, y and z that both sources have."""
     return [axis for axis in CARTESIAN if axis in command.values and axis in source.values]
 
 

@@ -90,7 +90,7 @@ class Stream:
 
     @property
     def turns(self) -> dict[str, float]:
-        """After what axes begin anew [rad], for those that do."""
+        """The angle [rad] after which an axis begins anew, for each axis that does."""
         return {axis: TURN for axis, signals in self.axes.items() if any(signal.turns for signal in signals)}
 
     @property
@@ -99,7 +99,7 @@ class Stream:
         return any(signal.basis == "range" for signals in self.axes.values() for signal in signals)
 
     def kind(self, axis: str) -> Kind:
-        """What one of its axes is."""
+        """Whether one of its axes is a length or an angle."""
         return kind_of(f"_{self.axes[axis][0].unit}") or "length"
 
 
@@ -229,7 +229,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
 
 
 def told_as_speeds(roles: Roles) -> str:
-    """What to say where the commands are velocities, as they add up to what is measured; empty where they are not.
+    """A sentence where the commands are velocities, because their sum follows the measurements; empty elsewhere.
 
     What is left out is asked only where nothing measures: an integral of a controller adds up, too.
     """
@@ -243,7 +243,7 @@ def told_as_speeds(roles: Roles) -> str:
 
 
 def _adds_up(command: Stream, stream: Stream, axis: str) -> bool:
-    """Whether commands, added up by the clock, lead as far as a sensor goes, which they do not as they are."""
+    """Whether the integral of the commands moves as far as a sensor, and the commands themselves do not."""
     (stamp, speed), measured = (side.source.series(axis) for side in (command, stream))
     steps = 0.5 * (speed[1:] + speed[:-1]) * np.diff(stamp) / 1e9
     summed = following((stamp, np.concatenate(([0.0], np.cumsum(steps)))), measured)
@@ -324,7 +324,7 @@ def _drop_copies(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) 
 
 
 def _in_order(streams: Sequence[Stream], left_out: list[tuple[Stream, str]]) -> list[Stream]:
-    """The commands and what follows them, with quaternions in the order in which both turn alike."""
+    """The commands and other streams, with w of each quaternion at the end at which they turn alike."""
     command, *others = streams
     reference = next((other for other in others if other.attitude and not other.attitude.is_open), None)
     if command.attitude and command.attitude.is_open and reference is not None:
@@ -357,7 +357,7 @@ def relations(run: Run) -> dict[tuple[str, str], Following]:
 
 
 def another_clock(source: Source, command: Source) -> str:
-    """What to say of a source whose stamps are all before or all after those of the commands; empty for others."""
+    """A sentence on a source whose stamps all precede or all follow those of the commands; empty for others."""
     stamps, theirs = (rows.stamp[rows.stamp != NO_STAMP] / 1e9 for rows in (source, command))
     if len(stamps) and len(theirs) and (stamps.max() < theirs.min() or stamps.min() > theirs.max()):
         return (
@@ -368,7 +368,7 @@ def another_clock(source: Source, command: Source) -> str:
 
 
 def _on_one_clock(command: Stream, stream: Stream) -> Stream:
-    """A stream on the commands' clock, where it has another one by which it follows nothing, with a question.
+    """A stream whose clock is shifted to that of the commands, with a question, where unshifted it follows nothing.
 
     On one clock it stays as it is: of a motion that repeats itself the lag may be a period longer, which is asked.
     How late it follows is the difference of the clocks and the arm's lag together. Where both begin, or end, at once,
@@ -418,7 +418,7 @@ def _on_one_clock(command: Stream, stream: Stream) -> Stream:
 
 
 def streams_of(part: Part) -> list[Stream]:
-    """The columns of a part, those apart whose names say that they are something else, or another list."""
+    """The columns of a part as streams: names of roles, lists and copies tell streams apart."""
     if part.clock is None:
         return []
     groups: dict[_Group, list[Signal]] = {}
@@ -719,7 +719,7 @@ def _is_namesake(command: Stream, stream: Stream) -> bool:
 
 
 def _copies(other: Stream, stream: Stream) -> bool:
-    """Whether a stream says again what another says just then, also where that changes: one that is late does not."""
+    """Whether a stream repeats the numbers of another at the same instants, also where these change."""
     told, source = other.source, stream.source
     order = np.argsort(told.stamp, kind="stable")
     rows = np.searchsorted(told.stamp[order], source.stamp, side="right") - 1
@@ -809,7 +809,7 @@ def _without_shared_words(axes: Iterable[str]) -> dict[str, str]:
 
 
 def _same_kind(command: Stream, axis: str, stream: Stream, other: str) -> bool:
-    """Whether two axes can be the same by their units."""
+    """Whether the units of two axes allow them to be the same axis."""
     both = (*command.axes[axis], *stream.axes[other])
     return command.kind(axis) == stream.kind(other) or any(signal.basis == "range" for signal in both)
 
@@ -840,7 +840,7 @@ def _set_units(roles: Roles) -> Roles:
 
 
 def _angles_by_name(roles: Roles) -> Stream:
-    """The commands, in units of angles where nothing says it of them, but the name of what measures them."""
+    """The commands, in radians on axes that only the names of their sensors call angles."""
     axes = dict(roles.command.axes)
     for axis, signals in roles.command.axes.items():
         seen = [some for stream in roles.measured.values() for some in stream.axes.get(axis, ())]

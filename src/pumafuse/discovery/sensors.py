@@ -157,7 +157,7 @@ def _design(basis: Basis, at: FloatArray) -> _Design:
 
 @dataclass(frozen=True)
 class _Axis:
-    """What two sensors tell of an axis; the denser one is the first [s, m or rad], and the path is by it."""
+    """The rows of two sensors on an axis [s, m or rad]; the denser sensor is the first, and the path is by it."""
 
     name: str
     path: Path
@@ -171,7 +171,7 @@ class _Axis:
 
     @cached_property
     def first(self) -> _Design:
-        """Of the first sensor's rows, whatever the latency."""
+        """The design of the first sensor's rows, which no latency changes."""
         return _design(self.path.basis, self.s)
 
     def between(self, begin: float, end: float) -> _Axis:
@@ -203,7 +203,7 @@ def _of_run(run: Run, first: str, second: str) -> Alignment | None:
 
 
 def _count(source: Source) -> int:
-    """How many values it has, those of a bunch as one."""
+    """The number of values of a source, where a bunch counts as one."""
     apart, _ = _intervals(source)
     values = sum(int(np.isfinite(value).sum()) for value in source.values.values())
     return values * (apart + 1) // max(len(source.stamp), 1)
@@ -259,7 +259,7 @@ def _thinned(time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArra
 
 @dataclass(frozen=True)
 class _Noise:
-    """What is believed of an axis while the latency is sought.
+    """The numbers of an axis that the search for a latency takes as known in one round.
 
     How far the second sensor moves where the first moves by 1, the noise of both [m or rad], what the commands leave of
     the path, and the ridge of the responses, if it is known yet.
@@ -274,7 +274,7 @@ class _Noise:
 
 @dataclass(frozen=True)
 class _Linear:
-    """An axis about a latency, its n rows those of the first sensor before those of the second."""
+    """An axis linearised about a latency; of its n rows the first sensor's precede those of the second."""
 
     axis: _Axis
     at: FloatArray  # when the rows of the second were valid [s]
@@ -291,7 +291,7 @@ class _Linear:
 
 
 def _linear(axis: _Axis, noise: _Noise, latency: float, fitted: bool) -> _Linear:
-    """An axis about a latency; ``fitted``: the noise is fitted anew."""
+    """Linearise an axis about a latency; with ``fitted`` its noise is fitted anew."""
     n1, n2, at = len(axis.s), len(axis.x), axis.x - latency
     basis, two = axis.first, _design(axis.path.basis, at)
     left1, left2 = noise.left(axis.s), noise.left(at)
@@ -474,7 +474,7 @@ def _costs(axis: _Axis, latencies: FloatArray) -> FloatArray:
 
 
 def _alignment(fits: Sequence[_Fit], steps: Sequence[Step], swapped: bool, late: Source) -> Alignment:
-    """What is told of the second sensor; ``swapped``: it was the first one that was the slower."""
+    """The alignment of the second sensor by fits; ``swapped``: these are of the first beside the second."""
     sign, best = -1.0 if swapped else 1.0, max(fits, key=lambda fit: max(np.ptp(axis.axis.x) for axis in fit.axes))
     low, high = min(fit.latency - fit.half for fit in fits), max(fit.latency + fit.half for fit in fits)
     if swapped:

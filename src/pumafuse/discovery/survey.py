@@ -118,7 +118,7 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
 
 
 def _along_axes(run: Run, framed: Collection[str]) -> Run:
-    """A run in the arm's axes, without the sensors that stand aside."""
+    """A run in the arm's axes, without the sensors that stand in frames of their own."""
     kept = {name: source for name, source in run.sensors.items() if name not in framed}
     return in_axes(replace(run, sensors=kept), None)[0]
 
@@ -187,7 +187,7 @@ def _is_sure(following: Following) -> bool:
 
 
 def too_early(name: str, by: float) -> str:
-    """What to say and to do where a source moves before its commands by so many seconds."""
+    """A sentence, with advice, on a source that moves before its commands by so many seconds."""
     return (
         f"{name} is {by:.2g} s early: it moves before its commands, as no arm does, and no lag can be told. Are set"
         " points and measurements exchanged, or stamped by two clocks? In run.toml exchange them, or add shift_s ="
@@ -217,7 +217,7 @@ def soonest(survey: Survey) -> float:
 
 
 def _refuse_alone(log: Path, parts: Sequence[Part], roles: Roles, what: str) -> None:
-    """Refuse commands without a sensor, with why anything else is none."""
+    """Refuse commands without a sensor, with the reasons why nothing else in the log is one."""
     if not roles.sensors:
         reasons = dict.fromkeys([*(f"{stream.name}: {why}" for stream, why in roles.left_out), *unused(parts)])
         reasons_told = "; ".join([*reasons][:_MOST_REASONS]) or "nothing else is in the log"

@@ -368,7 +368,7 @@ def prefixes(paths: Sequence[str]) -> list[str]:
 
 
 def holders(fields: Iterable[str]) -> set[str]:
-    """The names of columns that are, or hold, one of the fields that are asked for."""
+    """The names of columns that are a requested field, or that contain one."""
     return {path[:end] for path in fields for end in _ends(path)}
 
 

@@ -35,7 +35,7 @@ def has_tables(path: Path) -> bool:
 
 
 def names(path: Path) -> list[str]:
-    """What the tables of a file are called: the only one is called nothing."""
+    """The names of the tables of a file; a single table has the empty name."""
     return list(_tables(path, _written(path)))
 
 
@@ -48,7 +48,7 @@ def table(path: Path, name: str) -> pa.Table | bytes:
 
 
 def turned_note(signals: int, numbers: int) -> str:
-    """What to say of a table that is read turned."""
+    """The note on a table that is read with rows and columns exchanged."""
     return f"has {plural(signals, 'row')} of {plural(numbers, 'number')}: read turned, each row as a column"
 
 

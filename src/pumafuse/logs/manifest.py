@@ -74,7 +74,7 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def columns(self) -> list[str]:
-        """All columns that it takes."""
+        """The columns that the stamps are read from."""
         return [column for column in (self.column, self.nanoseconds, self.counter) if column]
 
     def stamps(self, table: Table) -> tuple[TimeArray, list[str]]:
@@ -91,7 +91,7 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return stamp, notes
 
     def as_logged(self, table: Table) -> tuple[TimeArray, str | None]:
-        """The same as they are in the table, and a note."""
+        """Stamps as the table has them, without repair, and a note."""
         if self.rate:
             return table.frames(self.rate, self.column)
         return table.stamps(self.column, self.nanoseconds, self.ending)
@@ -141,7 +141,7 @@ class RowNoise(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def column(self) -> str:
-        """Whichever there is."""
+        """The column of standard deviations, or that of variances."""
         return self.sd or self.variance
 
     def factor(self, value: FloatArray) -> FloatArray:

@@ -73,7 +73,7 @@ def first_zeros(source: Source, others: Sequence[Source]) -> int:
 
 
 def usual_of(steps: FloatArray) -> float:
-    """The step than which few are larger; numpy's quantile takes longer, and imports masked arrays (0.02 s)."""
+    """The step that few others exceed; numpy's quantile takes longer, and imports masked arrays (0.02 s)."""
     rank = int(USUAL * len(steps))
     return float(np.partition(steps, rank)[rank])
 

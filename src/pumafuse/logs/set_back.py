@@ -86,7 +86,7 @@ def _step(stamp: TimeArray, begin: int, row: int, end: int) -> Step | None:
 
 
 def _sources(run: Run) -> dict[str, Source]:
-    """What is commanded and sensed: a reference may have a clock of its own, that goes on."""
+    """The commands and the sensors of a run: a reference may have a clock of its own, which nobody set."""
     return {"": run.command, **run.sensors}
 
 
@@ -96,7 +96,7 @@ def _candidates(steps: Mapping[str, list[Step]]) -> Iterable[Step]:
 
 
 def _common(run: Run, step: Step, steps: Mapping[str, list[Step]]) -> Step | None:
-    """The step back of all clocks at a step of one: the surest one; None where not all were."""
+    """The surest step back of all clocks at a step of one clock; None where some clock went on."""
     by_source = {name: [other for other in steps[name] if _agree(other, step)][:1] for name in steps}
     agreeing, several = [*chain(*by_source.values())], sum(map(len, by_source.values())) > 1 or not run.sensors
     others = (source for name, source in _sources(run).items() if not by_source[name])
@@ -122,7 +122,7 @@ def _goes_on(stamp: TimeArray, step: Step) -> bool:
 
 
 def _shows(stamp: TimeArray, step: Step) -> bool:
-    """Whether an interval of a reference is shorter by about a step, where that is."""
+    """Whether a reference has an interval that is shorter by about a step, near that step."""
     stamps = stamp[stamp != NO_STAMP]
     interval, near = np.diff(stamps), np.abs(stamps[1:] - step.newest) <= step.back + TOLERATED_STEP_BACK_NS
     return bool(near.any()) and float(interval[near].min()) < float(np.median(interval)) - 0.5 * step.back

@@ -676,7 +676,7 @@ def _header(lines: Sequence[str], full: Sequence[int]) -> int:
 
 
 def _told_apart(lines: Sequence[str], header: int, separator: str) -> tuple[int, list[str] | None]:
-    """The first line that names are from, and these; None where the header has them all.
+    """The first line that names come from, and the names; None where they are just the header's.
 
     Those that are the same have the ones above before them: X, Y, Z of a Rotation and of a Position.
     """
