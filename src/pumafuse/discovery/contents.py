@@ -213,7 +213,7 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
 
 
 def _of_one_run(parts: Sequence[Part]) -> list[Part]:
-    """The parts of a log, without further runs: of files or sheets with the same columns, and of trials, the first is kept.
+    """The parts of a log without further runs: of files or sheets of the same columns, and of trials, the first is kept.
 
     Tables of one file that share the stamps were written together, as of two arms: these are one run.
     """

@@ -74,7 +74,7 @@ _PIECES = 20  # of all recordings, that a model which is right has independent s
 _ENOUGH = 20_000  # commands or measurements of a recording that an arm is known by: more make none better
 _SLOPE = 1e-5  # of a coordinate, by which quantities are varied
 _RARE = 1e-4  # probability of an arm, from which it counts
-_NONE = Fit(Arm(0.0, 1.0), -math.inf, np.zeros((0, 0)))  # is worse than any
+_NONE = Fit(Arm(0.0, 1.0), -math.inf, np.zeros((0, 0)), np.zeros(0))  # is worse than any
 
 
 class Freedom(NamedTuple):

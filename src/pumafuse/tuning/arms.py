@@ -194,6 +194,7 @@ class Fit(NamedTuple):
     arm: Arm  # the arm
     log_posterior: float  # with the biases at their best
     information: FloatArray  # of the coordinates that were varied, the biases being at their best, (k, k)
+    score: FloatArray  # how the logarithm rises with these, (k,)
 
 
 class Measured:
@@ -410,14 +411,14 @@ class Measured:
                 step = bounded_step(best.score, best.information, *ends, np.full(len(names), damping))
                 expected = float(best.score @ step) - 0.5 * float(step @ best.information @ step)
                 if expected < _CLOSE or best.log_posterior + PROMISE * expected < worth:
-                    return Fit(best.arm, best.log_posterior, best.information)
+                    return best
                 trial = self._linear(best.arm.moved(names, (here + step).tolist()), names, noise, limits)
                 if trial.log_posterior > best.log_posterior:
                     best = trial
                     break
             else:
                 break
-        return Fit(best.arm, best.log_posterior, best.information)
+        return best
 
     def variances(
         self, arm: Arm, names: Coordinates, noise: NoiseModel, limits: Limits, pieces: int, size: Callable[[Arm], float]
@@ -480,7 +481,7 @@ class Measured:
         log, gain = self.weighed(arms, noise, limits)
         return [arms[number]._replace(gain=float(gain[number])) for number in np.argsort(-log)[:count].tolist()]
 
-    def _linear(self, arm: Arm, names: Coordinates, noise: NoiseModel, limits: Limits) -> _Linear:
+    def _linear(self, arm: Arm, names: Coordinates, noise: NoiseModel, limits: Limits) -> Fit:
         """Posterior, score and information at an arm."""
         left, slopes, log_determinant = self._sloped(arm, names, noise)
         information, score = slopes @ slopes.T, slopes @ left
@@ -490,7 +491,7 @@ class Measured:
                 information[row, row] += 1.0 / sd**2
                 score[row] -= (arm.coordinate(name) - mean) / sd**2
         log = -0.5 * (float(left @ left) + log_determinant + self.count * _LOG_2PI)
-        return _Linear(arm, log + limits.log_prior(arm, names), score, information)
+        return Fit(arm, log + limits.log_prior(arm, names), information, score)
 
     def _sloped(self, arm: Arm, names: Coordinates, noise: NoiseModel) -> tuple[FloatArray, FloatArray, float]:
         """What an arm leaves and how it changes with each coordinate, whitened, without biases; the sum of log S."""
@@ -600,15 +601,6 @@ def covariance(information: FloatArray, scale: float | Sequence[float] = 1.0) ->
     size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12 / np.square(scale)))
     values, vectors = np.linalg.eigh(information * np.outer(size, size))
     return (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(size, size)
-
-
-class _Linear(NamedTuple):
-    """An arm with its log-posterior, and score and information of the coordinates."""
-
-    arm: Arm
-    log_posterior: float
-    score: FloatArray
-    information: FloatArray
 
 
 # ---- the noise ------------------------------------------------------------------------------------------------------
