@@ -14,7 +14,7 @@ import pumafuse as pf
 from pumafuse.errors import RunError
 from pumafuse.fusion.results import Recipe
 from pumafuse.logs.run import Source
-from pumafuse.logs.set_back import going_on
+from pumafuse.logs.set_back import drop_steps_back
 from pumafuse.pieces import fusing
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -57,7 +57,7 @@ def logged(
 def test_stamps_go_on_where_all_clocks_are_set_back(back: float, rates: dict[str, float]) -> None:
     """As in a run whose clocks were right, with a note of how much and where; every estimate is its estimate."""
     run, right = logged({8.0: back}, rates=rates), logged(rates=rates)
-    found, (note,) = going_on(run)
+    found, (note,) = drop_steps_back(run)
     assert f"all clocks are set back by {back:.3f} s in row 287: stamps go on" in note
     for name, source in {"command": found.command, **found.sensors}.items():
         expected = right.command if name == "command" else right.sensors[name]
@@ -70,14 +70,14 @@ def test_stamps_go_on_where_all_clocks_are_set_back(back: float, rates: dict[str
 def test_sensors_that_do_not_sample_evenly_go_on_too() -> None:
     """Stamps that scatter by a third of their interval: to a few ms, by the commands, which are even."""
     run, right = logged({8.0: 0.4}, jitter=0.3, seed=1), logged(jitter=0.3, seed=1)
-    found, notes = going_on(run)
+    found, notes = drop_steps_back(run)
     assert len(notes) == 1
     assert np.abs(found.sensors["camera"].stamp - right.sensors["camera"].stamp).max() < 5e6
 
 
 def test_several_steps_go_on() -> None:
     run, right = logged({5.0: 0.4, 9.0: 0.2, 15.0: 0.7}), logged()
-    found, notes = going_on(run)
+    found, notes = drop_steps_back(run)
     assert [one.split(" by ")[1][:5] for one in notes] == ["0.400", "0.200", "0.700"]
     assert np.abs(found.command.stamp - right.command.stamp).max() <= 3
 
@@ -85,10 +85,10 @@ def test_several_steps_go_on() -> None:
 @pytest.mark.parametrize(("back", "rates"), [(0.03, RATES), (0.04, RATES), (0.05, {"tracker": 100.0})])
 def test_a_step_of_one_command_is_seen_where_a_sensor_is_dense(back: float, rates: dict[str, float]) -> None:
     """One command alone is behind, at once with three rows or more of a sensor."""
-    found, notes = going_on(logged({8.0: back}, rates=rates))
+    found, notes = drop_steps_back(logged({8.0: back}, rates=rates))
     assert len(notes) == 1
     assert np.abs(found.command.stamp - logged().command.stamp).max() <= 1
-    assert going_on(logged({8.0: back}, rates={"camera": 25.0}))[1] == []
+    assert drop_steps_back(logged({8.0: back}, rates={"camera": 25.0}))[1] == []
 
 
 @pytest.mark.parametrize(("rate", "back", "is_set"), [(1000.0, 0.1, True), (10.0, 0.9, False)])
@@ -96,7 +96,7 @@ def test_a_reference_may_have_a_clock_that_goes_on(rate: float, back: float, is_
     """Then its stamps are left as they are, which is said."""
     (right,) = logged(rates={"truth": rate}).sensors.values()
     (stepped,) = logged({8.0: back}, rates={"truth": rate}).sensors.values()
-    found, (note,) = going_on(replace(logged({8.0: back}), reference=stepped if is_set else right))
+    found, (note,) = drop_steps_back(replace(logged({8.0: back}), reference=stepped if is_set else right))
     assert note.endswith("stamps go on from there" if is_set else "; that of the reference is not")
     assert np.abs(found.reference.stamp - right.stamp).max() <= 1
     assert np.abs(found.command.stamp - logged().command.stamp).max() <= 1
@@ -104,14 +104,14 @@ def test_a_reference_may_have_a_clock_that_goes_on(rate: float, back: float, is_
 
 def test_one_sensor_alone_is_named_and_left() -> None:
     run = logged({8.0: 0.06}, only="tracker")
-    found, (note,) = going_on(run)
+    found, (note,) = drop_steps_back(run)
     assert found is run
     assert note.startswith("tracker: its clock is set back by 0.060 s in row 796, and others are not")
 
 
 def test_commands_alone_are_not_all() -> None:
     run = logged({8.0: 0.3}, only="command")
-    assert going_on(run)[0] is run
+    assert drop_steps_back(run)[0] is run
 
 
 @settings(max_examples=150)
@@ -143,7 +143,7 @@ def test_rows_out_of_order_are_no_clock(what: str, seed: int, jitter: float) -> 
 
     run = logged(jitter=jitter, seed=seed)
     run = run.each(lambda _, source: changed(source))
-    assert going_on(run) == (run, [])
+    assert drop_steps_back(run) == (run, [])
 
 
 def test_a_long_run_is_to_be_cut_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,4 +161,4 @@ def test_a_long_run_is_to_be_cut_there(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(RunError, match=r"all clocks are set back by 0\.300 s .* cut the log there"):
         fusing.fuse_to(tmp_path, tmp_path / "out", Recipe(CONFIG))
     whole = pf.Run.read(tmp_path)
-    assert np.abs(going_on(whole)[0].command.stamp - logged().command.stamp).max() <= 1
+    assert np.abs(drop_steps_back(whole)[0].command.stamp - logged().command.stamp).max() <= 1

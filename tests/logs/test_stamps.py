@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pumafuse.arrays import NO_STAMP
-from pumafuse.logs.stamps import going_on, packets, spread
+from pumafuse.logs.stamps import drop_wraps, packets, spread
 
 EVEN = 7_000_000 * np.arange(3000)  # ns
 
@@ -18,7 +18,7 @@ def test_clocks_that_begin_anew_go_on(unit: int, count: int, words: str, epoch: 
     """After 2^32 us or ms, a day or half of one, bare or on top of a date, to the last digit, over a dropout too."""
     wrap = count * unit
     true = np.delete(EVEN // unit * unit + wrap - 9_999_000_000, slice(1420, 1428))
-    found, notes = going_on(epoch + true % wrap, "log: t")
+    found, notes = drop_wraps(epoch + true % wrap, "log: t")
     assert (found == epoch + true).all()
     assert len(notes) == 1
     assert f"{words}, first in row" in notes[0]
@@ -27,7 +27,7 @@ def test_clocks_that_begin_anew_go_on(unit: int, count: int, words: str, epoch: 
 @pytest.mark.parametrize("way", [-1, 1])
 def test_one_step_of_an_hour_goes_on(way: int) -> None:
     hour = 3_600_000_000_000
-    found, notes = going_on(EVEN + way * hour * (np.arange(3000) >= 1234), "log: t")
+    found, notes = drop_wraps(EVEN + way * hour * (np.arange(3000) >= 1234), "log: t")
     assert (found == EVEN).all()
     assert "row 1235" in notes[0]
 
@@ -36,24 +36,24 @@ def test_one_step_of_an_hour_goes_on(way: int) -> None:
 def test_other_steps_stay(step: int) -> None:
     """A clock that is set by something else, and a pause, are left to who cuts runs."""
     stamp = EVEN + step * (np.arange(3000) >= 1000)
-    found, notes = going_on(stamp, "log: t")
+    found, notes = drop_wraps(stamp, "log: t")
     assert (found == stamp).all()
     assert not notes
 
 
 def test_hourly_pauses_stay() -> None:
     stamp = EVEN + 3_600_000_000_000 * (np.arange(3000) // 1000)
-    assert (going_on(stamp, "log: t")[0] == stamp).all()
+    assert (drop_wraps(stamp, "log: t")[0] == stamp).all()
 
 
 def test_zeros_far_from_all_others_are_missing() -> None:
     """Zeros among stamps since 1970 are none; a clock that begins with 0 keeps it."""
     stamp = EVEN + 1_700_000_000_000_000_000
     stamp[[0, 1, 2, 700, 701, 702, 703]] = 0
-    found, notes = going_on(stamp, "log: t")
+    found, notes = drop_wraps(stamp, "log: t")
     assert (found[[0, 702]] == NO_STAMP).all()
     assert "7 stamps of 0" in notes[0]
-    assert (going_on(EVEN, "log: t")[0] == EVEN).all()
+    assert (drop_wraps(EVEN, "log: t")[0] == EVEN).all()
 
 
 def test_packets_are_spread_along_their_earliest_arrivals() -> None:

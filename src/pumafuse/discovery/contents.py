@@ -420,13 +420,13 @@ def _joints(table: Table, paths: Sequence[str]) -> dict[str, str]:
     listed: Any = None if column is None or not len(column) else column[0].as_py()
     joints = cast(list[Any], listed if isinstance(listed, list) else [])
     joints_by_path = {
-        path: names.plain(str(joints[int(match[1])]))
+        path: names.identifier(str(joints[int(match[1])]))
         for path in paths
         if (match := _OF_JOINT.search(path)) and int(match[1]) < len(joints)
     }
     for name, column in table.columns.items():
         if (match := _NAMED.fullmatch(name)) and pa.types.is_string(column.type) and column.null_count < len(column):
-            joints_by_path[f"{match[1]}position{match[2]}"] = names.plain(column.drop_null()[0].as_py())
+            joints_by_path[f"{match[1]}position{match[2]}"] = names.identifier(column.drop_null()[0].as_py())
     return joints_by_path
 
 

@@ -68,7 +68,7 @@ def _other_columns(part: Part) -> list[str]:
     """The columns of a part that are in no source, and why."""
     clockless = without_clock(part) if part.clock is None else ""
     others = dict.fromkeys((signal.column for signal in part.signals if clockless), clockless) | dict(part.left_out)
-    lines = [f"# {_pair(names.plain(column), column, printable(why, 200))}" for column, why in others.items()]
+    lines = [f"# {_pair(names.identifier(column), column, printable(why, 200))}" for column, why in others.items()]
     return ["", f"# Of {printable(part.label)} not taken for positions:", *lines] if others else []
 
 

@@ -329,12 +329,12 @@ def axis_of(column: str, labels: list[str]) -> str:
     label = None if unit_of(column) else re.search(r"\[([^\]]*)\]$", column)
     if label and label[1].isdigit():
         if (told := label_of(column, labels)) is not None:
-            return plain(re.sub(r"\.pos$", "", told))
+            return identifier(re.sub(r"\.pos$", "", told))
         number = int(label[1])
         spatial = number < 3 and not {"translation", "translations"}.isdisjoint(words(column))
         return "xyz"[number] if spatial else f"joint{number}"
     if label:
-        return plain(label[1]) or "position"
+        return identifier(label[1]) or "position"
     unit = unit_of(column)
     kept = [word for word in words(column) if word not in _SILENT and word.rstrip(_DIGITS) not in _DEVICES]
     if unit and kept and _UNITS.get(kept[-1]) == unit:
@@ -343,7 +343,7 @@ def axis_of(column: str, labels: list[str]) -> str:
     if kept and all(word.isdigit() for word in kept):
         kept = ["joint", *kept]
     named = leaf(column).rpartition(".")[2] if unit and "." in column else ""  # command.arm_deg is of the axis arm
-    return plain("_".join(kept)) or plain(named) or "position"
+    return identifier("_".join(kept)) or identifier(named) or "position"
 
 
 def label_of(column: str, labels: list[str]) -> str | None:
@@ -352,7 +352,7 @@ def label_of(column: str, labels: list[str]) -> str | None:
     return labels[int(index[1])] if index and int(index[1]) < len(labels) else None
 
 
-def plain(name: str) -> str:
+def identifier(name: str) -> str:
     """A name that can be an axis or a sensor: letters, digits, no unit at its end."""
     made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")[:60]
     while (unit := ending(made)) is not None:

@@ -141,7 +141,7 @@ def path(command: tuple[FloatArray, FloatArray], lag: float, s: FloatArray, z: F
     level = float(residual.mean())
     left = residue(s, residual - level, weights.freedom)
     free = max(len(s) - 1.0 - weights.freedom - left.freedom, 1.0)
-    sd = robust_sd(residual - level - left(s)) * math.sqrt(len(s) / free)
+    sd = quantile_sd(residual - level - left(s)) * math.sqrt(len(s) / free)
     return Path(basis, weights.coefficients, level, left, sd)
 
 
@@ -158,10 +158,10 @@ def _explained(
 
 def clipped_rms(left: FloatArray) -> float:
     """Root of the mean square, of each not more than ten robust deviations: what many rows have is no outlier."""
-    kept = np.clip(left, *(_CLIP * robust_sd(left) * np.array([-1.0, 1.0])))
+    kept = np.clip(left, *(_CLIP * quantile_sd(left) * np.array([-1.0, 1.0])))
     return math.sqrt(float(kept @ kept) / len(kept))
 
 
-def robust_sd(left: FloatArray) -> float:
+def quantile_sd(left: FloatArray) -> float:
     """Standard deviation by the 90 % quantile: a tenth may be outliers, and most may be at rest."""
     return float(np.quantile(np.abs(left), 0.9)) / 1.645

@@ -169,7 +169,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         raise UndecidedError(log, f"{why}; {advice}", parts)
     named = dict[str, Stream]()
     for apart_stream in _apart_by_name(streams[0]) if len(streams) == 1 else streams:
-        name = _unused_name(apart_stream.name, named.keys())
+        name = _unused(apart_stream.name, named.keys())
         named[name] = replace(apart_stream, name=name)
     streams = _set_seen_targets(list(named.values()))
     if (chosen := _command(streams)) is None:
@@ -444,10 +444,10 @@ def streams_of(part: Part) -> list[Stream]:
         by_column = (names.column_role(signals[0].name), f"its columns are called '{key.replace('_', ' ')}'")
         order = (by_column, by_file) if len(groups) > 1 else (by_file, by_column)
         role, why = next((choice for choice in (wanted, *order, by_clock, by_type) if choice[0]), (None, ""))
-        name = key if roles[key] == 1 else names.plain(f"{listed or key or part.stem}{copy}")
+        name = key if roles[key] == 1 else names.identifier(f"{listed or key or part.stem}{copy}")
         # What has no word of its own beside commands is not called after the file: another of its kind fits then.
         beside_commands = roles.keys() > {""} and "command" in of_columns
-        prefix = _prefix(signals, told, roles.keys()) if beside_commands else names.plain(part.stem)
+        prefix = _prefix(signals, told, roles.keys()) if beside_commands else names.identifier(part.stem)
         name = name if len(groups) > 1 and name else prefix
         axes, attitude = _axes(signals), None
         if any(axis in CARTESIAN for axis in axes):
@@ -459,7 +459,7 @@ def streams_of(part: Part) -> list[Stream]:
 def _prefix(signals: Sequence[Signal], told: Set[str], taken: Set[str]) -> str:
     """The name of columns beside commands: what all of them have in front of commanded axes, else ``measured``."""
     prefixes = {signal.axis.removesuffix(axis) for signal in signals for axis in told if _ends_with(signal.axis, axis)}
-    return names.plain(prefixes.pop()) if len(prefixes) == 1 and prefixes != {""} else _unused_name("measured", taken)
+    return names.identifier(prefixes.pop()) if len(prefixes) == 1 and prefixes != {""} else _unused("measured", taken)
 
 
 def _repeated_apart(key: _Group, signals: Sequence[Signal]) -> Iterator[tuple[_Group, list[Signal]]]:
@@ -491,7 +491,7 @@ def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
     for signal in signals:
         parts = {axis for axis, some in by_axis.items() if names.has_word(some[0].name, names.PARTS)}
         summed = parts if names.has_word(signal.name, names.PARTS) else set[str]()
-        by_axis.setdefault(_unused_name(signal.axis, by_axis.keys() - summed), []).append(signal)
+        by_axis.setdefault(_unused(signal.axis, by_axis.keys() - summed), []).append(signal)
     return {
         axis: some
         for axis, some in by_axis.items()
@@ -522,7 +522,7 @@ def _apart_by_name(stream: Stream) -> list[Stream]:
             return word in inside if word else others.isdisjoint(inside)
 
         attitude = next(filter(has_word, stream.part.attitudes), None)
-        return Stream(names.plain(word) or stream.name, None, "", stream.part, axes, attitude)
+        return Stream(names.identifier(word) or stream.name, None, "", stream.part, axes, attitude)
 
     ways = list[list[Stream]]()
     for word, axes_of_word in by_word.items():
@@ -615,7 +615,7 @@ def _set_seen_targets(streams: Sequence[Stream]) -> list[Stream]:
     return looked_at
 
 
-def _unused_name(name: str, taken: Set[str]) -> str:
+def _unused(name: str, taken: Set[str]) -> str:
     """A name, with a number where it is taken: ``x``, ``x_2``."""
     numbered = (name if number == 1 else f"{name}_{number}" for number in count(1))
     return next(candidate for candidate in numbered if candidate not in taken)

@@ -21,7 +21,7 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..logs.run import Run, Source
 from ..units import MS
 from .following import following, in_seconds, isolated, phase
-from .paths import ASIDE, Basis, Path, Residue, Shrunk, clipped_rms, interpolated, path, residue, robust_sd, shrunk
+from .paths import ASIDE, Basis, Path, Residue, Shrunk, clipped_rms, interpolated, path, quantile_sd, residue, shrunk
 
 _FOLLOWS = 0.5  # correlation of changes below which two sensors do not see one motion
 _FEWEST = 40  # rows of a sensor from which its latency is looked for
@@ -466,7 +466,7 @@ def _costs(axis: _Axis, latencies: FloatArray) -> FloatArray:
     table = np.linspace(begin, end, min(_TABLE, int((end - begin) / _DENSE) + 2))
     left = axis.z2[:, None] - axis.slope * np.interp(axis.x[:, None] - latencies, table, axis.path(table))
     left -= np.median(left, axis=0)
-    sd = min(map(robust_sd, left.T))
+    sd = min(map(quantile_sd, left.T))
     return np.minimum((left / max(sd, 1e-9 * float(np.ptp(axis.z2)))) ** 2, _FAR)
 
 
@@ -514,7 +514,7 @@ def _jitter(fit: _Fit, swapped: bool) -> tuple[float, dict[str, float]]:
     """
     rows = [axis.late(swapped) for axis in fit.axes]
     each = [axis.noise.sd1 if swapped else axis.noise.sd2 for axis in fit.axes]
-    sds = {axis.axis.name: sd * robust_sd(left) for axis, sd, (left, _) in zip(fit.axes, each, rows, strict=True)}
+    sds = {axis.axis.name: sd * quantile_sd(left) for axis, sd, (left, _) in zip(fit.axes, each, rows, strict=True)}
     squares, speed = (np.concatenate(some) ** 2 for some in zip(*rows, strict=True))
     number = np.repeat(np.arange(len(rows)), [len(late) for late, _ in rows])
     X = np.column_stack([number[:, None] == np.arange(len(rows)), speed]).astype(np.float64)

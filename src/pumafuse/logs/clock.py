@@ -17,7 +17,7 @@ from ..errors import RunError
 from ..units import TIMES, mistaken
 from .run import REFERENCE, TOLERATED_STEP_BACK_NS, Run, Source, note_rows
 from .screening import first_zeros, without_stray_values
-from .set_back import going_on
+from .set_back import drop_steps_back
 
 _OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
 _MOST_LOST = 2.5  # times the update period, from which more than half of the commands are missing
@@ -110,7 +110,7 @@ def without_strays(run: Run) -> Run:
     """The run without stray stamps (see :func:`stray_offsets`) and commands, and a note on each source that has any.
 
     Before that, stamps of clocks that were set back by up to 1 s are shifted so that they go on
-    (:func:`.set_back.going_on`).
+    (:func:`.set_back.drop_steps_back`).
 
     Their rows stay, without a stamp: commands are not used, measurements are invalid. Rows of sensors and of the
     reference that are far behind keep their stamps, since they disturb no other: they become too late. This is done
@@ -118,7 +118,7 @@ def without_strays(run: Run) -> Run:
     """
     if run.without_strays:
         return run
-    run, steps = going_on(run)
+    run, steps = drop_steps_back(run)
     notes = [*run.notes, *steps]
 
     def mended(label: str, source: Source) -> Source:

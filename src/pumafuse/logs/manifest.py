@@ -23,7 +23,7 @@ from ..toml import NotNegative, Positive
 from ..units import ANGLES, POSITIONS, TIMES, Kind, ending, from_si, kind_of, refuse_name
 from .columns import DAYS, TICKS, Table, leaf
 from .frames import CARTESIAN, Frame
-from .stamps import going_on, spread
+from .stamps import drop_wraps, spread
 
 _OF_TIME = {"unit", "nanoseconds", "counter", "shift_s"}  # keys beside a column of stamps
 _MOST = 2**63  # more than a whole number of a column can be
@@ -82,7 +82,7 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         stamp, note = self.as_logged(table)
         notes = [] if note is None else [note]
         if not self.rate:
-            stamp, more = going_on(stamp, f"{table.path.name}: {self.column}")
+            stamp, more = drop_wraps(stamp, f"{table.path.name}: {self.column}")
             notes += more
         if self.counter:
             stamp = spread(stamp, table.plain(self.counter)[0])

@@ -35,7 +35,7 @@ class Step(NamedTuple):
     behind: int  # how many rows are behind 'newest'
 
 
-def going_on(run: Run) -> tuple[Run, list[str]]:
+def drop_steps_back(run: Run) -> tuple[Run, list[str]]:
     """A run whose stamps go on where all clocks were set back, and a sentence on each step, also of a source alone."""
     notes = list[str]()
     for _ in range(_MOST):

@@ -24,7 +24,7 @@ _AT_ONCE_NS = 300_000  # between rows of a packet: nothing that moves an arm is 
 _LEAST_WAIT = 0.02  # s, from which it matters
 
 
-def going_on(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
+def drop_wraps(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
     """Stamps that go on over wraps of 32 bits, midnight and one step of an hour, without zeros, and notes on each."""
     notes, zero = list[str](), stamp == 0
     others = stamp[~zero & (stamp != NO_STAMP)]

@@ -34,7 +34,7 @@ from ..logs import tables
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, clock_faults
 from ..logs.manifest import stamps_of
 from ..logs.run import Run
-from ..logs.set_back import going_on
+from ..logs.set_back import drop_steps_back
 from .merging import Digest, digest, merge
 from .reading import Log
 
@@ -120,7 +120,7 @@ def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> tupl
 
 def _piece(run: Run, recipe: Recipe, begun: Segment, core: Filter, span: tuple[int, int]) -> Estimates:
     """The estimates of the rows after and until the instants ``span`` [int ns], with notes."""
-    moved, steps = going_on(run)
+    moved, steps = drop_steps_back(run)
     if moved is not run:
         raise RunError(f"{steps[0]}; {_IN_ORDER}")
     in_place, placed, config = in_base(run, recipe.config, whole=False)
