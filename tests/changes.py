@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pumafuse as pf
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 
 Change = Callable[[Source], Source]
 

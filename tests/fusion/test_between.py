@@ -8,7 +8,7 @@ import pytest
 import pumafuse as pf
 from fusion.test_oracle import GRID, MODES, MS, NOISE, PANEL, TRACKER, UNDER, VISION, Case, one, replace_, warned
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.tuning.likelihood import Likelihood
 from refusals import one_line
 from tuning_runs import outage

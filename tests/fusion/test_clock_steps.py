@@ -13,7 +13,7 @@ from pumafuse.fusion.clock_steps import find_leaps
 from pumafuse.fusion.faults import Fault, find_faults
 from pumafuse.fusion.placing import in_base
 from pumafuse.fusion.segments import build_segment
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.tuning.parameters import changed
 from tuning_runs import SCENARIOS, later
 

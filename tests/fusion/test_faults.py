@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import pumafuse as pf
 from changes import of_sensor
 from fusion.test_between import cut
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.tuning.likelihood import Likelihood
 from tuning_runs import SCENARIOS, outage, scenario, with_process, with_sensors
 

@@ -13,7 +13,8 @@ from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.config import FusionConfig
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.logs.run import Run, Source
+from pumafuse.logs.run import Run
+from pumafuse.logs.source import Source
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 

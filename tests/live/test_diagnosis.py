@@ -14,7 +14,7 @@ from changes import Change, delayed, exchanged, of_sensor, scaled
 from pumafuse.filter.response import response
 from pumafuse.fusion.consistency import consistency
 from pumafuse.fusion.verdicts import sentence
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from streams import events_of, feed
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from streams import (
     counted,
     delayed,

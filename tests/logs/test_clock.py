@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import RunError
 from pumafuse.logs.clock import segments, stray_offsets, without_strays
-from pumafuse.logs.run import Run, Source
+from pumafuse.logs.run import Run
+from pumafuse.logs.source import Source
 from refusals import one_line
 
 SECOND = 1_000_000_000

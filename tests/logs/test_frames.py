@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from pumafuse.logs.axes import in_axes
 from pumafuse.logs.frames import Cylindrical, Frame, Placed, Rotated
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from refusals import one_line
 
 SIGN = {"counterclockwise": 1.0, "clockwise": -1.0}

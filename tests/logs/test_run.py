@@ -12,7 +12,8 @@ import pytest
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import PumafuseError
 from pumafuse.logs import manifest
-from pumafuse.logs.run import Run, Source
+from pumafuse.logs.run import Run
+from pumafuse.logs.source import Source
 from refusals import one_line
 
 HOST = "t_ms,nominal_mm,correction_um,z_m,note\n0,560,500,0.1,a\n28,561,-500,0.2,b\n56,561,,0.2,c\n"

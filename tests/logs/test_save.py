@@ -15,8 +15,8 @@ from pumafuse import Run
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import RunError
 from pumafuse.logs.frames import Cylindrical, Rotated
-from pumafuse.logs.run import Source
 from pumafuse.logs.save import save
+from pumafuse.logs.source import Source
 from refusals import one_line
 
 DAYS_26 = 26 * 86400 * 10**9

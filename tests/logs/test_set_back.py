@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from pumafuse.errors import RunError
 from pumafuse.fusion.results import Recipe
-from pumafuse.logs.run import Source
 from pumafuse.logs.set_back import drop_steps_back
+from pumafuse.logs.source import Source
 from pumafuse.pieces import fusing
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")

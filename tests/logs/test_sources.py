@@ -16,7 +16,8 @@ import pytest
 from pumafuse import ArmModel, AxisModel, FirstOrder, FusionConfig, Sensor, fuse
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import PumafuseError, PumafuseWarning
-from pumafuse.logs.run import Run, Source
+from pumafuse.logs.run import Run
+from pumafuse.logs.source import Source
 from refusals import one_line
 
 ROWS = 500

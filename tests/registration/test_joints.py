@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import pumafuse as pf
-from pumafuse.logs.run import Run, Source
+from pumafuse.logs.run import Run
+from pumafuse.logs.source import Source
 from pumafuse.space.kinematics import Chain, Joints
 
 URDF = Path(__file__).parents[2] / "examples" / "pose-virtual" / "puma560.urdf"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.simulation.motion import grid
 from pumafuse.simulation.true_sensor import Bursts, Outliers, TrueSensor, measure, valid_times
 

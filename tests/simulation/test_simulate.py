@@ -10,7 +10,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.axes import in_axes
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.simulation.simulate import write
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

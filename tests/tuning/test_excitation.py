@@ -8,7 +8,7 @@ import pytest
 
 import pumafuse as pf
 from changes import Change, delayed, exchanged, of_sensor, scaled
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.tuning.parameters import Fit
 from tuning_runs import fit_stage, later, outage, quietly, scenario, spoiled
 

@@ -14,7 +14,7 @@ from fusion.test_oracle import CASES, MS, UNDER, Case, Seen, anomalous, every, s
 from fusion_oracle import AxisOracle
 from pumafuse.filter.outcome import ABSENT
 from pumafuse.fusion.consistency import densities_of, log_likelihood
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.model.arm import AxisModel
 from pumafuse.simulation.true_sensor import Outliers
 from pumafuse.tuning.likelihood import Likelihood, Point

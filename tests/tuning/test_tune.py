@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.parameters import Fit
 from pumafuse.tuning.stage import Plan

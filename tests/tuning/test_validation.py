@@ -8,7 +8,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.fusion.consistency import consistency, densities_of
-from pumafuse.logs.run import Source
+from pumafuse.logs.source import Source
 from pumafuse.tuning.validation import Check, check
 from tuning_runs import replaced, spoiled, with_outliers, with_process, with_sensors
 

@@ -22,7 +22,8 @@ from ..fusion.consistency import Finding
 from ..fusion.estimates import Mode
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
-from ..logs.run import Source, described
+from ..logs.run import described
+from ..logs.source import Source
 from ..model.arm import ArmModel
 from ..tuning.identifiability import LostError
 from ..tuning.parameters import Fit

@@ -28,7 +28,7 @@ from ..logs.columns import LOG_TIME, Table, Topic, leaf, longest, numeric_paths,
 from ..logs.frames import CARTESIAN
 from ..logs.manifest import ERROR, Time, is_error
 from ..logs.recordings import PATH, PATH_TIME
-from ..logs.run import Source, standing_clock
+from ..logs.source import Source, standing_clock
 from ..logs.stamps import packets
 from ..units import TIMES, Kind, divisor, ending, kind_of, si_of, unwrapped, wraps
 from . import names
@@ -483,7 +483,7 @@ def _signal(
     try:
         values, _ = table.plain(path)
         values = values if (none := sentinel(values)) is None else without(values, none)
-        values = np.where(tables.meets(table, where), values, np.nan) if where else values
+        values = np.where(table.meets(where), values, np.nan) if where else values
     except RunError as error:
         return printable(str(error).removeprefix(f"{table.path}: "))
     finite = values[np.isfinite(values)]

@@ -13,7 +13,8 @@ import numpy as np
 
 from ..arrays import FloatArray, TimeArray, known_rows
 from ..logs.frames import CARTESIAN
-from ..logs.run import Run, Source
+from ..logs.run import Run
+from ..logs.source import Source
 from ..space import rotations
 from ..units import DEG
 from .following import Following, following

@@ -19,7 +19,8 @@ from ..logs.axes import FARTHEST_TURN
 from ..logs.columns import leaf
 from ..logs.frames import CARTESIAN
 from ..logs.recordings import PATH_TIME
-from ..logs.run import REFERENCE, Run, Source
+from ..logs.run import REFERENCE, Run
+from ..logs.source import Source
 from ..units import AN, DEG, GUESSED, KINDS, TURN, Kind, kind_of
 from . import names
 from .contents import (

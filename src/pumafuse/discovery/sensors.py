@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
-from ..logs.run import Run, Source
+from ..logs.run import Run
+from ..logs.source import Source
 from ..units import MS
 from .following import following, in_seconds, isolated, phase
 from .paths import ASIDE, Basis, Path, Residue, Shrunk, clipped_rms, interpolated, path, quantile_sd, residue, shrunk

@@ -16,7 +16,8 @@ from ..filter.events import COMMAND, Events
 from ..filter.outcome import ABSENT, Outcome
 from ..logs.clock import clock_faults, segments
 from ..logs.frames import Cylindrical, Placed
-from ..logs.run import Run, Source
+from ..logs.run import Run
+from ..logs.source import Source
 from ..model.arm import ArmModel
 from ..units import Kind, seconds
 from .config import FusionConfig

@@ -18,8 +18,9 @@ from ..filter.response import at_rest, follow, record_of
 from ..logs.axes import in_axes, reference_orientation
 from ..logs.clock import TOLERATED_STEP_BACK_NS, without_strays
 from ..logs.frames import CARTESIAN, Placed
-from ..logs.run import Run, Source
+from ..logs.run import Run
 from ..logs.screening import lost
+from ..logs.source import Source
 from ..model.arm import ArmModel
 from ..space import rotations
 from ..space.rotations import TURNING

@@ -11,7 +11,7 @@ import numpy as np
 from .. import toml
 from ..arrays import NO_STAMP, BoolArray, FloatArray, IndexArray, IntArray, TimeArray, median
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, in_order
-from ..logs.run import Source
+from ..logs.source import Source
 from ..space import rotations
 from ..space.rotations import TURNING
 from ..units import seconds

@@ -25,8 +25,9 @@ from ..filter.response import response
 from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind, in_order
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
-from ..logs.run import Run, Source, note_rows
+from ..logs.run import Run
 from ..logs.screening import held
+from ..logs.source import Source, note_rows
 from ..model.arm import ArmModel, AxisModel
 from ..units import AN, of_kind, seconds
 from .config import FusionConfig

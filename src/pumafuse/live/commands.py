@@ -13,7 +13,7 @@ from ..arrays import FloatArray
 from ..filter.outcome import Outcome
 from ..logs.clock import interval_fault, missing_commands
 from ..logs.frames import Cylindrical, Frame
-from ..logs.run import Source
+from ..logs.source import Source
 from ..model.arm import ArmModel, Validity
 from ..units import Kind
 from .rate_limit import RateLimitedLog

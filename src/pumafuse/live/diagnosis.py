@@ -29,7 +29,8 @@ from ..fusion.faults import Fault, find_faults, settling_time
 from ..fusion.offline import judge
 from ..fusion.segments import Segment, build_segment
 from ..fusion.verdicts import SHOWS, likeliest, sentence
-from ..logs.run import Run, Source
+from ..logs.run import Run
+from ..logs.source import Source
 from .rate_limit import RateLimitedLog
 
 _SPAN_NS = 20_000_000_000  # of the past in which faults are looked for: within 5 s causes are mistaken for each other

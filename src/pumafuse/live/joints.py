@@ -74,7 +74,7 @@ class Joints:
         """Add a command; by stamps where it tells each joint to be, and where those tell it that it changes.
 
         A joint that answers later is commanded later, on the line from command to command, as
-        :meth:`pumafuse.logs.run.Source.delayed` has it.
+        :meth:`pumafuse.logs.source.Source.delayed` has it.
         """
         at = bisect_left(self._stamps, stamp)
         again = at < len(self._stamps) and self._stamps[at] == stamp

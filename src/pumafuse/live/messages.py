@@ -20,7 +20,7 @@ from ..logs import bags
 from ..logs.columns import LOG_TIME, NAMES, SPLIT_STAMPS, holders, leaf
 from ..logs.manifest import Column, CommandEntry, Manifest, Orientation, SourceEntry, Time
 from ..logs.recordings import PATH, TRANSFORMS, CommandedPath, begin_of, trajectory_in
-from ..logs.run import PAUSE, Source
+from ..logs.source import PAUSE, Source
 from ..units import POSITIONS, TIMES, divisor, ending
 from .tool import NOISE, ORIENTATION
 from .wire import Event

@@ -16,7 +16,8 @@ from ..errors import RunError
 from ..fusion.config import FusionConfig
 from ..fusion.segments import believed_commands
 from ..logs.clock import segments
-from ..logs.run import Run, Source
+from ..logs.run import Run
+from ..logs.source import Source
 from .tool import NOISE, ORIENTATION
 from .wire import Event, Lines
 

@@ -22,8 +22,8 @@ from ..fusion.config import FusionConfig
 from ..fusion.placing import Placing, turning_axes
 from ..logs.axes import FAR_TURN, FARTHEST_TURN
 from ..logs.frames import CARTESIAN
-from ..logs.run import NOISE
 from ..logs.screening import lost
+from ..logs.source import NOISE
 from ..model.arm import ArmModel
 from ..space import rotations
 from ..space.rotations import TURNING

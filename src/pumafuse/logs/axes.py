@@ -13,7 +13,8 @@ from ..space import rotations
 from ..space.rotations import TURNING
 from .clock import segments, without_strays
 from .frames import CARTESIAN, Frame, Placed, Rotated
-from .run import Run, Source
+from .run import Run
+from .source import Source
 
 FARTHEST_TURN = math.radians(170.0)  # at 180° a rotation vector changes its sign
 FAR_TURN = math.radians(120.0)  # from where on the axes of a rotation vector are far from linear

@@ -15,9 +15,10 @@ import numpy as np
 from ..arrays import NO_STAMP, IntArray, TimeArray, median
 from ..errors import RunError
 from ..units import TIMES, mistaken
-from .run import REFERENCE, TOLERATED_STEP_BACK_NS, Run, Source, note_rows
+from .run import REFERENCE, Run
 from .screening import first_zeros, without_stray_values
 from .set_back import drop_steps_back
+from .source import TOLERATED_STEP_BACK_NS, Source, note_rows
 
 _OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
 _MOST_LOST = 2.5  # times the update period, from which more than half of the commands are missing

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeAlias, cast
@@ -26,6 +26,7 @@ from ..errors import RunError, UnknownNameError, plural, reason, shortened
 from . import dates
 
 Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
+Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
 
 DAYS, TICKS = "_days", "_ticks"  # units of stamps that a program counts from a day of its own on
 # Their length [s], 1970-01-01 by the two programs, and above which number they are the second one's.
@@ -55,6 +56,7 @@ SENTINELS = {
 }
 _FAR, _OTHERS = 10.0, 10  # times all other numbers of a column; different ones at least: steps may go to 999
 _LONGEST_LIST = 64  # elements of a list that are listed one by one
+_SOME = 8  # values in an error
 _MOST_BYTES = 1 << 30  # of a table
 
 
@@ -128,6 +130,18 @@ class Table:
         if (np.abs(time) >= REACH_NS / 1e9).any():
             raise RunError(f"{self.path}: at {rate:g} Hz a row is stamped beyond the year 2115; check rate_hz")
         return units.nanoseconds(time), note
+
+    def meets(self, where: Where) -> BoolArray:
+        """Rows in which each of some columns has a value, (rows,)."""
+        every = met(self.path, self.columns, conditions(self.path, self.columns, where))
+        is_met = _filled(every.cast(pa.uint8()), 0) > 0
+        if not is_met.any():
+            raise no_row(self.path, [self.columns], where)
+        return is_met
+
+    def unwrapped(self, _: str, /, angle: FloatArray, turn: float) -> FloatArray:
+        """Angles of a column that go on, from those that begin anew after each turn [all in rad]."""
+        return units.unwrapped(angle, turn)
 
     def is_dated(self, name: str) -> bool:
         """Whether a column has dates, or times of day, and nothing else."""
@@ -397,6 +411,51 @@ def find(columns: Columns, path: str, where: str, *, part: bool = False) -> pa.C
         raise UnknownNameError(where, "column", path, columns)
     label = f"{where}: column '{shortened(path)}'"
     return _inside(columns[name], path[len(name) :], columns.get(NAMES), label, part)
+
+
+def conditions(path: Path, columns: Columns, where: Where) -> dict[str, pa.Scalar]:
+    """What the columns of ``where`` are compared with: in their own precision, 0.1 is found among float32, too."""
+    asked = dict[str, pa.Scalar]()
+    for name, value in where.items():
+        kind = find(columns, name, str(path)).type
+        text, floating = pa.types.is_string(kind) or pa.types.is_large_string(kind), pa.types.is_floating(kind)
+        of_type = pa.types.is_integer(kind) or floating or pa.types.is_decimal(kind)
+        if isinstance(value, str | bool):
+            of_type = text if isinstance(value, str) else pa.types.is_boolean(kind)
+        if not of_type:
+            what = f"column '{shortened(name)}' holds {shortened(str(kind))}, never {_written(value)}"
+            raise RunError(f"{path}: where: {what}")
+        asked[name] = pa.scalar(value, kind) if text or floating else pa.scalar(value)
+    return asked
+
+
+def met(path: Path, columns: Columns, asked: Mapping[str, pa.Scalar]) -> pa.ChunkedArray:
+    """Which rows of some columns meet all conditions; what is null meets none."""
+    every = (pc.equal(find(columns, name, str(path), part=True), value) for name, value in asked.items())
+    return reduce(pc.and_, every)
+
+
+def no_row(path: Path, parts: Iterable[Columns], where: Where) -> RunError:
+    """What to say when no row is left: what the columns hold, their range or some of it."""
+    held: dict[str, list[Any]] = {name: [] for name in where}
+    for columns in parts:
+        for name, values in held.items():
+            values_seen = {*values, *pc.unique(find(columns, name, str(path), part=True).drop_null()).to_pylist()}
+            ordered = sorted(values_seen)
+            held[name] = ordered[:_SOME] if isinstance(where[name], str) else ordered[:1] + ordered[1:][-1:]
+    wanted = " and ".join(f"{shortened(name)} = {_written(value)}" for name, value in where.items())
+    ranges = list[str]()
+    for name, values in held.items():
+        said = list(map(_written, values))
+        words = f"is {', '.join(said)}{', …' if len(said) == _SOME else ''}" if said else "has no value"
+        if len(set(said)) > 1 and not isinstance(where[name], str):
+            words = f"goes from {said[0]} to {said[-1]}"
+        ranges.append(f"{shortened(name)} {words}")
+    return RunError(f"{path}: no row has {wanted}; in this file {', '.join(ranges)}")
+
+
+def _written(value: Any) -> str:
+    return shortened(repr(value) if isinstance(value, str) else str(value).lower())
 
 
 def longest(columns: Container[str], path: str) -> str | None:

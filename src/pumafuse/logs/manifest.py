@@ -54,6 +54,12 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The kind of axis that it is of, by its unit."""
         return kind_of(self.ending or leaf(self.column))
 
+    def read(self, table: Table) -> tuple[FloatArray, str | None]:
+        """Its numbers, NaN in rows that are another axis's, and a note; an angle that begins anew goes on."""
+        numbers, note = table.numbers(self.column, self.ending)
+        chosen = np.where(table.meets(self.where), numbers, np.nan) if self.where else numbers
+        return table.unwrapped(repr(self), chosen, self.turn) if self.turn else chosen, note
+
 
 class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where the stamps of rows are."""

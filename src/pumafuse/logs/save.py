@@ -12,7 +12,8 @@ from .. import toml
 from ..errors import RunError
 from ..units import SCREEN, Screen, seconds
 from . import tables
-from .run import NOISE, Run, Source
+from .run import Run
+from .source import NOISE, Source
 
 _KEYS = ("file", "topic", "entity", "where", "time", "start", "clock", NOISE, "arrived")  # of a source in run.toml
 _TAKEN = ("commands", "truth", "trials", "samples", "path")

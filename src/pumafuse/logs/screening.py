@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray, median
 from ..units import TURN
-from .run import Source, note_rows
+from .source import Source, note_rows
 
 USUAL = 0.9  # of all steps are smaller than the usual one: more are not stray, and jumps of a motion may be as rare
 FAR = 5.0  # usual steps from which a value leaps: where a motion begins or turns it is about one

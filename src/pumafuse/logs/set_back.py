@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import NO_STAMP, IntArray, TimeArray
-from .run import TOLERATED_STEP_BACK_NS, Run, Source
+from .run import Run
+from .source import TOLERATED_STEP_BACK_NS, Source
 
 _IN_ORDER = 20  # rows in order before a step
 _LEAST, _OF_ALL, _OF_ONE = 1, 3, 5  # rows behind: of each source; of one at least, if all step back; if one does alone

@@ -26,6 +26,8 @@ _LEAST_WAIT = 0.02  # s, from which it matters
 
 def drop_wraps(stamp: TimeArray, label: str) -> tuple[TimeArray, list[str]]:
     """Stamps that go on over wraps of 32 bits, midnight and one step of an hour, without zeros, and notes on each."""
+    if len(stamp) < 2:
+        return stamp, []
     notes, zero = list[str](), stamp == 0
     others = stamp[~zero & (stamp != NO_STAMP)]
     if zero.any() and len(others) >= _FEWEST and np.abs(others).min() >= max(_FAR_NS, float(np.ptp(others))):

@@ -11,10 +11,10 @@ import os
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -26,12 +26,25 @@ import pyarrow.csv as pacsv
 import pyarrow.json as pajson
 import pyarrow.parquet as papq
 
-from ..arrays import BoolArray, FloatArray
+from ..arrays import FloatArray
 from ..errors import RunError, UnknownNameError, plural, shortened
 from . import formats
-from .columns import BLANK, NUMBER, SENTINELS, Table, find, largest, longest, prefixes, sentinel_among
+from .columns import (
+    BLANK,
+    NUMBER,
+    SENTINELS,
+    Table,
+    Where,
+    conditions,
+    find,
+    largest,
+    longest,
+    met,
+    no_row,
+    prefixes,
+    sentinel_among,
+)
 
-Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
 Choice: TypeAlias = Callable[[Sequence[str]], Sequence[str]]  # of some among all names of columns
 _Text: TypeAlias = tuple[pa.Table, list[str], list[str]]  # a table, names of all its columns, what was wrong with it
 
@@ -40,7 +53,6 @@ _RECORDINGS = {".mcap", ".bag", ".db3", ".rrd"}
 _BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
 _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _COMPRESSION = "zstd"
-_SOME = 8  # values in an error
 _HEAD = 1 << 16  # bytes of a text, among which its header is
 _DEEPEST, _LONG_LINE = 100, 4096  # levels of a line of JSON; bytes below which no line ends a process
 _STEPS = np.zeros(256, dtype=np.int8)  # of the depth, by character
@@ -132,16 +144,6 @@ def read(
         f"{path.name}: two columns are named '{shortened(name)}': neither is used" for name in sorted(_repeated(names))
     ]
     return Table(path, _named(table), table.num_rows, tuple(notes), tuple(names))
-
-
-def meets(table: Table, where: Where) -> BoolArray:
-    """Rows in which each of some columns has a value, (rows,)."""
-    whole = pa.table(dict(table.columns))
-    met = _met(table.path, whole, _conditions(table.path, whole, where))
-    is_met = np.from_dlpack(pc.fill_null(met, False).cast(pa.uint8()).combine_chunks()) > 0
-    if not is_met.any():
-        raise _no_row(table.path, [whole], where)
-    return is_met
 
 
 def chosen(table: Table, where: Where) -> Table:
@@ -747,12 +749,12 @@ def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa
     """The columns asked for and the rows, some at a time; and the names of all that the file has."""
     with _opened(path) as file:
         wanted, empty = _wanted(path, file, fields, where)
-        conditions = _conditions(path, empty, where)
+        asked = conditions(path, _named(empty), where)
         every = range(file.num_row_groups)
-        groups = [index for index in every if _may_hold(file.metadata.row_group(index), conditions)]
-        kept = [part.filter(_met(path, part, conditions)) if where else part for part in _parts(file, wanted, groups)]
+        groups = [index for index in every if _may_hold(file.metadata.row_group(index), asked)]
+        kept = [part.filter(met(path, _named(part), asked)) if where else part for part in _parts(file, wanted, groups)]
         if where and not any(part.num_rows for part in kept):
-            raise _no_row(path, _parts(file, prefixes(list(where)), None), where)
+            raise no_row(path, map(_named, _parts(file, prefixes(list(where)), None)), where)
         names = [file.schema.column(index).path for index in range(len(file.schema))]
         return pa.concat_tables(kept) if kept else empty, names
 
@@ -797,67 +799,21 @@ def _filterable(table: pa.Table) -> pa.Table:
 def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
     if not where:
         return whole
-    chosen = whole.filter(_met(path, whole, _conditions(path, whole, where)))
+    columns = _named(whole)
+    chosen = whole.filter(met(path, columns, conditions(path, columns, where)))
     if not chosen.num_rows:
-        raise _no_row(path, [whole], where)
+        raise no_row(path, [columns], where)
     return chosen
 
 
-def _conditions(path: Path, table: pa.Table, where: Where) -> dict[str, pa.Scalar]:
-    """What the columns of ``where`` are compared with: in their own precision, 0.1 is found among float32, too."""
-    columns, conditions = _named(table), dict[str, pa.Scalar]()
-    for name, value in where.items():
-        kind = find(columns, name, str(path)).type
-        text, floating = pa.types.is_string(kind) or pa.types.is_large_string(kind), pa.types.is_floating(kind)
-        of_type = pa.types.is_integer(kind) or floating or pa.types.is_decimal(kind)
-        if isinstance(value, str | bool):
-            of_type = text if isinstance(value, str) else pa.types.is_boolean(kind)
-        if not of_type:
-            what = f"column '{shortened(name)}' holds {shortened(str(kind))}, never {_written(value)}"
-            raise RunError(f"{path}: where: {what}")
-        conditions[name] = pa.scalar(value, kind) if text or floating else pa.scalar(value)
-    return conditions
-
-
-def _met(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.ChunkedArray:
-    """Which rows of a table meet all conditions; what is null meets none."""
-    columns = _named(rows)
-    met = [pc.equal(find(columns, name, str(path), part=True), value) for name, value in conditions.items()]
-    return reduce(pc.and_, met)
-
-
-def _may_hold(group: Any, conditions: Mapping[str, pa.Scalar]) -> bool:
+def _may_hold(group: Any, asked: Mapping[str, pa.Scalar]) -> bool:
     """Whether a part of Parquet may have rows that meet all conditions, by the least and the greatest of its values."""
-    for column in map(group.column, range(group.num_columns if conditions else 0)):
+    for column in map(group.column, range(group.num_columns if asked else 0)):
         name = column.path_in_schema
-        told = column.statistics if column.is_stats_set and name in conditions else None
-        if told is not None and told.has_min_max and not told.min <= conditions[name].as_py() <= told.max:
+        told = column.statistics if column.is_stats_set and name in asked else None
+        if told is not None and told.has_min_max and not told.min <= asked[name].as_py() <= told.max:
             return False
     return True
-
-
-def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
-    """What to say when no row is left: what the columns hold, their range or some of it."""
-    held: dict[str, list[Any]] = {name: [] for name in where}
-    for part in parts:
-        columns = _named(part)
-        for name, values in held.items():
-            values_seen = {*values, *pc.unique(find(columns, name, str(path), part=True).drop_null()).to_pylist()}
-            ordered = sorted(values_seen)
-            held[name] = ordered[:_SOME] if isinstance(where[name], str) else ordered[:1] + ordered[1:][-1:]
-    wanted = " and ".join(f"{shortened(name)} = {_written(value)}" for name, value in where.items())
-    ranges = list[str]()
-    for name, values in held.items():
-        said = list(map(_written, values))
-        words = f"is {', '.join(said)}{', …' if len(said) == _SOME else ''}" if said else "has no value"
-        if len(set(said)) > 1 and not isinstance(where[name], str):
-            words = f"goes from {said[0]} to {said[-1]}"
-        ranges.append(f"{shortened(name)} {words}")
-    return RunError(f"{path}: no row has {wanted}; in this file {', '.join(ranges)}")
-
-
-def _written(value: Any) -> str:
-    return shortened(repr(value) if isinstance(value, str) else str(value).lower())
 
 
 def _named(table: pa.Table) -> dict[str, pa.ChunkedArray]:

@@ -20,7 +20,8 @@ from ..fusion.config import FusionConfig
 from ..logs import manifest, tables
 from ..logs.clock import stray_offsets
 from ..logs.frames import CARTESIAN, Cylindrical
-from ..logs.run import NoCommandError, Run, clock_of, of_table, of_tables
+from ..logs.reading import clock_of
+from ..logs.run import NoCommandError, Run, of_table, of_tables
 from ..logs.tables import Table
 from ..units import TIMES
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..filter.response import response
 from ..logs.frames import CARTESIAN
-from ..logs.run import Source
 from ..logs.screening import lost
+from ..logs.source import Source
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
 from ..units import seconds

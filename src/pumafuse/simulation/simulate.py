@@ -18,7 +18,8 @@ from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, PROCESS, FusionConfig, of_axis
 from ..logs import save, tables
 from ..logs.frames import Cylindrical, Placed
-from ..logs.run import Run, Source
+from ..logs.run import Run
+from ..logs.source import Source
 from ..units import MM, SCREEN, of_kind
 from .motion import POINTS, Motion, grid, simulate_axis
 from .scenario import Scenario

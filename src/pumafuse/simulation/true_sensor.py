@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, TimeArray
 from ..fusion.config import PerAxis, of_axis
-from ..logs.run import Source
+from ..logs.source import Source
 from ..toml import NotNegative, Positive
 from . import reverting
 

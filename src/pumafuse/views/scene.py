@@ -28,7 +28,8 @@ from .styles import Sink
 
 if TYPE_CHECKING:  # the process of the live view begins sooner without
     from ..fusion.estimates import Estimates
-    from ..logs.run import Run, Source
+    from ..logs.run import Run
+    from ..logs.source import Source
     from ..space.kinematics import Joints
 
 _PATH_POINTS = 20_000  # a 3D path needs no more, whatever the rate of the estimates
