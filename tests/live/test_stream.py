@@ -2,11 +2,14 @@
 
 import math
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pytest
 
 import pumafuse as pf
+from pumafuse.live.sources import replay
+from pumafuse.logs.source import Source
 from streams import TRACKED, Both, line, lines
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -192,3 +195,15 @@ def test_the_grid_goes_on_over_a_pause(pause: float, commands_first: bool, rate:
     assert len(both.estimates) >= len(offline.time)
     found = [(one["t"], one["radial"]["position_mm"]) for one in both.estimates[: len(offline.time)]]
     assert found == list(zip(offline.time.tolist(), (offline.axes["radial"].position * 1e3).tolist(), strict=True))
+
+
+def test_a_replayed_row_of_one_axis_says_nothing_of_the_others() -> None:
+    """Where axes have rows of their own, a row is no invalid measurement of the others."""
+    stamp = np.array([10_000_000, 20_000_000])
+    seen = Source(stamp, {"x": np.array([0.1, np.nan]), "y": np.array([np.nan, 0.2])}, "eye", apart=True)
+    run = pf.Run("any", Source(stamp, {"x": np.zeros(2), "y": np.zeros(2)}, "commands"), {"eye": seen})
+    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05))
+    arm = pf.ArmModel(name="any", update_period=0.01, delay=0.0, axes={"x": axis, "y": axis})
+    config = pf.FusionConfig(arm=arm, sensors={"eye": pf.Sensor(sd=1e-3)})
+    events = chain.from_iterable(replay(run, config, 1e6))
+    assert [event.values for event in events if event.sensor] == [{"x": 0.1}, {"y": 0.2}]

@@ -1,4 +1,4 @@
-"""Messages of a running ROS as events, read as the same ``run.toml`` reads them from a bag."""
+"""Messages of a running robot as events, read as the same ``run.toml`` reads them from a recording."""
 
 from __future__ import annotations
 
@@ -6,32 +6,36 @@ import math
 import re
 import statistics
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib import import_module
 from itertools import chain, takewhile
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, TimeArray
 from ..errors import ConfigError
 from ..logs import bags
-from ..logs.columns import LOG_TIME, NAMES, SPLIT_STAMPS, holders, leaf
-from ..logs.manifest import Column, CommandEntry, Manifest, Orientation, SourceEntry, Time
+from ..logs.columns import DAYS, LOG_TIME, NAMES, SPLIT_STAMPS, Table, Where, holders
+from ..logs.manifest import CommandEntry, Manifest, SourceEntry
+from ..logs.reading import read_source
 from ..logs.recordings import PATH, TRANSFORMS, CommandedPath, begin_of, trajectory_in
 from ..logs.source import PAUSE, Source
-from ..units import POSITIONS, TIMES, divisor, ending
-from .tool import NOISE, ORIENTATION
+from ..units import POSITIONS, TIMES, divisor
+from .sources import events_of
+from .tool import ORIENTATION
 from .wire import Event
 
-Getter: TypeAlias = Callable[[Any], Any]
 _LACKS = (IndexError, ValueError, TypeError)  # of a message that has no such element, or no number there
-_NO_STAMP = math.nan
 _USUAL = 101  # gaps between commands of which the median is the usual one
 
 
-def getter(path: str) -> Getter:
+@cache
+def getter(path: str) -> Callable[[Any], Any]:
     """What follows a field path, see :mod:`pumafuse.logs.columns`, into a message.
 
     What it raises: AttributeError where the type has no such field, IndexError or ValueError where a message has no
@@ -53,89 +57,77 @@ def getter(path: str) -> Getter:
     return get
 
 
-class _Number:
-    """A column of numbers in SI; an angle that begins anew after a turn is made to go on."""
+@dataclass(frozen=True)
+class Messages(Table):
+    """Messages that were received at one instant, as a table whose columns are the field paths in them."""
 
-    def __init__(self, column: Column, where: str) -> None:
-        unit = column.ending or ending(leaf(column.column))
-        if unit not in POSITIONS:
-            raise ConfigError(f"{where}: column '{column.column}' has no unit; give unit = 'm' or 'rad' beside it")
-        self._get, self._divisor, self._met = getter(column.column), divisor(unit), _condition(column.where)
-        self._turn, self._before, self._turns = column.turn, math.nan, 0.0
+    messages: Sequence[Any] = ()
+    received: int = 0  # ns
+    # the latest value [rad] of each angle that goes on over turns, and what was added to it
+    turns: dict[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
 
-    def __call__(self, row: Any) -> float:
+    def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, None]:
+        """A column of positions [m or rad], NaN where a message has none."""
+        return self.plain(name)[0] / divisor(unit or self._ending(name, POSITIONS, "mm")), None
+
+    def plain(self, name: str) -> tuple[FloatArray, None]:
+        """A column of numbers without conversion, NaN where a message has none."""
+        get = getter(name)
+        return np.array([_number(get, message) for message in self.messages], dtype=np.float64), None
+
+    def meets(self, where: Where) -> BoolArray:
+        """Messages in which each of some fields has a value, (rows,)."""
+        return np.array([_meets(message, where) for message in self.messages], dtype=np.bool_)
+
+    def stamps(self, name: str, nanoseconds: str = "", unit: str = "") -> tuple[TimeArray, None]:
+        """Stamps in int64 ns, ``NO_STAMP`` where a message has none."""
+        stamps = (self._stamp(message, name, nanoseconds, unit) for message in self.messages)
+        return np.fromiter((stamp if abs(stamp) < REACH_NS else NO_STAMP for stamp in stamps), np.int64), None
+
+    def unwrapped(self, key: str, /, angle: FloatArray, turn: float) -> FloatArray:
+        """Angles that go on from those of the messages before, as numpy's unwrap has it."""
+        return np.array([self._goes_on(key, value, turn) for value in angle.tolist()])
+
+    def _stamp(self, message: Any, name: str, nanoseconds: str, unit: str) -> int:
+        if name == LOG_TIME:
+            return self.received
         try:
-            value = float(self._get(row)) / self._divisor if self._met(row) else math.nan
-        except _LACKS:
-            return math.nan
-        if not self._turn or value != value:
-            return value
-        step = value - self._before
-        if abs(step) >= 0.5 * self._turn:  # as numpy's unwrap has it
-            short = (step + 0.5 * self._turn) % self._turn - 0.5 * self._turn
-            self._turns += (0.5 * self._turn if short == -0.5 * self._turn and step > 0.0 else short) - step
-        self._before = value
-        return value + self._turns
-
-
-def _condition(where: Mapping[str, bool | int | float | str]) -> Callable[[Any], bool]:
-    """Whether each of some fields has a value."""
-    asked = [(getter(path), value) for path, value in where.items()]
-
-    def met(row: Any) -> bool:
-        try:
-            return all(get(row) == value for get, value in asked)
-        except _LACKS:
-            return False
-
-    return met
-
-
-def _quaternion_getter(orientation: Orientation, where: str) -> Callable[[Any], tuple[float, ...] | None]:
-    """The quaternion x, y, z, w of a row; None where it has none."""
-    plain = orientation.quaternion is not None
-    columns = [Column(name, orientation.unit) for name in orientation.columns]
-    numbers = [getter(column.column) for column in columns] if plain else [_Number(column, where) for column in columns]
-
-    def turned(row: Any) -> tuple[float, ...] | None:
-        try:
-            value = np.array([[float(number(row)) for number in numbers]])
-        except _LACKS:
-            return None
-        quaternion = orientation.quaternions(value)[0]
-        return None if np.isnan(quaternion).any() else tuple(quaternion.tolist())
-
-    return turned
-
-
-def _stamp(time: Time, where: str) -> Callable[[Any, int], float | int]:
-    """The stamp of a row [ns], by it and by when it was received [ns]; NaN for none."""
-    if time.rate or time.counter:
-        raise ConfigError(
-            f"{where}: time: a running robot's messages need stamps, or '{LOG_TIME}', when they are received"
-        )
-    shift = round(time.shift * 1e9)
-    if time.column == LOG_TIME:
-        return lambda _, received: received + shift
-    get, get_nanoseconds = getter(time.column), getter(time.nanoseconds)
-    unit = time.ending or ending(leaf(time.column))
-    per_unit = 10 ** (9 - 3 * TIMES.index(unit)) if unit in TIMES else None
-
-    def stamp(row: Any, _: int) -> float | int:
-        try:
-            value = get(row)
-            if time.nanoseconds:
-                return int(value) * 10**9 + int(get_nanoseconds(row)) + shift
-            for seconds, nanoseconds in SPLIT_STAMPS:
-                if hasattr(value, seconds) and hasattr(value, nanoseconds):
-                    return getattr(value, seconds) * 10**9 + getattr(value, nanoseconds) + shift
-            if per_unit is None:
-                raise ConfigError(f"{where}: column '{time.column}' has no unit; give unit = 's' or 'ns' beside it")
-            return value * per_unit + shift if isinstance(value, int) else round(value * per_unit) + shift
+            value = getter(name)(message)
+            if nanoseconds:
+                return int(value) * 10**9 + int(getter(nanoseconds)(message))
+            for seconds, fraction in SPLIT_STAMPS:
+                if hasattr(value, seconds) and hasattr(value, fraction):
+                    return getattr(value, seconds) * 10**9 + getattr(value, fraction)
+            per_unit = 10 ** (9 - 3 * TIMES.index(unit or self._ending(name, TIMES, "s")))
+            return value * per_unit if isinstance(value, int) else round(value * per_unit)
         except (*_LACKS, OverflowError):
-            return _NO_STAMP
+            return NO_STAMP
 
-    return stamp
+    def _goes_on(self, key: str, value: float, turn: float) -> float:
+        before, turns = self.turns.get(key, (math.nan, 0.0))
+        step = value - before
+        if abs(step) >= 0.5 * turn:
+            short = (step + 0.5 * turn) % turn - 0.5 * turn
+            turns += (0.5 * turn if short == -0.5 * turn and step > 0.0 else short) - step
+        if value == value:
+            self.turns[key] = value, turns
+        return value + turns
+
+
+def _number(get: Callable[[Any], Any], message: Any) -> float:
+    """A number of a message; NaN where it has none."""
+    try:
+        return float(get(message))
+    except _LACKS:
+        return math.nan
+
+
+def _meets(message: Any, where: Where) -> bool:
+    """Whether each of some fields has a value."""
+    try:
+        return all(getter(path)(message) == value for path, value in where.items())
+    except _LACKS:
+        return False
 
 
 class Reader:
@@ -146,15 +138,13 @@ class Reader:
     """
 
     def __init__(self, name: str, entry: SourceEntry, commanded: dict[str, float]) -> None:
-        where = f"sensors.{name}" if name else "command"
+        if entry.time.rate or entry.time.counter or entry.time.ending == DAYS:
+            where = f"sensors.{name}" if name else "command"
+            raise ConfigError(
+                f"{where}: time: a running robot's messages need stamps, or '{LOG_TIME}', when they are received"
+            )
         self.name, self.entry = name, entry
-        self._stamp, self._met = _stamp(entry.time, where), _condition(entry.where)
-        self._values = {
-            axis: [_Number(column, where) for column in columns]
-            for axis, columns in (*entry.axes.items(), *entry.joints.items())
-        }
-        self._turned = None if entry.orientation is None else _quaternion_getter(entry.orientation, where)
-        self._noise = None if entry.noise is None else getter(entry.noise.column)
+        self._table = Messages(Path(entry.label), {}, 0, ())
         self._commanded, self._turns, self._away = commanded, entry.turns, dict[str, float]()
         self._is_of_paths = PATH in holders(entry.fields)
         if self._is_of_paths:
@@ -166,6 +156,7 @@ class Reader:
         self._path: CommandedPath | None = None
         self._coming: Iterator[SimpleNamespace] = iter(())
         self._next: SimpleNamespace | None = None  # of the path; then come the others
+        self._read([], 0)  # refuses columns without a unit
 
     def missing_fields(self, empty: Any) -> list[str]:
         """The fields that a type of messages has not, of which this is an empty one."""
@@ -183,7 +174,7 @@ class Reader:
             except _LACKS:
                 pass
         if not lacking and parts is None:
-            self._stamp(empty, 0)
+            self.entry.time.stamps(self._table_of([empty], 0))  # refuses stamps without a unit
         return lacking
 
     def events(self, message: Any, received: int) -> Iterator[Event]:
@@ -192,48 +183,43 @@ class Reader:
             self._follow(message, received)
             return
         rows = _rows(message, self._asks_whole)
-        for row in [message] if rows is None else rows:
-            for event in self._event(row, received):
-                yield from self._between(event)
-                yield event
+        yield from self._events([message] if rows is None else rows, received)
 
     def due(self, now: int) -> Iterator[Event]:
         """The commands until now [ns] of the path of a trajectory."""
         while self._next is not None and self._next.time_ns <= now:
             row, self._next = self._next, next(self._coming, None)
-            yield from self._event(SimpleNamespace(path=row), row.time_ns)
+            yield from self._events([SimpleNamespace(path=row)], row.time_ns)
 
     @property
     def next_due(self) -> int | None:
         """When the next of these is [ns]; None without any."""
         return None if self._next is None else self._next.time_ns
 
-    def _event(self, row: Any, received: int) -> Iterator[Event]:
-        if not self._met(row):
-            return
-        values: dict[str, Any] = {
-            axis: sum(number(row) for number in numbers) for axis, numbers in self._values.items()
-        }
-        if self._turns and self.name:
-            self._go_beside(values)
-        finite = {axis: value for axis, value in values.items() if value == value}
-        if not self.name:
-            self._commanded.update(finite)
-        if self._turned is not None and (turned := self._turned(row)) is not None:
-            finite[ORIENTATION] = turned
-        if self._noise is not None and self.entry.noise is not None:
-            finite[NOISE] = self.entry.noise.factor(_number(self._noise, row)).item()
-        if finite or not self.entry.has_own_rows:
-            as_logged = self.name and not self.entry.has_own_rows  # a sensor's row says what it has not, as in a log
-            yield Event(self._stamp(row, received), self.name, {**values, **finite} if as_logged else finite or values)
+    def _events(self, messages: Sequence[Any], received: int) -> Iterator[Event]:
+        chosen = [message for message in messages if _meets(message, self.entry.where)]
+        for event in events_of(self.name, self._read(chosen, received)):
+            if not self.name:
+                self._commanded.update({axis: value for axis, value in event.values.items() if value == value})
+                yield from self._between(event)
+            yield event
 
-    def _go_beside(self, values: dict[str, Any]) -> None:
-        """Move angles that go on by whole turns to where they were commanded when the first of them came."""
-        for axis, turn in self._turns.items():
-            value = values.get(axis, math.nan)
-            if value == value and axis not in self._away and axis in self._commanded:
-                self._away[axis] = turn * round((value - self._commanded[axis]) / turn)
-            values[axis] = value - self._away.get(axis, 0.0)
+    def _table_of(self, messages: Sequence[Any], received: int) -> Messages:
+        return replace(self._table, rows=len(messages), messages=messages, received=received)
+
+    def _read(self, messages: Sequence[Any], received: int) -> Source:
+        source, _ = read_source(self._table_of(messages, received), self.entry)
+        if self.name and self._turns:
+            values = {axis: self._beside(axis, value) for axis, value in source.values.items()}
+            source = replace(source, values=values)
+        return source.rows(source.has_value) if source.apart else source
+
+    def _beside(self, axis: str, value: FloatArray) -> FloatArray:
+        """An angle that goes on, moved by whole turns to where it was commanded when the first of it came."""
+        turn, came = self._turns.get(axis, 0.0), value[~np.isnan(value)]
+        if turn and len(came) and axis not in self._away and axis in self._commanded:
+            self._away[axis] = turn * round((float(came[0]) - self._commanded[axis]) / turn)
+        return value - self._away.get(axis, 0.0)
 
     def _between(self, event: Event) -> Iterator[Event]:
         """The commands on the line from the one before, for a controller that goes on so; not over a pause.
@@ -254,10 +240,7 @@ class Reader:
         turned = values.pop(ORIENTATION, None)
         stamp = np.array([before.t, event.t], dtype=np.int64)
         path = Source(stamp, values, "command", orientation=turned).interpolated(step)
-        for row in range(1, len(path.stamp) - 1):
-            at: dict[str, Any] = {axis: float(value[row]) for axis, value in path.values.items()}
-            at |= {} if path.orientation is None else {ORIENTATION: tuple(path.orientation[row].tolist())}
-            yield Event(int(path.stamp[row]), "", at)
+        yield from events_of("", path.rows(slice(1, -1)))
 
     def _follow(self, message: Any, received: int) -> None:
         """Follow the path of a trajectory, in the place of what is left of the one before."""
@@ -276,14 +259,6 @@ def readers_of(listed: Manifest) -> list[Reader]:
     """The readers of all sources of a ``run.toml``; of one instant commands come last."""
     commanded, entries = dict[str, float](), {**listed.sensors, "": listed.command}
     return [Reader(name, entry, commanded) for name, entry in entries.items()]
-
-
-def _number(get: Getter, row: Any) -> FloatArray:
-    """A number of a row, (); NaN where it has none."""
-    try:
-        return np.array(float(get(row)))
-    except _LACKS:
-        return np.array(math.nan)
 
 
 def _rows(message: Any, whole: bool) -> list[Any] | None:

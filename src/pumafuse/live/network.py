@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol, TypeAlias
 
-from ..errors import ConfigError, RunError
+from ..errors import PumafuseError, RunError
 from .address import Address, Allowed, SocketAddress, host_port, listener, receiver
 from .backlog import Backlog
 from .rate_limit import RateLimitedLog
@@ -341,7 +341,7 @@ class EventClient(_Client):
                             self._backlog.add(now, event)
                         self._came.notify()
                     some = True
-            except (Refused, ConfigError, struct.error) as error:
+            except (Refused, PumafuseError, struct.error) as error:
                 self._log.write("refused", f"{self._name}: {self.REFUSED}{error}")
         return some
 

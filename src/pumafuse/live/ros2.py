@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ConfigError, reason, suggestion
+from ..errors import ConfigError, PumafuseError, reason, suggestion
 from ..filter.outcome import Outcome
 from ..fusion.pose import covariance_in_log, turning_covariance
 from ..logs.bags import DAMAGE
@@ -195,7 +195,7 @@ class Ros2Source:
             except (ImportError, AttributeError):
                 self._log.write(f"{name} {kind}", f"{name}: no package here has its type {kind}: source one that does")
                 continue
-            except ConfigError as error:
+            except PumafuseError as error:
                 self._log.write(f"{name} {kind}", str(error))
                 continue
             if lacking:

@@ -61,19 +61,20 @@ def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     sources = [*run.sensors.items(), ("", believed_commands(run, config))]
     times = (source.arrival if len(source.arrival) else source.stamp for _, source in sources)
     arrival = np.concatenate([np.maximum.accumulate(stamp) for stamp in times])
-    events = [event for name, source in sources for event in _events(name, source.in_joints())]
+    events = [event for name, source in sources for event in events_of(name, source.in_joints())]
     order = np.argsort(arrival, kind="stable")
     return arrival[order], [events[row] for row in order.tolist()]
 
 
-def _events(name: str, source: Source) -> Iterator[Event]:
-    """The rows of a sensor, or of commands (no name), which give only the axes that they have a value for, if any."""
+def events_of(name: str, source: Source) -> Iterator[Event]:
+    """The rows of a sensor as events, or of commands (no name), which give only the axes that they have a value for."""
     columns: list[list[float]] = [value.tolist() for value in source.values.values()]
     turned = [None] * len(source.stamp) if source.orientation is None else source.orientation.tolist()
+    as_logged = name and not source.apart  # it says what it has not
     noise = source.noise.tolist() or [None] * len(source.stamp)
     for stamp, orientation, scaled, *row in zip(source.stamp.tolist(), turned, noise, *columns, strict=True):
         every = dict(zip(source.values, row, strict=True))
-        values: dict[str, Any] = {axis: value for axis, value in every.items() if name or value == value}
+        values: dict[str, Any] = {axis: value for axis, value in every.items() if as_logged or value == value}
         if orientation is not None and orientation[0] == orientation[0]:
             values[ORIENTATION] = orientation
         if scaled is not None:
