@@ -123,7 +123,7 @@ def intervals_of(stage: Stage) -> dict[str, ConfidenceInterval]:
 def contains(found: ConfidenceInterval, one: Parameter, truth: pf.FusionConfig) -> bool:
     """Whether an interval contains the truth; one that is open below contains 0."""
     low, high = found.ci95
-    return (0.0 if found.open[0] and one.vanishes else low) <= one.get(truth) <= high
+    return (0.0 if found.open[0] and one.vanishes else low) <= one.number(truth) <= high
 
 
 def quietly(work: Callable[[], T]) -> T:

@@ -89,7 +89,7 @@ def test_the_result_is_likelier_and_reports_by_how_much() -> None:
     for key, one in fitted(found).items():
         known = keys[key].configured(found.before)
         assert one.before == (None if known is None else pytest.approx(known / keys[key].unit))
-        assert one.value == pytest.approx(keys[key].get(found.config) / keys[key].unit)
+        assert one.value == pytest.approx(keys[key].number(found.config) / keys[key].unit)
         low, high = one.ci95
         assert (low is None or low <= one.value) and (high is None or one.value <= high), one
     assert found.details.orders.keys() == set(AXES)

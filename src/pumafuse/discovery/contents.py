@@ -213,7 +213,7 @@ def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
 
 
 def _of_one_run(parts: Sequence[Part]) -> list[Part]:
-    """The parts of a log without further runs: of files or sheets of the same columns, and of trials, the first is kept.
+    """The parts of a log without further runs: of files or sheets of the same columns, or of trials, the first.
 
     Tables of one file that share the stamps were written together, as of two arms: these are one run.
     """
@@ -597,7 +597,7 @@ def _span(clock: Clock) -> float:
 
 
 def _spread(table: Table, clock: Clock, others: Iterable[Clock], counts: Sequence[str]) -> Clock:
-    """A clock; where rows arrive in packets, another that stamps each row, or they are spread by a count, else a question.
+    """A clock; where rows come in packets, another that stamps each row, or one spread by a count, else a question.
 
     The other clock lasts as long: that of a loop beside the stamps of a camera's frames.
     """

@@ -246,7 +246,7 @@ def interval_fault(stamp: TimeArray, period: float) -> tuple[str, Literal["sende
     if len(intervals) < _FEW:
         return None
     quarters = len(intervals) * np.arange(1, 4) // 4  # numpy's quantile takes ten times as long
-    early, usual, late = (np.partition(intervals, quarters)[quarters] / 1e9).tolist()
+    early, usual, late = map(float, np.partition(intervals, quarters)[quarters] / 1e9)
     pairs = (intervals[1:] + intervals[:-1]) / 1e9
     both = median(pairs)
     near = np.minimum(np.abs(intervals / 1e9 - early), np.abs(intervals / 1e9 - late)) < _EVEN * both

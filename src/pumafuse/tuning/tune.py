@@ -199,11 +199,7 @@ def tune(
         axis: search.lag_sds(Arm.of(result.arm.axes[axis], result.arm.delay_of(axis)))
         for axis, search in searched.items()
     }
-    for axis, sds in lag_sds.items():
-        for name in ("seen", "unseen"):
-            sd = rounded(getattr(sds, name)) if sds else None
-            result = changed(result, ("arm", "axes", axis, f"{name}_lag_sd"), sd)
-    tuned = _set_provenance(result, free, by_key, {} if interrupted else lags, names)
+    tuned = _set_provenance(result, free, by_key, {} if interrupted else lags, lag_sds, names)
     doubted += _unseen_notes(searched, lag_sds, result)
     doubted += lag_steps({axis: search.plain for axis, search in arms.items()}, tuned)
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
@@ -425,6 +421,7 @@ def _set_provenance(
     free: Sequence[Parameter],
     intervals: Mapping[str, ConfidenceInterval],
     lags: Mapping[str, FittedLag],
+    lag_sds: Mapping[str, LagSds | None],
     runs: list[str],
 ) -> FusionConfig:
     """The configuration with the intervals of the arm's parameters and lags, and the runs they were fitted on."""
@@ -439,6 +436,10 @@ def _set_provenance(
     for axis, lag in lags.items():
         low, high = (rounded(end / MS) for end in open_interval(lag.lag_ms_ci95))
         config = changed(config, ("arm", "axes", axis, "lag_ci95"), (low, high))
+    for axis, sds in lag_sds.items():
+        seen, unseen = (rounded(sds.seen), rounded(sds.unseen)) if sds else (None, None)
+        for name, sd in (("seen_lag_sd", seen), ("unseen_lag_sd", unseen)):
+            config = changed(config, ("arm", "axes", axis, name), sd)
     earlier = _tuned_on(config)  # what is not fitted now is from there
     return changed(config, ("arm", "provenance", "tuned_on"), [*(run for run in earlier if run not in runs), *runs])
 
