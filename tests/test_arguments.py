@@ -14,7 +14,7 @@ PLACE = {"x": 0.1 * np.sin(TIME)}
 
 
 def arm(**wrong: object) -> pf.ArmModel:
-    axis = {key: wrong.pop(key) for key in ("gain_recovery", "gain") if key in wrong}
+    axis = {key: wrong.pop(key) for key in ("gain_recovery", "gain", "unseen_lag_sd") if key in wrong}
     plant = wrong.pop("plant", pf.FirstOrder(time_constant=0.05))
     return pf.ArmModel(
         **{"name": "a", "update_period": 0.028, "delay": 0.06, **wrong}, axes={"x": pf.AxisModel(plant=plant, **axis)}
@@ -31,7 +31,8 @@ def trials() -> pf.StepTrials:
 
 WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "no period": (lambda: arm(update_period=0.0), "axes.x: period, plant, recovery and fastest speed must be > 0"),
-    "negative delay": (lambda: arm(delay=-0.06), "delay and play >= 0"),
+    "negative delay": (lambda: arm(delay=-0.06), "delay, play and sds >= 0"),
+    "a negative sd of a lag": (lambda: arm(unseen_lag_sd=-1e-3), "delay, play and sds >= 0"),
     "a delay that is none": (lambda: arm(delay=math.nan), "must be finite"),
     "a gain that is none": (lambda: arm(gain=pf.Gain(intercept=math.nan)), "must be finite"),
     "negative time constant": (lambda: arm(plant=pf.FirstOrder(time_constant=-1.0)), "must be > 0"),

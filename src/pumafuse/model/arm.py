@@ -267,12 +267,13 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         plant = [number for number in msgspec.structs.astuple(axis.plant) if isinstance(number, float | int)]
         optional = [1.0 if number is None else number for number in (axis.gain_recovery, axis.max_speed)]
         positive = self.update_period, *optional, *plant
-        not_negative = self.delay, *(0.0 if number is None else number for number in (axis.delay, axis.play))
+        may_be_none = axis.delay, axis.play, axis.seen_lag_sd, axis.unseen_lag_sd
+        not_negative = self.delay, *(0.0 if number is None else number for number in may_be_none)
         if not math.isfinite(sum(positive) + sum(not_negative) + axis.gain.slope + axis.gain.intercept):
-            raise ConfigError(f"axes.{name}: period, delay, plant, gain, fastest speed and play must be finite")
+            raise ConfigError(f"axes.{name}: period, delay, plant, gain, fastest speed, play and sds must be finite")
         if min(positive) <= 0.0 or min(not_negative) < 0.0:
             raise ConfigError(
-                f"axes.{name}: period, plant, recovery and fastest speed must be > 0, delay and play >= 0"
+                f"axes.{name}: period, plant, recovery and fastest speed must be > 0, delay, play and sds >= 0"
             )
         for key, ci95 in {"lag_ms_ci95": axis.lag_ci95, "gain.intercept_ci95": axis.gain.intercept_ci95}.items():
             if ci95 is not None and not ci95[0] <= ci95[1]:
