@@ -13,6 +13,7 @@ template <int N>
 void with_lanes(Time k, auto make) {
     if constexpr (N <= 7) {
         if (k <= 6) return make(std::integral_constant<int, 6>{});
+        if (k <= 8) return make(std::integral_constant<int, 8>{});
         if (k <= 10) return make(std::integral_constant<int, 10>{});
         if (k <= 12) return make(std::integral_constant<int, 12>{});
     }

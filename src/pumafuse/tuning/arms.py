@@ -509,13 +509,19 @@ class Measured:
 
     def _derivatives(self, arm: Arm, names: Coordinates) -> list[FloatArray]:
         """The response of each recording, and how it changes with each coordinate, (1 + k, m)."""
-        steps = [_LOG_SHIFT if name in LOGARITHMIC else _SHIFT for name in names]
-        if not any((arm.play, arm.max_speed, arm.beyond, arm.below)) and not self.sags:  # it is linear
-            steps = [1.0 if name in ("gain", "slope") else step for name, step in zip(names, steps, strict=True)]
-        beside = [arm.moved([name], [arm.coordinate(name) + step]) for name, step in zip(names, steps, strict=True)]
+        is_linear = not any((arm.play, arm.max_speed, arm.beyond, arm.below)) and not self.sags
+        is_scale = is_linear and "gain" in names and not (arm.recovery or arm.slope)  # of a gain that stays
+        varied = [name for name in names if not (is_scale and name == "gain")]
+        steps = [_LOG_SHIFT if name in LOGARITHMIC else _SHIFT for name in varied]
+        if is_linear:
+            steps = [1.0 if name in ("gain", "slope") else step for name, step in zip(varied, steps, strict=True)]
+        beside = [arm.moved([name], [arm.coordinate(name) + step]) for name, step in zip(varied, steps, strict=True)]
         responses = self.responses_of([arm, *beside])
         for moved in responses:
             moved[1:] = (moved[1:] - moved[0]) / np.array(steps)[:, None]
+        if is_scale:
+            row = 1 + names.index("gain")
+            responses = [np.insert(moved, row, moved[0] / arm.gain, axis=0) for moved in responses]
         return responses
 
     @property

@@ -31,7 +31,7 @@ _MORE = 1.1  # of the expected gain, from which a longer step is tried
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
 _SHARES = (1.0, 0.5, 0.2)
-_REACH = 1.5  # longest step of a coordinate, in its scale
+REACH = 1.5  # longest step of a coordinate, in its scale
 
 
 Notify: TypeAlias = Callable[[Point], None]
@@ -99,7 +99,7 @@ class _Ascent:
     ) -> None:
         self._likelihood, self._free, self._outcomes, self._tolerance = likelihood, free, outcomes, tolerance
         self._low, self._high = np.array([parameter.range for parameter in free]).reshape(-1, 2).T
-        self._reach = _REACH * np.array([parameter.scale for parameter in free])
+        self._reach = REACH * np.array([parameter.scale for parameter in free])
         self._axis = [-1 if parameter.axis is None else likelihood.axes.index(parameter.axis) for parameter in free]
         self._damping = np.full(len(free), _FIRST_DAMPING)
 
