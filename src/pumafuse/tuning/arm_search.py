@@ -184,13 +184,14 @@ class ArmSearch:
         """Whether it is seen at one instant of each update period."""
         return self.phase is not None
 
-    def lag_sds(self, arm: Arm) -> LagSds | None:
-        """How well the lag of an arm is known, by all likely arms; None where measurements are not in step."""
+    def lag_sds(self, arm: Arm, mixture: Mixture) -> LagSds | None:
+        """How well the lag of an arm is known, by all arms of a mixture; None where measurements are not in step."""
         commands, later = (self._measured.at_commands(by) for by in (0.0, self._measured.period))
         way = np.concatenate(later.responses(arm)) - np.concatenate(commands.responses(arm))
         if not self.in_step or not way.any():
             return None
-        likely, shares = zip(*((arm, share) for arm, share in self.posterior.arms if share > _RARE), strict=True)
+        every = self.posterior.arms(mixture)
+        likely, shares = zip(*((arm, share) for arm, share in every if share > _RARE), strict=True)
 
         def variance(at: Measured) -> float:
             moved = np.hstack(at.responses_of([arm, *likely]))

@@ -482,7 +482,7 @@ def _axis_lag(search: ArmSearch, chosen: Chosen, trusted: str, kind: Kind) -> Ax
         sizes = {name: (getattr(sag, name), _MARGIN * half) for name, half in search.bent.sag_half.items()}
         ends = {f"{name}_ci95": (size - half, size + half) for name, (size, half) in sizes.items()}
         values["sag"] = msgspec.structs.replace(sag, **ends)
-    sds = search.lag_sds(arm)
+    sds = search.lag_sds(arm, mixture)
     lag = AxisLag(
         sensor=trusted,
         lag=arm.total,

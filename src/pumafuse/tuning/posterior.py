@@ -125,10 +125,9 @@ class AxisPosterior:
 
     branches: Sequence[Branch]  # of all models that count
 
-    @property
-    def arms(self) -> list[tuple[Arm, float]]:
-        """The arms of all entries with their probabilities."""
-        mixture, entries = self.mixture(), [entry for branch in self.branches for entry in branch.entries]
+    def arms(self, mixture: Mixture) -> list[tuple[Arm, float]]:
+        """The arms of all entries with their probabilities by a :meth:`mixture`."""
+        entries = [entry for branch in self.branches for entry in branch.entries]
         weight = np.bincount(mixture.nearest, mixture.weight, len(entries))
         return [(entry.arm, share) for entry, share in zip(entries, weight.tolist(), strict=True)]
 

@@ -196,7 +196,7 @@ def tune(
     allowed |= {axis: doubt.lag_ci95 for axis, doubt in doubted_axes.items()}
     lags = fitted_lags(free, config, result, around, allowed, unmeasured)
     lag_sds = {
-        axis: search.lag_sds(Arm.of(result.arm.axes[axis], result.arm.delay_of(axis)))
+        axis: search.lag_sds(Arm.of(result.arm.axes[axis], result.arm.delay_of(axis)), search.posterior.mixture())
         for axis, search in searched.items()
     }
     tuned = _set_provenance(result, free, by_key, {} if interrupted else lags, lag_sds, names)
