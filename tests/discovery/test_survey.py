@@ -683,6 +683,13 @@ def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
     assert found.roles.command.why == "others follow it"
 
 
+def test_what_moves_half_as_far_follows_no_commands_that_only_run_ahead(tmp_path: Path) -> None:
+    """Two points of one body, in a unit that both say: that one runs ahead makes it no command."""
+    t, u, _, z = recorded()
+    text = refusal(tmp_path, {"t": t, **xyz(u, "tip_{}_mm"), **xyz(0.6 * z, "wrist_{}_mm")})
+    assert "which numbers are the commands?" in text
+
+
 @pytest.mark.parametrize(
     ("commanded", "measured"),
     [

@@ -666,6 +666,8 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float,
             alike = [relation for relation in relations if abs(relation.correlation) >= SAME]
             at_once = max(_AT_ONCE, 0.5 * period_of(other.source))
             behind = [relation for relation in alike if at_once < relation.lag < latest]
+            if leader.role != "command" and not (leader.guessed or other.guessed):  # units are said: it goes as far
+                behind = list(filter(_as_far, behind))
             if 2 * len(behind) >= len(alike):
                 count += sum(abs(relation.correlation) for relation in behind)
                 scaled -= sum(abs(math.log(abs(relation.slope))) for relation in behind)
