@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import PumafuseError
@@ -97,10 +97,14 @@ def write_file(path: Path, content: str | bytes, *, replace: bool = True) -> Non
 
 
 def sweep(folders: Iterable[Path]) -> None:
-    """Remove the temporary folders that killed workers of this process left beside the folders they were writing."""
+    """Remove the temporary folders that killed workers of this process left beside the folders they were writing.
+
+    Each gets another name first, so that no worker still moves what is half removed to where a whole run is due.
+    """
     for folder in folders:
-        for left in folder.parent.glob(f"{glob.escape(_prefix(folder, os.getpid()))}*"):
-            shutil.rmtree(left, ignore_errors=True)
+        for left in list(folder.parent.glob(f"{glob.escape(_prefix(folder, os.getpid()))}*")):
+            with suppress(FileNotFoundError):
+                shutil.rmtree(left.rename(left.with_name(f"{left.name}-left")), ignore_errors=True)
 
 
 def _prefix(path: Path, process: int) -> str:

@@ -269,8 +269,9 @@ def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(
     assert "Traceback" not in message and "interrupted: " in message
     time.sleep(1.0)  # what is still running would still write
     assert 3 <= len(names(out)) < 300
+    files = (FILES - {"eye.csv"}) | {"scope.csv", "trials.csv", "samples.csv"}
+    assert {name: names(out / name) for name in names(out)} == dict.fromkeys(names(out), files)
     for name in names(out):
-        assert names(out / name) == (FILES - {"eye.csv"}) | {"scope.csv", "trials.csv", "samples.csv"}
         assert pf.Run.read(out / name).name.endswith(f"seed {name.removeprefix('seed-')}")
 
 

@@ -61,6 +61,8 @@ def run_jobs(
     what: str, jobs: Mapping[str, Callable[[], R]], folders: Iterable[Path]
 ) -> tuple[dict[str, R], dict[str, str]]:
     """Run every job, several at a time."""
+    from multiprocessing import active_children
+
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -69,6 +71,7 @@ def run_jobs(
     parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
     work = (delayed(_guard)(name, job) for name, job in jobs.items())
     outcomes: Generator[tuple[str, R | None, str | None]] | None = None
+    before = active_children()
     try:
         with _block_ctrl_c():
             outcomes = cast(Generator[tuple[str, R | None, str | None]], parallel(work))
@@ -90,9 +93,13 @@ def run_jobs(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of work that is not used
             if outcomes is not None:
-                outcomes.close()  # only now does no worker write any more
+                outcomes.close()
         threading.excepthook = hook
-        sweep(folders)
+        if len(results) + len(failed) < len(jobs):
+            for worker in set(active_children()).difference(before):  # what joblib has left behind
+                worker.kill()
+                worker.join()
+        sweep(folders)  # only now does no worker write any more
     done = {name: results[name] for name in jobs if name in results}
     return done, {name: failed[name] for name in jobs if name in failed}
 
