@@ -83,15 +83,3 @@ def test_state_space_answers_as_the_step_response(plant: FirstOrder | SecondOrde
     times = np.linspace(0.0, 0.5, 60)
     held = expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * times[:, None, None])
     np.testing.assert_allclose((C @ held[:, :n, n:])[:, 0, 0], plant.step_response(times), rtol=0.0, atol=1e-11)
-
-
-@pytest.mark.parametrize("damping", [0.1, 0.864, 1 - 1e-9, 50.0])
-def test_transfer_functions_are_equations_3_and_5(damping: float) -> None:
-    """1 / (τs + 1) and ω² / (s² + 2ζωs + ω²), coefficient by coefficient, to a factor; no spurious power of s."""
-    for plant, right in (
-        (FirstOrder(time_constant=0.0425), [1.0, 1.0 / 0.0425]),
-        (second_order(damping), [1.0, 2.0 * damping * OMEGA, OMEGA**2]),
-    ):
-        tf = plant.transfer_function()
-        np.testing.assert_allclose(np.trim_zeros(tf.num[0][0], "f"), right[-1:], rtol=1e-15)
-        np.testing.assert_allclose(tf.den[0][0], right, rtol=1e-15)

@@ -6,7 +6,7 @@ A new plant is a class here with a tag and the methods of :class:`Plant`, added 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import Annotated, TypeAlias
 
 import msgspec
 import numpy as np
@@ -14,9 +14,6 @@ import numpy.typing as npt
 
 from ..arrays import FloatArray
 from ..toml import MOST, Interval, Positive
-
-if TYPE_CHECKING:
-    import control
 
 Delay = Annotated[float, msgspec.Meta(ge=0, le=1e4)]  # s
 Frequency = Annotated[float, msgspec.Meta(ge=1e-6, le=MOST)]  # rad/s; of a lower one the lag would overflow
@@ -33,13 +30,6 @@ class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
         """Position p [m] at ``time`` [s] after v stepped from 0 to 1 m; 0 before the step; the shape of ``time``."""
         raise NotImplementedError
-
-    def transfer_function(self) -> control.TransferFunction:
-        """The plant as a `control` transfer function from v to p, without gain and delay; A is a companion form."""
-        import control
-
-        A = self.state_space()[0]
-        return control.tf([-A[-1, 0]], [1.0, *-A[-1, ::-1]])
 
     @property
     def lag(self) -> float:
