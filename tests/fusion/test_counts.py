@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -10,7 +11,10 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from fusion.test_segments import MS, ORIGIN, SECOND, TICK, A, config, crowded_runs, measurements, nan, properties
 from pumafuse.arrays import NO_STAMP
+from pumafuse.fusion import results
 from pumafuse.fusion.summary import summarise
+from pumafuse.logs.source import Source
+from tuning_runs import scenario
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 WORDS = {"fused", "rejected", "reacquired", "duplicate", "before_start", "too_late", "invalid", "unknown"} | {
@@ -88,3 +92,24 @@ def test_a_row_of_several_axes_counts_by_the_best_of_them() -> None:
     seen = [ORIGIN + 10 * MS, ORIGIN + 20 * MS], {"radial": [nan, nan], "vertical": [0.5, nan]}
     run = pf.Run.from_arrays([ORIGIN, ORIGIN + TICK], {"radial": [0.5, 0.5], "vertical": [0.5, 0.5]}, {"a": seen})
     assert pf.fuse(run, config(a=A)).counts["a"] == {"fused": 1, "invalid": 1}
+
+
+@pytest.mark.parametrize("how", [{"mode": "as-live"}, {"mode": "smoothed"}, {"engine": "filterpy"}], ids=str)
+def test_stray_rows_change_no_estimate(how: dict[str, str]) -> None:
+    """To the bit, of each source one ahead and one behind, which is too late of a sensor, in a log in x, y, z."""
+    made = pf.simulate(scenario("cylindrical-cartesian", 0.04, 0.02))
+
+    def strayed(_: str, one: Source) -> Source:
+        rows = one.rows(np.insert(np.arange(len(one.stamp)), [10, 20], [10, 20]))
+        rows.stamp[[10, 21]] += np.array([77, -12]) * SECOND
+        return rows
+
+    got, wanted = (pf.fuse(run, made.config, **how) for run in (made.run.each(strayed), made.run))
+    assert got.to_arrow().equals(wanted.to_arrow()) and got.biases == wanted.biases
+    used = [est.measurements.where(np.isfinite(est.measurements.innovation)) for est in (got, wanted)]
+    for field in pf.Measurements.ARRAYS:
+        np.testing.assert_array_equal(getattr(used[0], field), getattr(used[1], field))
+    tables = [results.reference_table(est.reference, est.config) for est in (got, wanted)]
+    assert tables[0].equals(tables[1])
+    assert got.command_counts["stray"] == 2
+    assert {(counts["stray"], counts["too_late"]) for counts in got.counts.values()} == {(1, 1)}

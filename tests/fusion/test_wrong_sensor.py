@@ -147,12 +147,6 @@ def test_a_slip_that_both_see_is_followed(order: tuple[str, ...]) -> None:
     assert rms(error, 5.6) < 1.05 * rms(error_of(), 5.6)
 
 
-def test_a_sensor_alone_follows_a_slip_at_once() -> None:
-    """After a period and one more measurement: 40 ms for the tracker."""
-    error = error_of(slip=True, sensors=["tracker"])
-    assert np.abs(error[504:]).max() < 0.5
-
-
 @in_any_order
 def test_the_harm_of_an_outage_ends_with_it(order: tuple[str, ...]) -> None:
     """A tracker silent from 9 to 15 s beside a wrong camera: the camera alone is believed meanwhile."""
