@@ -53,5 +53,4 @@ def refused(*arguments: object) -> str:
 
 
 def names(folder: Path) -> set[str]:
-    """What is in a folder."""
     return {path.name for path in folder.iterdir()}

@@ -45,8 +45,6 @@ def paths() -> list[Path]:
 
 @dataclass(frozen=True)
 class Block:
-    """One fenced block of a page."""
-
     language: str
     title: str
     text: str

@@ -15,7 +15,6 @@ from pages import ROOT
 
 @pytest.fixture
 def benchmark(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
-    """Imports one of the benchmarks' modules."""
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "1")
     return importlib.import_module

@@ -48,7 +48,6 @@ def what_it_asks_for(name: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The wheel and the sdist."""
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "build", "--no-isolation", "--sdist", "--wheel", "--outdir", folder)
     return next(folder.glob("*.whl")), next(folder.glob("*.tar.gz"))

@@ -118,7 +118,6 @@ def test_only_an_earlier_result_is_replaced_and_only_with_force(with_tracker: Pa
     ],
 )
 def test_bad_input_is_one_line_that_says_what_to_do(arguments: tuple[object, ...], expected: str) -> None:
-    """What, where, and the accepted names; exit code 1."""
     assert expected in refused(*arguments)
 
 
@@ -136,7 +135,6 @@ def test_bad_input_is_one_line_that_says_what_to_do(arguments: tuple[object, ...
     ],
 )
 def test_wrong_usage_exits_with_2(arguments: tuple[object, ...]) -> None:
-    """Missing arguments and impossible options are usage errors."""
     assert pumafuse(*arguments, code=2).stdout == ""
 
 

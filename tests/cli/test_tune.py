@@ -46,7 +46,6 @@ def given(place: Path) -> tuple[Path, Path]:
 
 @pytest.fixture(scope="module")
 def tuned(place: Path, given: tuple[Path, Path]) -> tuple[Path, subprocess.CompletedProcess[str]]:
-    """The result folder, and the finished command with --json."""
     return place / "out", pumafuse("tune", given[0], "-c", given[1], "-o", place / "out", "--json")
 
 

@@ -259,9 +259,6 @@ def test_a_misspelt_sensor_is_named_with_the_other_name() -> None:
     assert any("1704 rows have no sensor of this name" in note for note in found)
 
 
-# ---- a sensor that says the same, or is wild -----------------------------------------------------------------------
-
-
 # ---- no false alarm -------------------------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import chi2
 
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
@@ -22,6 +23,7 @@ from pumafuse.fusion.estimates import Estimates, Mode
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.segments import build_segment
 from pumafuse.logs.run import Run
+from pumafuse.logs.source import Source
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, Plant, SecondOrder
 
@@ -430,3 +432,110 @@ def test_a_million_steps_leave_the_covariance_as_it_was() -> None:
     begun = Filter(model, int(events.time[-5000]))
     wanted = begun.run(events.rows(slice(-5000, None)), Results.room(5000, 1), last)
     np.testing.assert_allclose(outputs[1:6:2], wanted[1:6:2], rtol=1e-5)
+
+
+def test_smoothing_does_not_reach_across_a_clock_that_was_set_back() -> None:
+    """Each side is smoothed as if it were a run of its own."""
+    parts = [Case(one(UNDER), seed=seed).made() for seed in (1, 2)]
+    later, config = 60_000 * MS, parts[0][1]
+
+    def joined(*sources: Source) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        stamps = np.concatenate([sources[0].stamp + later, sources[1].stamp])
+        return stamps, {"radial": np.concatenate([source.values["radial"] for source in sources])}
+
+    command = joined(*(run.command for run, _ in parts))
+    tracker = joined(*(run.sensors["tracker"] for run, _ in parts))
+    with pytest.warns(PumafuseWarning):
+        both = fuse(Run.from_arrays(*command, {"tracker": tracker}), config, mode="smoothed")
+    for number, (run, _) in enumerate(parts):
+        alone, here = fuse(run, config, mode="smoothed")["radial"], both.segment == number
+        np.testing.assert_array_equal(both["radial"].position[here], alone.position)
+        np.testing.assert_array_equal(both["radial"].position_sd[here], alone.position_sd)
+
+
+# ---- gates ----------------------------------------------------------------------------------------------------------
+
+
+def check_gated(run: Run, config: FusionConfig, estimates: Estimates, mode: str) -> dict[Outcome, set[tuple[str, int]]]:
+    """Estimates are those of the Gaussian without what was rejected; what re-acquired adds (ν/scale)² to the offset's.
+
+    Returns:
+        The rows with each outcome.
+    """
+    found = estimates.measurements
+    stamps = np.rint(found.stamp * 1e9).astype(np.int64) + estimates.origin
+    sources = [(found.sensors[number], run.sensors[found.sensors[number]].stamp) for number in found.sensor]
+    rows = [(name, int(np.searchsorted(of, stamp))) for (name, of), stamp in zip(sources, stamps, strict=True)]
+    by = {kind: {row for row, outcome in zip(rows, found.outcome, strict=True) if outcome == kind} for kind in Outcome}
+    oracle = AxisOracle(run, config, "radial", leave_out=by[Outcome.REJECTED], reacquired=by[Outcome.REACQUIRED])
+    check_innovations(found.where(np.isin(found.outcome, [Outcome.FUSED, Outcome.REACQUIRED])), oracle)
+    check_estimates(estimates["radial"], getattr(oracle, mode)(nanoseconds(estimates)))
+    return by
+
+
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+@settings(max_examples=30)
+@given(cases(), st.sampled_from(["filtered", "smoothed"]))
+def test_any_gated_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
+    """Gates narrow enough to reject and to re-acquire."""
+    run, config = tame(case).made()
+    config = msgspec.structs.replace(
+        config, sensors={name: msgspec.structs.replace(each, gate=1.0) for name, each in config.sensors.items()}
+    )
+    check_gated(run, config, fuse(run, config, rate=case.rate, **MODES[mode]), mode)
+
+
+# ---- biases ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("level", "start"), [(-2.0, None), (3.0, 5e-3)])
+def test_a_bias_is_in_the_coordinates_of_the_log(level: float, start: float | None) -> None:
+    """Measurements 600.4 mm − p have a bias of 600.4 mm wherever the arm starts, configured or by its first command."""
+    case = Case(seen={"panel": PANEL, "tracker": TRACKER}, start={} if start is None else {"radial": 0.5 + start})
+    run, config = case.made()
+    shift = level - 0.5
+    for name, bias in (("panel", 0.6004), ("tracker", 0.0)):
+        of, values = config.sensors[name], run.sensors[name].values["radial"]
+        values[:] = of.scale * (AxisOracle(run, config, "radial").undisturbed(case.seen[name].valid)[0] + shift) + bias
+    run.command.values["radial"][:] += shift
+    moved = replace(run, start={axis: u + shift for axis, u in run.start.items()})
+    bias = fuse(moved, config).biases["panel"]["radial"]
+    assert abs(bias.value - 0.6004) < 2.0 * bias.sd**2 / 1.0**2  # all that the prior of 0 ± 1 m takes from it, twice
+    assert bias.sd < 0.5e-3
+
+
+# ---- latencies that wander ------------------------------------------------------------------------------------------
+
+SCALE, JITTER, DRIFT = -1.5, 0.004, 0.3e-3
+
+
+def moving(seen: Seen, process: Process) -> tuple[Run, FusionConfig]:
+    """Three seconds of swinging to and fro by 60 mm at up to 0.11 m/s, commands every 10 ms."""
+    times = np.arange(300) * 10 * MS
+    case = Case(one(UNDER), times=times, period=0.01, process=process, offset_sd=1e-3, seen={"tracker": seen})
+    run, config = case.made()
+    run.command.values["radial"][:] = 0.5 + 0.03 * np.sin(2.0 * np.pi * 0.6e-9 * times)
+    return run, config
+
+
+def jittering_nis(latency_sd: float, seed: int) -> np.ndarray:
+    """NIS of 150 measurements whose latency really wanders, of an arm whose offset really walks."""
+    rng, valid = np.random.default_rng(seed), every(50, 150)
+    of = sensor(0.1e-3, latency=0.02, scale=SCALE, latency_sd=latency_sd)
+    run, config = moving(Seen(of, valid), Process(input_noise=0.0, drift=DRIFT))
+    actual = np.maximum(valid + np.rint(rng.normal(0.0, JITTER * 1e9, len(valid))).astype(np.int64), 0)
+    order = np.argsort(actual)
+    offset = np.empty(len(valid))
+    step = np.sqrt(np.diff(actual[order], prepend=0) * 1e-9) * DRIFT
+    offset[order] = rng.normal(0.0, config.start.offset_sd) + np.cumsum(step * rng.normal(size=len(valid)))
+    position = AxisOracle(run, config, "radial").undisturbed(actual)[0] + offset
+    run.sensors["tracker"].values["radial"][:] = SCALE * position + rng.normal(0.0, 0.1e-3, len(valid))
+    return fuse(run, config).measurements.nis
+
+
+def test_measurements_whose_latency_wanders_are_consistent_where_latency_sd_says_so() -> None:
+    """Mean NIS over many runs is 1 within the 99.9 % band of χ²; without latency_sd the errors look far too large."""
+    right, wrong = (np.concatenate([jittering_nis(sd, seed) for seed in range(25)]) for sd in (JITTER, 0.0))
+    low, high = chi2.ppf([0.0005, 0.9995], len(right)) / len(right)
+    assert low < right.mean() < high
+    assert wrong.mean() > 3.0

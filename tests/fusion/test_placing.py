@@ -19,7 +19,6 @@ LEVEL = Rotation.from_rotvec([-1.5, 0.2, 0.3])
 
 
 def config(**sensors: dict[str, object]) -> pf.FusionConfig:
-    """A configuration whose six axes answer alike."""
     axes = {axis: {"kind": "angle"} | PLANT if axis.startswith("r") else PLANT for axis in AXES}
     arm = {"name": "arm", "update_period_ms": PERIOD * 1e3, "delay_ms": DELAY * 1e3, "axes": axes}
     return pf.FusionConfig.parse({"arm": arm, "sensors": sensors, "process": NOISE})

@@ -35,7 +35,6 @@ def est(config: pf.FusionConfig) -> pf.Estimates:
 
 @pytest.fixture(scope="module")
 def saved(est: pf.Estimates, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Their result folder."""
     folder = tmp_path_factory.mktemp("results") / "fused"
     est.save(folder)
     return folder

@@ -190,7 +190,6 @@ def test_sticking_trials_are_named_and_left_out() -> None:
 
 
 def test_a_gain_that_is_no_line_is_called_none() -> None:
-    """Its lack of fit is significant."""
     bent = {0.002: 1.0, 0.004: 1.3, 0.008: 1.0, 0.019: 1.0}
     trials = [replace(trial, position=bent[trial.step] * trial.position) for trial in Arm(1, 0.01e-3).campaign(2)]
     axis = identified(trials).axes["radial"]

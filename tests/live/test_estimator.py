@@ -4,8 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import pumafuse as pf
+from pumafuse.filter.outcome import ABSENT, Outcome
+from pumafuse.live.commands import Commands
 from pumafuse.logs.clock import clock_faults
 
 ARM = pf.ArmModel.load("puma560-internal")
@@ -165,7 +169,6 @@ def test_silence_only_makes_the_estimate_less_certain() -> None:
     ],
 )
 def test_what_is_wrong_at_the_start_is_refused(wrong: dict) -> None:
-    """One clear line, as for files."""
     with pytest.raises(pf.PumafuseError, match=r"window|stale_after|radal|start"):
         pf.LiveEstimator(CONFIG, **wrong)
 
@@ -250,3 +253,50 @@ def test_two_senders_are_named_and_no_command_is_called_missing(later: float, co
     twice = np.sort(np.concatenate([np.arange(len(t)), np.arange(0, len(t), 50)]))  # some rows are there twice
     recorded = clock_faults(pf.Run.from_arrays(t[twice], {"radial": u[twice]}), PERIOD, [])
     assert len(recorded) == 1 and words in recorded[0]
+
+
+FUSED = int(Outcome.FUSED)
+START = (0.25, np.nan)
+COMMANDS = st.lists(
+    st.tuples(
+        st.integers(-20, 20),
+        st.sampled_from([(FUSED, FUSED), (FUSED, ABSENT), (ABSENT, FUSED), (int(Outcome.INVALID), FUSED)]),
+        st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+    ),
+    max_size=60,
+)
+
+
+@settings(max_examples=300)
+@given(COMMANDS, st.integers(5, 25), st.integers(0, 25), st.booleans())
+def test_any_order_of_commands_has_the_one_that_was_in_force(
+    commands: list[tuple[int, tuple[int, int], tuple[float, float]]], window: int, back: int, forgets: bool
+) -> None:
+    """At any instant that the window may ask for, and the latest with its step, as in a table of all that was fused.
+
+    Of one stamp the last that came counts. What is taken back was never there.
+    """
+    ours, table, newest = Commands(START), [{}, {}], -20
+    for stamp, codes, values in commands:
+        newest = max(newest, stamp)
+        stamp = max(stamp, newest - window)
+        ours.add(stamp, bytes(codes), values, newest - window)
+        for axis in range(2):
+            if codes[axis] == FUSED:
+                table[axis][stamp] = values[axis]
+    if forgets:
+        after = newest - window + min(back, window)
+        ours.forget(after)
+        table = [{stamp: value for stamp, value in one.items() if stamp <= after} for one in table]
+    for axis, (one, found) in enumerate(zip(table, ours.latest(), strict=True)):
+        stamps = sorted(one)
+        if not stamps:
+            assert found is None
+            assert ours.at(axis, newest) is None
+            continue
+        level = START[axis] if axis == 0 else one[stamps[0]]
+        before = one[stamps[-2]] if len(stamps) > 1 else level
+        assert found == (stamps[-1], one[stamps[-1]], one[stamps[-1]] - before)
+        for instant in range(newest - window, newest + 2):
+            passed = [stamp for stamp in stamps if stamp <= instant]
+            assert ours.at(axis, instant) == (one[passed[-1]] if passed else level)

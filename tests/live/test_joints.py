@@ -52,7 +52,6 @@ SENSORS = {
 
 
 def joints_at(time: np.ndarray) -> np.ndarray:
-    """A motion of the joints [rad], (n, 6)."""
     phase = np.arange(6) * 0.7
     return 0.4 * np.sin(time[:, None] * np.linspace(0.7, 1.9, 6) + phase) + [0.1, -0.6, 0.9, 0.2, 0.5, -0.3]
 

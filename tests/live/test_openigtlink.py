@@ -86,7 +86,6 @@ def message(kind: str, content: bytes, device: str = "camera") -> bytes:
 
 
 def listed(name: str, numbers: list[float]) -> bytes:
-    """A device among several."""
     return struct.pack(f">20sBx{len(numbers)}f", name.encode(), 2, *numbers)
 
 

@@ -53,11 +53,9 @@ class Recorded:
         self.tick_until(lambda: self.recorder._writer.rows == rows)
 
     def noticed(self, text: str) -> None:
-        """Wait for a notice."""
         self.tick_until(lambda: any(text in notice for notice in self.notices))
 
     def close(self) -> pf.Run:
-        """End the recording, and read it."""
         self.recorder.close(self.live.sure)
         return pf.Run.read(self.folder)
 

@@ -144,7 +144,6 @@ def test_publishers_come_late_leave_and_return(tmp_path: Path, start: Callable[.
     ],
 )
 def test_wrong_arguments(tmp_path: Path, options: list[str], code: int, words: str) -> None:
-    """One line each."""
     cell(tmp_path, STAMPED)
     given = [one.format(tmp_path) for one in options]
     assert words in pumafuse("live", "-c", tmp_path / "fusion.toml", *given, code=code).stderr

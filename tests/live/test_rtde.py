@@ -190,7 +190,6 @@ def test_a_robot_that_hangs_up_is_called_again(robot: Callable[..., Robot]) -> N
 def test_what_a_robot_refuses_is_said(
     robot: Callable[..., Robot], more: dict[str, object], run: str, words: str
 ) -> None:
-    """One sentence with the names; and no event."""
     notices = list[str]()
     found = source(robot(**more), run, notices)
     found.start()

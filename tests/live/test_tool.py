@@ -57,7 +57,6 @@ CONFIG = pf.FusionConfig(
 
 
 def pose(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    """A motion of the tool: where it is [m], (n, 3), and how it is turned, up to 70° from its mean."""
     at = 0.1 * np.column_stack([np.sin(time), np.sin(0.7 * time + 1.0), np.cos(1.3 * time)]) + [0.5, 0.2, -0.1]
     turn = np.column_stack([0.9 * np.sin(0.9 * time), 0.5 * np.sin(1.7 * time), 0.8 * np.cos(0.6 * time)])
     return at, Rotation.from_rotvec(turn) * Rotation.from_rotvec([-1.6, 0.2, 0.4])

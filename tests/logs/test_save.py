@@ -55,7 +55,6 @@ def sources(draw: st.DrawFn, axes: tuple[str, ...]) -> Source:
 
 
 def test_arrivals_come_back() -> None:
-    """When rows came is saved where it is told."""
     command = replace(source([0, 28_000_000], {"x": [1, 2]}), arrival=np.array([5, 28_000_009]))
     again = through(Run("log", command, {"eye": source([0], {"x": [3]})}))
     assert again.command.arrival.tolist() == [5, 28_000_009] and len(again.sensors["eye"].arrival) == 0

@@ -101,7 +101,6 @@ arms = st.builds(
 
 @pytest.fixture
 def load(tmp_path: Path):
-    """Load an arm from the text of a file."""
 
     def from_text(text: str) -> ArmModel:
         path = tmp_path / "arm.toml"

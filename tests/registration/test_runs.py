@@ -119,7 +119,6 @@ def test_a_marker_that_is_fixed_stays(tmp_path: Path, registered: Path) -> None:
     ],
 )
 def test_what_cannot_be_registered_is_one_line(arguments: tuple[str, ...], words: str) -> None:
-    """The line says what, and what is accepted."""
     assert words in refused("register", RUNS / "inspect1", *arguments)
 
 

@@ -105,7 +105,6 @@ WRONG = {
 
 @pytest.mark.parametrize("case", WRONG)
 def test_a_size_of_the_other_kind_is_refused(case: str, tmp_path: Path) -> None:
-    """One line with the key."""
     (old, new), message = WRONG[case]
     assert old in SCENARIO
     with pytest.raises(pf.ConfigError, match=message) as caught:

@@ -60,7 +60,6 @@ WRONG: dict[str, tuple[str, ...]] = {
 
 @pytest.mark.parametrize("text", WRONG, ids=lambda text: text[-24:])
 def test_a_wrong_scenario_is_refused_in_one_line(text: str, tmp_path: Path) -> None:
-    """File, key and the accepted names."""
     message = one_line(pf.PumafuseError, lambda: load(tmp_path, text))
     assert "scenario.toml" in message and all(words in message for words in WRONG[text]), message
 
