@@ -96,12 +96,16 @@ def test_a_row_of_several_axes_counts_by_the_best_of_them() -> None:
 
 @pytest.mark.parametrize("how", [{"mode": "as-live"}, {"mode": "smoothed"}, {"engine": "filterpy"}], ids=str)
 def test_stray_rows_change_no_estimate(how: dict[str, str]) -> None:
-    """To the bit, of each source one ahead and one behind, which is too late of a sensor, in a log in x, y, z."""
+    """To the bit, of each source one ahead, one behind and one behind at its end, in a log in x, y, z.
+
+    What a sensor has behind is too late.
+    """
     made = pf.simulate(scenario("cylindrical-cartesian", 0.04, 0.02))
 
     def strayed(_: str, one: Source) -> Source:
-        rows = one.rows(np.insert(np.arange(len(one.stamp)), [10, 20], [10, 20]))
-        rows.stamp[[10, 21]] += np.array([77, -12]) * SECOND
+        end = len(one.stamp)
+        rows = one.rows(np.insert(np.arange(end), [10, 20, end], [10, 20, end - 1]))
+        rows.stamp[[10, 21, end + 2]] += np.array([3600, -12, -100]) * SECOND
         return rows
 
     got, wanted = (pf.fuse(run, made.config, **how) for run in (made.run.each(strayed), made.run))
@@ -111,5 +115,6 @@ def test_stray_rows_change_no_estimate(how: dict[str, str]) -> None:
         np.testing.assert_array_equal(getattr(used[0], field), getattr(used[1], field))
     tables = [results.reference_table(est.reference, est.config) for est in (got, wanted)]
     assert tables[0].equals(tables[1])
-    assert got.command_counts["stray"] == 2
-    assert {(counts["stray"], counts["too_late"]) for counts in got.counts.values()} == {(1, 1)}
+    assert got.command_counts["stray"] == 3
+    assert {(counts["stray"], counts["too_late"]) for counts in got.counts.values()} == {(1, 2)}
+    assert any("command" in note and "stray" in note for note in got.notes)
