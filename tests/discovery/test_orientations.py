@@ -1,6 +1,6 @@
 """Orientations in logs that nothing describes: which columns, which order, and what becomes of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -115,21 +115,45 @@ def test_an_order_that_nothing_tells_is_asked_for(tmp_path: Path) -> None:
     assert any("is w the first of q0, q1, q2, q3?" in one for one in asked(found))
 
 
-def test_the_pose_of_universal_robots_is_a_rotation_vector(tmp_path: Path) -> None:
-    """Six numbers of target_TCP_pose and actual_TCP_pose in one table: m, and a rotation vector in rad."""
-    rows: dict[str, Any] = {"timestamp": 0.02 * np.arange(700)}
-    t = rows["timestamp"]
-    for name, late in (("target", 0.0), ("actual", LATE)):
-        six = np.hstack([places(t - late), turned(t - late).as_rotvec()])
-        rows |= {f"{name}_TCP_pose_{k}": six[:, k] for k in range(6)}
-    write(tmp_path / "ur.csv", rows)
-    found = survey(tmp_path / "ur.csv")
+@pytest.mark.parametrize(
+    ("told", "seen", "angles", "question"),
+    [
+        ("target_TCP_pose_{}", "actual_TCP_pose_{}", Rotation.as_rotvec, ""),
+        ("wanted_flange[{}]", "flange[{}]", Rotation.as_quat, "is w the last of"),
+        ("ee.setpoint_{}", "ee.state_{}", lambda turned: turned.as_euler("xyz"), "angles about x, y and z that stay"),
+    ],
+)
+def test_a_list_of_a_tool_is_x_y_z_and_an_orientation(
+    told: str, seen: str, angles: Callable[[Rotation], FloatArray], question: str, tmp_path: Path
+) -> None:
+    """Of Universal Robots a rotation vector in rad beside m, of others as their numbers are, and asked."""
+    t = 0.02 * np.arange(700)
+    rows: dict[str, Any] = {"timestamp": t}
+    for name, late in ((told, 0.0), (seen, LATE)):
+        pose = np.hstack([places(t - late), angles(turned(t - late))])
+        rows |= {name.format(number): column for number, column in enumerate(pose.T)}
+    write(tmp_path / "log.csv", rows)
+    found = survey(tmp_path / "log.csv")
     run, config = written(found, tmp_path / "out")
     assert tuple(config.arm.axes) == ("x", "y", "z", *TURNING)
     assert run.command.orientation is not None
     assert (Rotation.from_quat(run.command.orientation) * turned(t).inv()).magnitude().max() < 1e-6
     assert np.abs(run.command.values["y"] - places(t)[:, 1]).max() < 1e-9
-    assert found.relations["actual", "rx"].lag == pytest.approx(LATE, abs=0.004)
+    assert [relation.lag for relation in found.relations.values()] == [pytest.approx(LATE, abs=0.004)] * 6
+    assert any("o name says it" in line and question in line for line in asked(found)) == bool(question)
+
+
+@pytest.mark.parametrize(("told", "seen", "first"), [("cmd_tcp_{}", "tcp_{}", 1), ("goal[{}]", "eef_pos[{}]", 0)])
+def test_three_numbers_of_a_tool_are_a_place(told: str, seen: str, first: int, tmp_path: Path) -> None:
+    """Also where only the sensor's name says so: no joints in rad."""
+    t = 0.02 * np.arange(700)
+    rows: dict[str, Any] = {"t": t}
+    for name, late in ((told, 0.0), (seen, LATE)):
+        rows |= {name.format(first + place): column for place, column in enumerate(places(t - late).T)}
+    write(tmp_path / "log.csv", rows)
+    run, _ = written(survey(tmp_path / "log.csv"), tmp_path / "out")
+    assert run.kinds == dict.fromkeys("xyz", "length")
+    assert np.abs(run.command.values["y"] - places(t)[:, 1]).max() < 1e-9
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -108,7 +107,7 @@ _ELEMENT = re.compile(r"(.*)\[(\d+)\]")
 _TOLD = {"command", "reference"}  # roles in a table by which it is a run of its own, where others are beside them
 _CHILD = "child_frame_id"
 _BASES = names.words_in("base world map odom root origin")  # words of frames that stand still
-_TOOLS = names.words_in("tool tcp ee eef effector flange hand gripper")
+_HANDS = names.TOOLS | names.words_in("hand gripper")
 _NUMBERS = re.compile(r"\d+")  # as in tool0_controller
 _STREAM_NS = 250_000_000  # between trajectories of one point, up to which they are commands that are sent as they act
 
@@ -340,10 +339,18 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
     )
 
 
-def _points(paths: Iterable[str]) -> set[str]:
-    """The lists named p with three elements, x, y and z: control engineers write p for places and q for joints."""
-    lists = Counter(match[1] for path in paths if (match := _ELEMENT.fullmatch(path)))
-    return {name for name, size in lists.items() if size == len(CARTESIAN) and names.words(name)[:1] == ["p"]}
+def _points(paths: Iterable[str]) -> dict[str, str]:
+    """The axes x, y and z of lists of three elements that are places, by their columns.
+
+    These are a tool's, or named p: control engineers write p for places and q for joints.
+    """
+    return {
+        column: axis
+        for name, columns in names.lists(paths).items()
+        if len(columns) == len(CARTESIAN)
+        and (names.is_of_space(name) or (names.words(name)[:1] == ["p"] and columns[0].endswith("]")))
+        for column, axis in zip(columns, CARTESIAN, strict=True)
+    }
 
 
 def is_nameless(signals: Iterable[Signal], clock: Clock) -> bool:
@@ -383,7 +390,9 @@ def _velocities(signals: Sequence[Signal], stamp: TimeArray) -> dict[str, str]:
     }
 
 
-def _placed(signal: Signal, attitudes: Iterable[Attitude], inches: Mapping[str, str], points: Container[str]) -> Signal:
+def _placed(
+    signal: Signal, attitudes: Iterable[Attitude], inches: Mapping[str, str], points: Mapping[str, str]
+) -> Signal:
     """A signal with the axis or the unit that columns beside it imply: an orientation, inches, or a list of x, y, z."""
     beside = next((attitude for attitude in attitudes if signal.column in attitude.coordinates), None)
     if beside is not None:
@@ -391,8 +400,7 @@ def _placed(signal: Signal, attitudes: Iterable[Attitude], inches: Mapping[str, 
         signal = replace(signal, axis=beside.coordinates[signal.column], **unit)
     if signal.column in inches:
         return replace(signal, axis=names.axis_of(inches[signal.column], []), unit="inch", basis="name")
-    element = _ELEMENT.fullmatch(signal.column)
-    return replace(signal, axis=CARTESIAN[int(element[2])]) if element and element[1] in points else signal
+    return replace(signal, axis=points.get(signal.column, signal.axis))
 
 
 def _likeliest(columns: Sequence[str]) -> list[str]:
@@ -930,7 +938,7 @@ def _by_frame(table: Table, source: Part) -> Iterator[tuple[Part, Table]]:
     links = {name for _, name in rows}
     moving = [pair for pair, here in rows.items() if np.ptp(at[:, here], axis=1).max() > 0.0]
     chosen = [pair for pair in moving if pair[0] not in links or names.has_word(_NUMBERS.sub("", pair[0]), _BASES)]
-    chosen = [pair for pair in chosen if names.has_word(_NUMBERS.sub("", pair[1]), _TOOLS)] or chosen
+    chosen = [pair for pair in chosen if names.has_word(_NUMBERS.sub("", pair[1]), _HANDS)] or chosen
     if not chosen:
         yield replace(source, notes=(*source.notes, "no frame in it moves as seen from a base: links only turn")), table
     others = [f"{frame} → {name}" for frame, name in rows if (frame, name) not in chosen]

@@ -101,6 +101,7 @@ EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns tha
 VALID = words_in("valid tracked visible detected")  # of columns that say whether a row of a sensor means anything
 _TELLING = _TIMES | COUNTERS | WHOSE | VALID | words_in("episode run trial")
 _DIGITS = "0123456789"
+_ELEMENT = re.compile(r"(.*[^\W_])(?:\[(\d+)\]|[_. ](\d+))")  # p[0], tcp_0
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|cm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
@@ -111,6 +112,10 @@ _KEYS = words_in("file topic entity where time clock start")  # of a source in r
 # Joints in metres, where others turn.
 SLIDING = words_in("slide slider prismatic linear rail gantry insertion telescope telescopic elevator")
 JOINTS = words_in("joint joints jnt dof")
+TOOLS = words_in("tool tcp ee eef effector flange")  # whose numbers are of space
+_OF_SPACE = TOOLS | words_in("cartesian xyz")
+# Beside these they are of joints, or angles alone.
+_NOT_OF_SPACE = JOINTS | words_in("controller qpos q rpy ypr euler rotvec rot angle angles ori orient hand gripper")
 _IN = "in"  # inches, or an input
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
@@ -344,6 +349,29 @@ def axis_of(column: str, labels: list[str]) -> str:
         kept = ["joint", *kept]
     named = leaf(column).rpartition(".")[2] if unit and "." in column else ""  # command.arm_deg is of the axis arm
     return identifier("_".join(kept)) or identifier(named) or "position"
+
+
+def lists(columns: Iterable[str]) -> dict[str, list[str]]:
+    """Columns that are the elements of one list, ``p[0]`` and ``p[1]`` or ``tcp_1`` and ``tcp_2``, by what they share.
+
+    They are counted from 0 or 1, without a gap; a unit may end each.
+    """
+    elements: dict[str, dict[int, str]] = {}
+    for column in columns:
+        if (match := _ELEMENT.fullmatch(column.removesuffix(ending(column) or ""))) is not None:
+            elements.setdefault(match[1], {})[int(match[2] or match[3])] = column
+    ordered = {name: sorted(numbered.items()) for name, numbered in elements.items()}
+    return {
+        name: [column for _, column in items]
+        for name, items in ordered.items()
+        if items[0][0] in (0, 1) and items[-1][0] - items[0][0] == len(items) - 1
+    }
+
+
+def is_of_space(name: str) -> bool:
+    """Whether the name of a list says that its numbers are places, or poses, of a tool in space."""
+    parts = {word.rstrip(_DIGITS) for word in words(name)}
+    return not _OF_SPACE.isdisjoint(parts) and _NOT_OF_SPACE.isdisjoint(parts)
 
 
 def label_of(column: str, labels: list[str]) -> str | None:

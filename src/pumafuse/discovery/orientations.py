@@ -37,11 +37,12 @@ QUATERNION = re.compile(
     rf"(?P<join>[_. \[(]?)(?P<part>[xyzwXYZW0-4]){_BACK}"
 )
 _NAMED, _NUMBERED = "wxyz", ("0123", "1234")  # parts of a quaternion, in the order of letters
-_ANGLE = re.compile(rf"{_FRONT}(?P<part>(?i:r[xyz]|roll|pitch|yaw|[abcwprxyz])|[0-5]){_BACK}")
+_ANGLE = re.compile(rf"{_FRONT}(?P<part>(?i:r[xyz]|roll|pitch|yaw|[abcwprxyz])){_BACK}")
 _EULER = {("a", "b", "c"): "kuka", ("w", "p", "r"): "fanuc", ("roll", "pitch", "yaw"): "rpy"}
 _NAMED_EULER = {"kuka": "KUKA's angles about z, y, x", "fanuc": "FANUC's angles about x, y, z that stay"}
 _NAMELESS = re.compile(r"column \d+")
-_UR = re.compile(r"(?i)tcp_?pose[_\[]$")  # x, y, z in m and a rotation vector in rad
+_UR = re.compile(r"(?i)tcp_?pose$")  # x, y, z in m and a rotation vector in rad
+_LONGEST = 20  # elements of a list that are tried: two poses with grippers have 16
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class Attitude:
 def attitudes_in(table: Table, paths: Iterable[str]) -> list[Attitude]:
     """The orientations of a table; ``paths`` are those of its numbers."""
     paths = list(paths)
-    return [*_quaternions(table, paths), *_without_header(table, paths), *_angles(table, paths)]
+    return [*_quaternions(table, paths), *_in_order(table, paths), *_angles(table, paths), *_listed(table, paths)]
 
 
 def _plain(table: Table, columns: Sequence[str]) -> FloatArray | None:
@@ -127,18 +128,19 @@ def _quaternions(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
         yield Attitude(made, quaternion, "a guess: w first" if doubt else "by name", doubt=doubt)
 
 
-def _without_header(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
-    """Seven columns without names, x, y, z and four of norm 1, as TUM's and ETH's files of poses have them: w last."""
-    order = [path for path in paths if _NAMELESS.fullmatch(path)]
-    for first in range(len(order) - 6):
-        xyz, (x, y, z, w) = order[first : first + 3], order[first + 3 : first + 7]
-        position, value = _plain(table, xyz), _plain(table, [x, y, z, w])
-        if position is None or value is None or not _moves(position) or not are_units(value):
-            continue
-        made = Orientation(quaternion=(x, y, z, w), order="xyzw")
-        doubt = f"is w the last of {x}, {y}, {z}, {w}? Their norm is 1, and no name says it (run.toml, order)"
-        axes = dict(zip(xyz, CARTESIAN, strict=True))
-        yield Attitude(made, rotations.of_quaternions(value, made.order), "a norm of 1: w last", axes, doubt=doubt)
+def _in_order(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
+    """Seven columns of a list, or without names, as TUM's and ETH's files have: x, y, z and four of norm 1, w last."""
+    nameless = [path for path in paths if _NAMELESS.fullmatch(path)]
+    for order in (nameless, *(columns for columns in names.lists(paths).values() if len(columns) <= _LONGEST)):
+        for first in range(len(order) - 6):
+            xyz, (x, y, z, w) = order[first : first + 3], order[first + 3 : first + 7]
+            position, value = _plain(table, xyz), _plain(table, [x, y, z, w])
+            if position is None or value is None or not _moves(position) or not are_units(value):
+                continue
+            made = Orientation(quaternion=(x, y, z, w), order="xyzw")
+            doubt = f"is w the last of {x}, {y}, {z}, {w}? Their norm is 1, and no name says it (run.toml, order)"
+            axes = dict(zip(xyz, CARTESIAN, strict=True))
+            yield Attitude(made, rotations.of_quaternions(value, made.order), "a norm of 1: w last", axes, doubt=doubt)
 
 
 def are_units(value: FloatArray) -> bool:
@@ -152,24 +154,39 @@ def are_units(value: FloatArray) -> bool:
 def _angles(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
     """Rotation vectors and Euler angles beside x, y and z that move."""
     for group in _groups(_ANGLE, paths, ("head", "end")):
-        listed = group.keys() >= set("012345") and _UR.search(group["0"].rpartition("0")[0]) is not None
-        angles = {
-            group[part]: axis for part, axis in zip("012" if listed else "xyz", CARTESIAN, strict=True) if part in group
-        }
-        triples: list[tuple[str, str, str]] = [("3", "4", "5")] if listed else [rotations.TURNING, *_EULER]
-        forms = [form for form in triples if set(form) <= group.keys()]
-        position = _plain(table, list(angles)) if len(angles) == len(CARTESIAN) else None
-        if len(forms) != 1 or position is None or not _moves(position):
-            continue
-        first, second, third = columns = (*(group[part] for part in forms[0]),)
-        made, unit = _of_angles(table, (first, second, third), _EULER.get(forms[0], "")), names.unit_of(first)
-        if listed:
-            made = Orientation(rotation_vector=(first, second, third), unit="rad")
-        if made is not None:
-            euler = _NAMED_EULER.get(made.convention, "angles about x, y and z that stay")
-            what = f"{euler if made.euler else 'a rotation vector'}{'' if unit else f', in {made.unit}'}"
-            doubt = "" if listed else f"are {', '.join(columns)} {what}? No name says it (run.toml)"
-            yield Attitude(made, made.read(table)[0], "by name", angles, "m" if listed else "", doubt)
+        forms = [form for form in [rotations.TURNING, *_EULER] if set(form) <= group.keys()]
+        if len(forms) == 1 and set(CARTESIAN) <= group.keys():
+            xyz, columns = ([group[part] for part in parts] for parts in (CARTESIAN, forms[0]))
+            yield from _beside(table, xyz, columns, [_EULER.get(forms[0], "")])
+
+
+def _listed(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
+    """Six numbers of a tool in one list, x, y, z and three angles: UR's pose, or whatever these may be."""
+    for name, columns in names.lists(paths).items():
+        if len(columns) == 6 and names.is_of_space(name):
+            yield from _beside(table, columns[:3], columns[3:], ["", "rpy"], surely=_UR.search(name) is not None)
+
+
+def _beside(
+    table: Table, xyz: Sequence[str], columns: Sequence[str], conventions: Iterable[str], *, surely: bool = False
+) -> Iterator[Attitude]:
+    """Three angles beside x, y and z that move, by the first convention that their numbers allow.
+
+    ``surely`` they are a rotation vector in rad, beside m.
+    """
+    position, (first, second, third) = _plain(table, xyz), columns
+    if position is None or not _moves(position):
+        return
+    options = (_of_angles(table, (first, second, third), convention) for convention in conventions)
+    made, unit = next(filter(None, options), None), names.unit_of(first)
+    if surely:
+        made = Orientation(rotation_vector=(first, second, third), unit="rad")
+    if made is not None:
+        euler = _NAMED_EULER.get(made.convention, "angles about x, y and z that stay")
+        what = f"{euler if made.euler else 'a rotation vector'}{'' if unit else f', in {made.unit}'}"
+        doubt = "" if surely else f"are {', '.join(columns)} {what}? No name says it (run.toml)"
+        axes = dict(zip(xyz, CARTESIAN, strict=True))
+        yield Attitude(made, made.read(table)[0], "by name", axes, "m" if surely else "", doubt)
 
 
 def _moves(position: FloatArray) -> bool:

@@ -830,7 +830,7 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
 
 def _set_units(roles: Roles) -> Roles:
     """Roles whose guessed units make commands and measurements move equally far, one unit a kind and source."""
-    command, reference = _angles_by_name(roles), roles.reference
+    command, reference = _kinds_by_name(roles), roles.reference
     others = [sensor for sensor in (reference, *reversed(roles.sensors)) if sensor is not None]
     sure = [other for other in others if not other.guessed]
     for sensor in sure:  # the first sensor has the last word
@@ -842,14 +842,20 @@ def _set_units(roles: Roles) -> Roles:
     return replace(roles, command=command, sensors=sensors, reference=reference)
 
 
-def _angles_by_name(roles: Roles) -> Stream:
-    """The commands, in radians on axes that only the names of their sensors call angles."""
+def _kinds_by_name(roles: Roles) -> Stream:
+    """The commands, in radians on axes that only the names of their sensors call angles, in metres on numbered ones.
+
+    An axis that is only numbered would be a joint; as x, y or z of its sensors it is none.
+    """
     axes = dict(roles.command.axes)
     for axis, signals in roles.command.axes.items():
         seen = [some for stream in roles.measured.values() for some in stream.axes.get(axis, ())]
         turning = [some for some in seen if names.turns(some.column, some.axis) and kind_of(f"_{some.unit}") == "angle"]
         if turning and signals[0].basis == "range" and roles.command.kind(axis) == "length":
             axes[axis] = _set_guessed_unit(signals, "_rad")
+        in_space = [some for some in seen if some.axis in CARTESIAN and kind_of(f"_{some.unit}") == "length"]
+        if in_space and _NUMBERED.fullmatch(signals[0].axis):
+            axes[axis] = _set_guessed_unit(signals, "_m")
     return replace(roles.command, axes=axes)
 
 
