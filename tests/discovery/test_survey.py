@@ -986,6 +986,7 @@ def test_roles_of_columns_by_name(column: str, role: str | None) -> None:
         ("range_mm", "position", "mm"),
         ("tcp_y_cm", "y", "cm"),
         ("ziel_x [cm]", "ziel_x", "cm"),
+        ("x [µm]", "x", "um"),
         ("x(in)", "x", "inch"),
         ("carriage_inches", "carriage", "inch"),
         ("lift_in", "lift_in", ""),
@@ -1084,15 +1085,20 @@ def test_torques_and_attitudes_that_move_alike_are_no_sensors(log: Path) -> None
     assert {why for part in found.parts for why in part.left_out.values()} == {"of a quaternion"}
 
 
-def test_columns_without_names_are_told_apart_by_which_follows_which(tmp_path: Path) -> None:
-    """As far and later: commands, what measures them in another order, and what is none of these, in one table."""
+@pytest.mark.parametrize("called", ["column {}", "Var{}"])
+def test_columns_without_names_are_told_apart_by_which_follows_which(called: str, tmp_path: Path) -> None:
+    """As far and later: commands, what measures them in another order, and what is none of these, in one table.
+
+    Without a header, and under the names that MATLAB gives where there are none.
+    """
     torque = 40.0 * np.gradient(ZT[:, 0])
     columns = [T, ZT[:, 1], U[:, 0], torque, U[:, 1], ZT[:, 2], U[:, 2], ZT[:, 0]]
-    np.savetxt(tmp_path / "log.txt", np.column_stack(columns), "%.6f")
+    header = ",".join(called.format(number) for number in range(1, 9)) if called.startswith("Var") else ""
+    np.savetxt(tmp_path / "log.txt", np.column_stack(columns), "%.6f", delimiter=",", header=header, comments="")
     found = survey(tmp_path / "log.txt")
     told, (seen,) = found.roles.command, found.roles.sensors
     pairs = {told.axes[axis][0].column: seen.axes[axis][0].column for axis in told.axes}
-    assert pairs == {"column 3": "column 8", "column 5": "column 2", "column 7": "column 6"}
+    assert pairs == {called.format(one): called.format(other) for one, other in ((3, 8), (5, 2), (7, 6))}
     np.savetxt(tmp_path / "log.txt", np.column_stack([T, U, 1.5 * ZT]), "%.6f")
     assert "which numbers are the commands" in one_line(RunError, lambda: survey(tmp_path / "log.txt"))
 
@@ -2241,7 +2247,33 @@ def test_in_is_a_unit_beside_words_of_roles_and_an_input_beside_an_output(
     assert found.run.axes == ("x",)
 
 
-@pytest.mark.parametrize("unit", ["kPa", "rpm", "N.m", "mV"])
+def test_a_line_below_the_header_says_the_units(tmp_path: Path) -> None:
+    """Of stamps, positions, and what is none by its unit alone; what a name says wins."""
+    header = "Clock,Set [rad],Act Angle,Drive,Drift\nms,-,deg,Nm,[deg/s]\n"
+    rows = zip(1e3 * T, U[:, 0], np.degrees(ZT[:, 0]), 3.0 * U[:, 1], 5.0 * U[:, 2], strict=True)
+    (tmp_path / "log.csv").write_text(header + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    found = survey(tmp_path / "log.csv")
+    (part,) = found.parts
+    assert part.left_out == {"Drive": "in Nm", "Drift": "in deg/s"} and part.clock is not None
+    assert part.clock.basis == "ms by name" and {(one.unit, one.basis) for one in part.signals} == {
+        ("rad", "name"),
+        ("deg", "name"),
+    }
+    assert [relation.lag for relation in found.relations.values()] == [pytest.approx(LAG, abs=0.01)]
+    run, _ = written(found, tmp_path / "out")
+    (angle,) = run.command.values.values()
+    assert np.abs(angle - U[:, 0]).max() < 1e-9
+
+
+def test_a_leader_commands_its_followers(tmp_path: Path) -> None:
+    """Joints of two arms that are only numbered: angles, no lengths."""
+    columns = {f"follower_{n}": ZT[:, n] for n in range(3)} | {f"leader_{n}": U[:, n] for n in range(3)}
+    found = surveyed(tmp_path, {"t": T, **columns})
+    assert of_roles(found) == [[f"leader_{n}" for n in range(3)], [f"follower_{n}" for n in range(3)]]
+    assert {*found.run.kinds.values()} == {"angle"}
+
+
+@pytest.mark.parametrize("unit", ["kPa", "rpm", "N.m", "mV", "deg/s", "m/s²", "rad/s^2"])
 def test_other_units_in_brackets_are_no_positions(unit: str) -> None:
     assert names.no_position(f"P_ref_0 [{unit}]") == f"in {unit}"
 

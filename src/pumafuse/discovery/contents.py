@@ -76,7 +76,6 @@ _OF_STEP = 0.01  # by which no step of a clock that was counted differs from the
 _METRES = names.words_in(
     "Pose PoseStamped PoseWithCovarianceStamped Point PointStamped Odometry TransformStamped TFMessage tfMessage"
 )
-NAMELESS = tables.FIRST.split()[:1]  # of the words that a column is called that has no name
 # s, over which a way is compared with what a velocity adds up to: beyond the digits of a position, within a motion.
 _OF_WAY = 0.1
 # Shares of the variance of the ways that a velocity explains as it is, as a correlation of 0.95 does, and the most that
@@ -297,7 +296,7 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
             times.append(path)
         elif path in counts:
             left_out[path] = "rises evenly: a count or a clock"
-        elif why := names.no_position(name) or names.no_position(_labelled(path, listed)):
+        elif why := _no_position(table, path, name) or names.no_position(_labelled(path, listed)):
             still = _signal(table, path, where, source, listed, None) if names.column_role(name) == "command" else why
             left_out[name] = still if isinstance(still, str) and still.startswith(RESTS) else why
         elif len(signals) == _MOST_COLUMNS:
@@ -308,7 +307,7 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
             left_out[name] = signal_or_why
     inches, points = names.inches_in(paths), _points(paths)
     signals = [_placed(signal, told, inches, points) for signal in _drop_quaternions(signals, left_out)]
-    called = [signal.column for signal in signals if not _is_nameless(signal.column)]
+    called = [signal.column for signal in signals if not names.number_of_nameless(signal.column)]
     if signals and (why := names.no_position_by_place(source.stem, called)):
         left_out |= {signal.name: f"{why}, as {source.label} is called" for signal in signals}
         signals = []
@@ -357,11 +356,7 @@ def is_nameless(signals: Iterable[Signal], clock: Clock) -> bool:
     """Whether no column has a name: those of a table without a header, or of an array that has its clock in it."""
     array, bracket, _ = clock.time.column.partition("[")
     columns = [signal.column for signal in signals]
-    return all(_is_nameless(column) or (bracket and column.startswith(f"{array}[")) for column in columns)
-
-
-def _is_nameless(column: str) -> bool:
-    return names.words(column)[:1] == NAMELESS
+    return all(names.number_of_nameless(column) or (bracket and column.startswith(f"{array}[")) for column in columns)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of numbers that are none, nothing is a velocity
@@ -484,6 +479,18 @@ def _called(column: str, where: Mapping[str, Any]) -> str:
     return "_".join([*(key if isinstance(key, str) else f"joint_{key}" for key in where.values()), column])
 
 
+def _name_with_unit(table: Table, path: str) -> str:
+    """The name of a column, with the unit that a line below the header says where it says none itself."""
+    unit = "" if names.unit_of(path) else table.units.get(path, "")
+    return f"{path} [{unit}]" if unit.strip("-") else path
+
+
+def _no_position(table: Table, path: str, name: str) -> str | None:
+    """What a column is by its name, or by a unit below that, if that is no position."""
+    told = _name_with_unit(table, path)
+    return names.no_position(name) or (None if told == path or names.unit_of(told) else f"in {table.units[path]}")
+
+
 def _signal(
     table: Table, path: str, where: Mapping[str, Any], source: Part, labels: list[str], joint: str | None
 ) -> Signal | str:
@@ -504,11 +511,11 @@ def _signal(
     sliding = kind in _RADIANS and names.has_word(joint or path, names.SLIDING)
     metres = kind in _METRES or sliding or _ECHOED.match(path)
     of_type = "m" if metres else "rad" if kind in _RADIANS or path.startswith(f"{PATH}.") else ""
-    unit = names.unit_of(path) or names.unit_of(source.topic or source.entity)
+    unit = names.unit_of(_name_with_unit(table, path)) or names.unit_of(source.topic or source.entity)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
     called = _ECHO.sub("", path)
-    if _is_nameless(path) and names.has_word(source.stem, names.JOINTS):
-        called = called.replace(NAMELESS[0], "joint")
+    if (number := names.number_of_nameless(path)) and names.has_word(source.stem, names.JOINTS):
+        called = f"joint {number}"
     axis = joint or names.axis_of(_called(called, where), labels)
     if kind == _PX4:
         element = _ELEMENT.fullmatch(path)
@@ -541,7 +548,9 @@ def _numeric_paths(table: Table) -> Iterator[str]:
     """Paths of all numbers in the first cells of a table, and columns of text, which may be numbers, too."""
     for name, column in table.columns.items():
         first = column.drop_null()[:1]
-        if not len(first) and names.words(name)[:1] in ([], NAMELESS):  # a separator at the end of each line
+        if not len(first) and (
+            names.number_of_nameless(name) or not names.words(name)
+        ):  # a separator at the end of each line
             continue
         if not len(first) or pa.types.is_string(first.type):
             yield name
@@ -563,7 +572,8 @@ def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tu
     notes, stroke, coarse = list[str](), _stroke(signals), 0.0
     called = sorted(_stamp_columns(table), key=lambda name: (name == LOG_TIME, "header" not in names.words(name)))
     in_units = [name for name in table.columns if ending(leaf(name)) in TIMES and name not in called]
-    nameless = next(iter(table.columns), "") in (tables.FIRST, "X_Value")
+    first = next(iter(table.columns), "")
+    nameless = first == "X_Value" or names.number_of_nameless(first)
 
     def candidates() -> Iterator[Clock | None]:
         yield from (_clock_of(table, name, stroke) for name in called)
@@ -700,7 +710,7 @@ def _clock_of(table: Table, name: str, stroke: float, span: float = 0.0) -> Cloc
             time, basis = Time(name, nanoseconds=beside), "seconds and nanoseconds"
         elif (unit := ending(leaf(name))) in TIMES:
             time, basis = Time(name), f"{unit[1:]} by name"
-        elif unit := names.time_unit_of(name):
+        elif unit := names.time_unit_of(_name_with_unit(table, name)):
             time, basis = Time(name, unit), f"{unit} by name"
         else:
             values = table.plain(name)[0]

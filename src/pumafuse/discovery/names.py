@@ -26,13 +26,14 @@ _ROLES: dict[Role, frozenset[str]] = {
     "command": words_in(
         "command commands commanded cmd goal goals target targets tgt tar desired des demand demanded setpoint"
         " setpoints set sp soll sol sollwert planned action actions control ctrl input inputs com wanted reqd requested"
+        " leader master"
         " consigna consigne comando deseado desejado controle"
     ),
     "sensor": _DEVICES
     | words_in(
         "state states measured measurement measurements meas msr actual present real ist istwert pv process current"
         " cur curr encoder encoders feedback fbk fb readback rbv observed observation estimate estimated recorded"
-        " reported odom medida medido mesure messwert misura"
+        " reported odom medida medido mesure messwert misura follower slave puppet"
     ),
 }
 # In the name of a topic or file these are something else.
@@ -102,10 +103,13 @@ VALID = words_in("valid tracked visible detected")  # of columns that say whethe
 _TELLING = _TIMES | COUNTERS | WHOSE | VALID | words_in("episode run trial")
 _DIGITS = "0123456789"
 _ELEMENT = re.compile(r"(.*[^\W_])(?:\[(\d+)\]|[_. ](\d+))")  # p[0], tcp_0
+_NAMELESS = re.compile(r"(?:column |Column|Var|Unnamed: )(\d+)")  # also as MATLAB and pandas call them
 _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q[0], q_0, q1, x_mm
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|cm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
-_OTHER_UNIT = re.compile(r"[\[(] *([kM]?Pa|m?bar|psi|rpm|k?N|N[. *]?m|m[AV]|k?Hz|%) *[\])]$", re.IGNORECASE)
+_OTHER_UNIT = re.compile(
+    r"[\[(] *([kM]?Pa|m?bar|psi|rpm|k?N|N[. *]?m|m[AV]|k?Hz|%|[a-z]*/(?:s|sec|min)(?:\^?2|²)?) *[\])]$", re.IGNORECASE
+)
 _IN_BRACKETS = re.compile(r" [\[(] *([^\W\d][^\])]*?)\W*[\])]$")  # counts [counts?]; no label of a list
 _BRACKETED = re.compile(rf"[\[(] *(mm|cm|m|um|in|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
@@ -146,9 +150,9 @@ def words(name: str) -> list[str]:
     """The words of a name in lower case: ``goalPose_x`` is goal, pose, x; ``QTarget2`` is q, target, 2.
 
     Numbers of devices stay with them: ``camera2`` is one word. ``refx`` is ref, x, and ``velcmd`` is vel, cmd. ``H2C``
-    is one, too. ``PosAct`` is pos, actual. Accents are left out.
+    is one, too. ``PosAct`` is pos, actual. Accents are left out, and µ is u.
     """
-    apart = _HUMP.sub("_", _ACCENT.sub("", unicodedata.normalize("NFD", name)))
+    apart = _HUMP.sub("_", _ACCENT.sub("", unicodedata.normalize("NFKD", name).replace("μ", "u")))
     whole = [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
     glued = [None if word in _KNOWN else _GLUED.fullmatch(word) for word in whole]
     parts = [
@@ -211,6 +215,12 @@ def has_word(name: str, vocabulary: frozenset[str]) -> bool:
     return not vocabulary.isdisjoint(words(name))
 
 
+def number_of_nameless(column: str) -> str:
+    """The number of a column that has no name, as readers and programs call it; empty for any other."""
+    match = _NAMELESS.fullmatch(column)
+    return match[1] if match else ""
+
+
 def is_time(column: str) -> bool:
     """Whether a column is called as stamps are; ``t_deg`` is an axis."""
     return not _TIMES.isdisjoint(words(column)) and not unit_of(column)
@@ -218,7 +228,7 @@ def is_time(column: str) -> bool:
 
 def time_unit_of(column: str) -> str:
     """The unit of stamps that a name says otherwise than by its ending, ``micros`` or ``t [ms]``; empty without one."""
-    *before, last = words(leaf(column)) or [""]
+    *before, last = words(column) or [""]
     return _TIME_UNITS.get(last, "") if before or len(last) > 2 else ""
 
 
@@ -238,6 +248,8 @@ def likeliest_first(columns: Iterable[str]) -> list[str]:
 def no_position(column: str) -> str | None:
     """What a column is by its name, if that is no position; a unit of positions wins over words."""
     kind, unit, parts = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
+    if number_of_nameless(column):
+        return None
     if not _CHANGES.isdisjoint(parts):
         return "relative: a change, no position"
     if _PER.search(column):

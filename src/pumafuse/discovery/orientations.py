@@ -40,7 +40,6 @@ _NAMED, _NUMBERED = "wxyz", ("0123", "1234")  # parts of a quaternion, in the or
 _ANGLE = re.compile(rf"{_FRONT}(?P<part>(?i:r[xyz]|roll|pitch|yaw|[abcwprxyz])){_BACK}")
 _EULER = {("a", "b", "c"): "kuka", ("w", "p", "r"): "fanuc", ("roll", "pitch", "yaw"): "rpy"}
 _NAMED_EULER = {"kuka": "KUKA's angles about z, y, x", "fanuc": "FANUC's angles about x, y, z that stay"}
-_NAMELESS = re.compile(r"column \d+")
 _UR = re.compile(r"(?i)tcp_?pose$")  # x, y, z in m and a rotation vector in rad
 _LONGEST = 20  # elements of a list that are tried: two poses with grippers have 16
 
@@ -130,7 +129,7 @@ def _quaternions(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
 
 def _in_order(table: Table, paths: Sequence[str]) -> Iterator[Attitude]:
     """Seven columns of a list, or without names, as TUM's and ETH's files have: x, y, z and four of norm 1, w last."""
-    nameless = [path for path in paths if _NAMELESS.fullmatch(path)]
+    nameless = [path for path in paths if names.number_of_nameless(path)]
     for order in (nameless, *(columns for columns in names.lists(paths).values() if len(columns) <= _LONGEST)):
         for first in range(len(order) - 6):
             xyz, (x, y, z, w) = order[first : first + 3], order[first + 3 : first + 7]

@@ -25,7 +25,6 @@ from ..units import AN, DEG, GUESSED, KINDS, TURN, Kind, kind_of
 from . import names
 from .contents import (
     ARE_SPEEDS,
-    NAMELESS,
     RANGES,
     RESTS,
     Part,
@@ -687,7 +686,7 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     fewest = 0.0 if _is_namesake(command, stream) else fewest
     called = [(axis, signal) for axis, some in stream.axes.items() for signal in some]
     is_open = all(signal.axis == axis and signal.basis == "range" for axis, signal in called)  # a unit that nobody says
-    is_open = is_open and not any(names.words(signal.column)[:1] == NAMELESS for _, signal in called)
+    is_open = is_open and not any(names.number_of_nameless(signal.column) for _, signal in called)
     as_far = is_open or 1.0 / _GAINS < float(np.median(gains or 1.0)) < _GAINS
     if len(behind) > fewest and as_far and max(gains) < _GAINS * min(gains):
         return f"{float(np.median([relation.lag for relation in behind])) * 1e3:.0f} ms late", ""
@@ -717,8 +716,11 @@ def _rises_evenly(value: FloatArray) -> bool:
 def _is_namesake(command: Stream, stream: Stream) -> bool:
     """Whether columns are called as those of the commands without a word of these: ``q[0]`` beside ``q_cmd[0]``."""
     shared = stream.axes.keys() & command.axes.keys()
-    names_of = [[names.bare(side.axes[axis][0].name) for side in (stream, command)] for axis in shared]
-    return bool(names_of) and all(first == other and first[:1] != NAMELESS for first, other in names_of)
+    both = [[side.axes[axis][0] for side in (stream, command)] for axis in shared]
+    return bool(both) and all(
+        names.bare(first.name) == names.bare(other.name) and not names.number_of_nameless(first.column)
+        for first, other in both
+    )
 
 
 def _copies(other: Stream, stream: Stream) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from itertools import count
 from pathlib import Path
@@ -72,6 +72,7 @@ class Table:
     names: tuple[str, ...] = ()
     # which size in a column stands for "none", where the file has more rows; None: these tell
     sentinel_of: Callable[[str], float | None] | None = None
+    units: Mapping[str, str] = field(default_factory=dict[str, str])  # what a line below the header says, by column
 
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
         """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels."""

@@ -70,6 +70,7 @@ _NUMBER = re.compile(
 )
 _UNITS = r"[µunm]?s|[µumc]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(?:mm|m|deg|rad|°)/s²?"
 _UNIT = re.compile(rf"[\[(]?(|-|{_UNITS})[\])]?")
+_UNIT_ROW = b"pumafuse: units"  # of the columns, with tabs between them, in the metadata of a table of text
 # What programs print: `Target X: 70.0 mm | q[0]=1.5 | mode: auto`. A label has up to four words, as in longer ones a
 # search would begin anew at each word of a line of prose.
 _WORD = r"[^\W\d][\w.]*(?:[\[(][\w°]+[\])])?"
@@ -143,7 +144,11 @@ def read(
     notes += [
         f"{path.name}: two columns are named '{shortened(name)}': neither is used" for name in sorted(_repeated(names))
     ]
-    return Table(path, _named(table), table.num_rows, tuple(notes), tuple(names))
+    metadata: dict[bytes, bytes] = table.schema.metadata or {}
+    header: list[str] = table.column_names
+    below = metadata.get(_UNIT_ROW, b"").decode().split("\t")
+    units = {name: unit for name, unit in zip(header, below, strict=False) if unit}
+    return Table(path, _named(table), table.num_rows, tuple(notes), tuple(names), units=units)
 
 
 def chosen(table: Table, where: Where) -> Table:
@@ -354,7 +359,8 @@ def _of_csv(path: Path, text: bytes, choice: Choice | None) -> _Text:
         table, names, more = _parsed(path, text.decode("cp1252").encode(), choice)
         more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
     numbered, twice = _numbered(path, table.column_names)
-    return pa.table([_listed(column) for column in table.columns], numbered), names or numbered, [*twice, *more]
+    listed = pa.table([_listed(column) for column in table.columns], numbered, metadata=table.schema.metadata)
+    return listed, names or numbered, [*twice, *more]
 
 
 def _numbered(path: Path, header: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -416,19 +422,20 @@ def _parsed(path: Path, text: bytes, choice: Choice | None) -> _Text:
         return "skip"
 
     def parsed(layout: _Layout, **options: Any) -> pa.Table:
-        return pacsv.read_csv(
+        table = pacsv.read_csv(
             pa.BufferReader(text),
             read_options=pacsv.ReadOptions(
                 use_threads=False,
                 skip_rows=layout.skipped,
                 column_names=layout.names,
-                skip_rows_after_names=int(layout.units),
+                skip_rows_after_names=int(layout.units is not None),
             ),
             parse_options=pacsv.ParseOptions(delimiter=layout.separator, newlines_in_values=layout.broken, **options),
             convert_options=pacsv.ConvertOptions(
                 null_values=BLANK, strings_can_be_null=True, decimal_point=layout.point, include_columns=used
             ),
         )
+        return table if used or layout.units is None else table.replace_schema_metadata({_UNIT_ROW: layout.units})
 
     try:
         table = parsed(layout)
@@ -584,7 +591,7 @@ class _Layout(NamedTuple):
     point: str  # of decimals: 1,5;2 as well as 1.5,2
     skipped: int  # lines above the header; with it where names are given
     names: list[str] | None
-    units: bool = False  # whether a line with units is below the header
+    units: str | None = None  # of a line below the header, with tabs between them; None: there is no such line
     above: int = 0  # how many of the lines above are no comments and not blank
     broken: bool = False  # whether cells in quotes go on in the next line
 
@@ -619,14 +626,15 @@ def _layout(text: bytes) -> _Layout:
         wide = re.split(r"\s{2,}|\t", lines[above[0]].strip()) if above and of_rows == " " else []
         is_header = len(wide) == width and _is_text(wide)  # names of several words, each above its column
         names, top = (wide, above[0]) if is_header else (list(map(_column, range(width))), rows)
-        separator, skipped, units = of_rows, rows, False
+        separator, skipped, units = of_rows, rows, None
     else:
         separator = _separator(lines[header])
         cells = _cells(lines[header], separator)
-        units = header > first and all(map(_UNIT.fullmatch, cells))
-        top, names = _told_apart(lines, header - units, separator)
+        told = [_UNIT.fullmatch(cell) for cell in cells] if header > first else [None]
+        units = "\t".join(match[1] for match in told if match) if all(told) else None
+        top, names = _told_apart(lines, header - (units is not None), separator)
         names = cells if names is None and len(cells) > _WIDE else names
-        skipped = header - units + (names is not None)
+        skipped = header - (units is not None) + (names is not None)
     return _Layout(separator, _point(text, separator), skipped, names, units, sum(n < top for n in full), broken)
 
 

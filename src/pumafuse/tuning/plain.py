@@ -199,6 +199,8 @@ class Doubt(NamedTuple):
     def sentence(self, config: FusionConfig, axis: str) -> str:
         """What to know of it, under the configuration that is doubted; empty where that is little."""
         screen, (low, high) = config.arm.screen_of(axis), self.lag_ci95
+        longest = float(LAGS[-1])  # that is searched: beyond it a number says nothing
+        lag = f"{self.lag * MS:.4g} ms" if self.lag <= longest else f"more than {longest:.3g} s"
         then = "The arm is that of least squares instead" if self.refutes else "The interval of its lag covers both"
         matters = self.off > _NOTHING * self.plain.measured.range
         if self.is_worse and matters:
@@ -207,14 +209,14 @@ class Doubt(NamedTuple):
             times = "" if gain == "1" else f" times {gain},"
             what = (
                 "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
-                f" {self.lag * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
+                f" {lag}, is {self.off * screen.scale:.3g} {screen.unit} off where the axis moves, the"
                 f" commands{times} {delayed.total * MS:.0f} ms later are {far:.3g}"
             )
         elif ((self.is_beaten or self.is_another) and matters) or (
             max(low - self.lag, self.lag - high) > _NOTABLE * self.plain.arm.total
         ):
             what = (
-                f"the likelihood says a lag of {self.lag * MS:.4g} ms, least squares, which have no model of noise,"
+                f"the likelihood says a lag of {lag}, least squares, which have no model of noise,"
                 f" {self.plain.arm.total * MS:.4g} ({low * MS:.4g} to {high * MS:.4g})"
             )
         else:
