@@ -45,6 +45,16 @@ def test_lag_gain_and_level_are_found(lag: float, gain: float, level: float, rat
     assert found.offset == pytest.approx(all_along if about_one else level, abs=2e-3 if about_one else 4e-3)
 
 
+@pytest.mark.parametrize("each", [5, 20])
+def test_a_value_that_is_repeated_is_no_news(each: int) -> None:
+    """Of a sensor of 20 or 5 Hz in a log of 100 Hz: how late it is when it is new, not half an interval more."""
+    t = np.arange(0.0, 24.0, 0.01)
+    z = path(t - 0.06)[np.arange(len(t)) // each * each]
+    found = following((stamped(t), path(t)), (stamped(t), z))
+    assert found is not None and found.correlation > 0.98
+    assert found.lag == pytest.approx(0.06, abs=0.005)
+
+
 def test_an_axis_that_a_stop_holds_off_is_not_early() -> None:
     """Up and some way back in 6 s, and an arm that stays where it stops: it follows later, not 0.02 to 0.2 s sooner.
 

@@ -157,6 +157,26 @@ def test_three_numbers_of_a_tool_are_a_place(told: str, seen: str, first: int, t
 
 
 @pytest.mark.parametrize(
+    ("told", "seen", "by_rows"), [("O_T_EE_d[{}]", "O_T_EE[{}]", False), ("goal_{}", "T_{}", True)]
+)
+def test_a_matrix_of_a_pose_gives_its_place(told: str, seen: str, by_rows: bool, tmp_path: Path) -> None:
+    """Of Franka Emika, one column after the other, and one row after the other; no T in it is a clock."""
+    t = 0.02 * np.arange(700)
+    rows: dict[str, Any] = {"t": t}
+    for name, late in ((told, 0.0), (seen, LATE)):
+        pose = np.zeros((700, 4, 4))
+        pose[:, :3, :3], pose[:, :3, 3], pose[:, 3, 3] = turned(t - late).as_matrix(), places(t - late), 1.0
+        elements = (pose if by_rows else pose.transpose(0, 2, 1)).reshape(700, 16)
+        rows |= {name.format(number): column for number, column in enumerate(elements.T)}
+    write(tmp_path / "log.csv", rows)
+    found = survey(tmp_path / "log.csv")
+    run, _ = written(found, tmp_path / "out")
+    assert run.kinds == dict.fromkeys("xyz", "length")
+    assert np.abs(run.command.values["z"] - places(t)[:, 2]).max() < 1e-9
+    assert [relation.lag for relation in found.relations.values()] == [pytest.approx(LATE, abs=0.004)] * 3
+
+
+@pytest.mark.parametrize(
     ("names", "letters", "prefix"), [(("A", "B", "C"), "ZYX", "X Y Z"), (("roll", "pitch", "yaw"), "xyz", "x y z")]
 )
 def test_euler_angles_beside_a_place_are_an_orientation(

@@ -1008,7 +1008,7 @@ def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
         *("moment[1]", "pwm.3", "delta_x_mm", "sd_x_mm", "rel_yaw_deg", "T [°C]", "success_rate", "delta_q_reset[0]"),
         *("Motor/MotorFbTor#0", "MotorCmdKp#0", "kd_2", "actual_cur", "cur_3", "current_joint2"),
         *("Z2_CurrentFeedback", "measured_current_y", "target_tensions[2]", "cable_tension_4"),
-        *("K_Nm_per_rad", "spring [N/mm]", "encoder counts per deg"),
+        *("u_px", "target_x_pixels", "K_Nm_per_rad", "spring [N/mm]", "encoder counts per deg"),
     ],
 )
 def test_what_is_no_position_is_left_out(column: str) -> None:
@@ -2265,6 +2265,14 @@ def test_a_line_below_the_header_says_the_units(tmp_path: Path) -> None:
     assert np.abs(angle - U[:, 0]).max() < 1e-9
 
 
+@pytest.mark.parametrize(("called", "size"), [("Time (min)", 60.0), ("elapsed_hours", 3600.0)])
+def test_a_clock_may_count_minutes_or_hours(called: str, size: float, tmp_path: Path) -> None:
+    found = surveyed(tmp_path, {called: T / size, "goal_x_m": U[:, 0], "x_m": ZT[:, 0]})
+    run, _ = written(found, tmp_path / "out")
+    assert np.abs(np.diff(run.command.stamp) / 1e9 - 0.02).max() < 1e-6
+    assert [relation.lag for relation in found.relations.values()] == [pytest.approx(LAG, abs=0.01)]
+
+
 def test_a_leader_commands_its_followers(tmp_path: Path) -> None:
     """Joints of two arms that are only numbered: angles, no lengths."""
     columns = {f"follower_{n}": ZT[:, n] for n in range(3)} | {f"leader_{n}": U[:, n] for n in range(3)}
@@ -2273,7 +2281,7 @@ def test_a_leader_commands_its_followers(tmp_path: Path) -> None:
     assert {*found.run.kinds.values()} == {"angle"}
 
 
-@pytest.mark.parametrize("unit", ["kPa", "rpm", "N.m", "mV", "deg/s", "m/s²", "rad/s^2"])
+@pytest.mark.parametrize("unit", ["kPa", "rpm", "N.m", "mV", "deg/s", "µm/s", "rad/s^2"])
 def test_other_units_in_brackets_are_no_positions(unit: str) -> None:
     assert names.no_position(f"P_ref_0 [{unit}]") == f"in {unit}"
 

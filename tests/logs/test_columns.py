@@ -229,6 +229,7 @@ def test_stamps_written_in_two_ways_are_refused(cells: list[str]) -> None:
         ("12:34:56.789", 45_296_789_000_000),
         ("0:00:01", GIGA),
         ("0 days 00:00:01.500000", 1_500_000_000),  # pandas
+        ("02:05.5", 125_500_000_000),  # minutes and seconds, as Excel shows them
         ("1 day, 0:00:00.000001", 86_400 * GIGA + 1_000),  # Python
         ("12:34:56:789", 45_296_789_000_000),  # LabVIEW
         ("12:00:00 AM", 0),

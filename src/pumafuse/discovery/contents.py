@@ -283,7 +283,7 @@ def _arrays_joined(files: Sequence[Path]) -> list[Path]:
 def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
     signals, left_out, times, paths = list[Signal](), dict[str, str](), list[str](), list(_numeric_paths(table))
     joints, counts = _joints(table, paths), {name for name in _columns(table) if _counts(table, name) is not None}
-    rows = _axes_in_rows(table)
+    rows, matrices = _axes_in_rows(table), _matrices(table, paths)
     told = attitudes_in(table, paths) if rows == [{}] else []
     attitudes = [attitude for attitude in told if attitude.turns]
     turning = {path for attitude in attitudes for path in attitude.columns.columns}
@@ -292,7 +292,9 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
         name, listed = _called(path, where), labels.get(leaf(path), [])
         if path in where or path in turning:
             continue
-        if names.is_time(path):
+        if matrices.get(path) == "":
+            left_out[name] = "of a matrix, beside its x, y and z"
+        elif path not in matrices and names.is_time(path):
             times.append(path)
         elif path in counts:
             left_out[path] = "rises evenly: a count or a clock"
@@ -305,7 +307,7 @@ def _part(table: Table, source: Part, labels: Mapping[str, list[str]], rate: flo
             signals.append(signal_or_why)
         elif signal_or_why:
             left_out[name] = signal_or_why
-    inches, points = names.inches_in(paths), _points(paths)
+    inches, points = names.inches_in(paths), _points(paths) | matrices
     signals = [_placed(signal, told, inches, points) for signal in _drop_quaternions(signals, left_out)]
     called = [signal.column for signal in signals if not names.number_of_nameless(signal.column)]
     if signals and (why := names.no_position_by_place(source.stem, called)):
@@ -350,6 +352,18 @@ def _points(paths: Iterable[str]) -> dict[str, str]:
         and (names.is_of_space(name) or (names.words(name)[:1] == ["p"] and columns[0].endswith("]")))
         for column, axis in zip(columns, CARTESIAN, strict=True)
     }
+
+
+def _matrices(table: Table, paths: Iterable[str]) -> dict[str, str]:
+    """The elements of matrices of a pose, four by four, one column or row after the other: x, y, z; empty of others."""
+    axes = dict[str, str]()
+    for columns in names.lists(paths).values():
+        for point, others in (((12, 13, 14), (3, 7, 11)), ((3, 7, 11), (12, 13, 14))) if len(columns) == 16 else ():
+            with suppress(RunError):
+                if all((table.plain(columns[k])[0] == float(k == 15)).all() for k in (*others, 15)):
+                    axes |= dict.fromkeys(columns, "")
+                    axes |= {columns[k]: axis for k, axis in zip(point, CARTESIAN, strict=True)}
+    return axes
 
 
 def is_nameless(signals: Iterable[Signal], clock: Clock) -> bool:

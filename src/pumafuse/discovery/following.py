@@ -28,6 +28,7 @@ _FLICKERING = 0.1  # of what changes at all, the share that is the flicker of on
 _ROUNDING = 1e-12  # of a value
 _MOST_OUTLYING = 0.05  # of the changes: each outlier is in two, and of few measurements some are more than a clip takes
 _SLOW, _FASTEST = 0.1, 0.99  # of the way that so many rows do not exceed: less is rest
+_EVENLY = 3.0  # times as many rows as usual, for which a sensor that is slower than its rows holds a value at most
 _MOSTLY = 0.5  # share of the rows in motion, from which the median is one of them
 _NEARLY = 0.98  # of the highest correlation: of several such hills, as a periodic motion has, the nearest counts
 _KNEES = np.linspace(0.0, 1.0, 13)[1:-1]  # of the range that is commanded, where a curve bends
@@ -64,6 +65,11 @@ def following(
     (t, u), (s, z) = in_seconds(*leader, origin), in_seconds(*follower, origin)
     inside = (s > t[0] if len(t) else s > np.inf) & (s < t[-1] if len(t) else False)
     s, z = s[inside], z[inside]
+    news = np.flatnonzero(np.diff(z, prepend=np.nan))
+    held = np.diff(news)
+    usual = float(np.median(held)) if len(held) >= _FEWEST else 0.0
+    if usual > 1.0 and held.max() <= _EVENLY * usual:
+        s, z = s[news], z[news]  # it is slower than its rows
     if len(t) < _FEWEST or len(s) < _FEWEST or _stands(u) or _stands(z):
         return None
     noise, steps, outliers, moves = scatter(z), _resolution(z), float(isolated(s, z).mean()), _in_motion(z)

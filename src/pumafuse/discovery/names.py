@@ -19,7 +19,8 @@ def words_in(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-_DEVICES = words_in("tracker camera vision sensor range laser mocap vicon optitrack gps")  # of which there may be two
+# Of which there may be two:
+_DEVICES = words_in("tracker camera cam vision sensor range laser mocap vicon optitrack qualisys gps")
 # Where words of several roles meet, as in command_state, the first role wins.
 _ROLES: dict[Role, frozenset[str]] = {
     "reference": words_in("truth reference ref ground gt groundtruth referencia referenz riferimento"),
@@ -65,7 +66,7 @@ _QUANTITIES = words_in(
     " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tor tq tau moment moments force forces"
     " tension tensions wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts"
     " power pwm duty load pressure temperature temperatures temp covariance quaternion quat std sd sigma var variance"
-    " error err errs yawspeed rollspeed pitchspeed rpm rps mps kmh kpa psi pct percent"
+    " error err errs yawspeed rollspeed pitchspeed rpm rps mps kmh kpa psi pct percent px pixel pixels"
 )
 _NO_POSITIONS = _QUANTITIES | words_in(
     "kp ki kd mode scaling bits quality confidence orientation rotation twist index id seq sequence count status valid"
@@ -92,8 +93,10 @@ _TIME_UNITS = {
     **dict.fromkeys(words_in("seconds secs sec s"), "s"),
     **dict.fromkeys(words_in("milliseconds millis msecs msec ms"), "ms"),
     **dict.fromkeys(words_in("microseconds micros usecs usec us"), "us"),
+    **dict.fromkeys(words_in("minutes mins min"), "min"),
+    **dict.fromkeys(words_in("hours hour hrs hr"), "h"),
 }
-_TIMES = frozenset(word for word in _TIME_UNITS if len(word) > 2) | words_in(
+_TIMES = frozenset(word for word in _TIME_UNITS if len(word) > 3 or word == "sec") | words_in(
     "t time times stamp stamps timestamp timestamps date datetime clock ts arrival arrived zeit tempo tiempo"
 )
 COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
@@ -108,7 +111,7 @@ _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|cm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
 _OTHER_UNIT = re.compile(
-    r"[\[(] *([kM]?Pa|m?bar|psi|rpm|k?N|N[. *]?m|m[AV]|k?Hz|%|[a-z]*/(?:s|sec|min)(?:\^?2|²)?) *[\])]$", re.IGNORECASE
+    r"[\[(] *([kM]?Pa|m?bar|psi|rpm|k?N|N[. *]?m|m[AV]|k?Hz|%|[^\W\d]*/(?:s|sec|min)(?:\^?2|²)?) *[\])]$", re.IGNORECASE
 )
 _IN_BRACKETS = re.compile(r" [\[(] *([^\W\d][^\])]*?)\W*[\])]$")  # counts [counts?]; no label of a list
 _BRACKETED = re.compile(rf"[\[(] *(mm|cm|m|um|in|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
@@ -133,7 +136,7 @@ _UNITS = {
 }
 _TURNING = re.compile(
     r"joint|jnt|dof|shoulder|elbow|wrist|waist|hip|knee|ankle|neck|angle|theta|yaw|pitch|roll|heading|azimuth|motor"
-    r"|angulo|angolo|winkel|servo|pan|tilt|lift|flex|gripper|^([amj](_?d)?_?\d+|q(_?d)?_?\d*)$",
+    r"|angulo|angolo|winkel|servo|pan|tilt|lift|flex|gripper|^([amj](_?d)?_?\d+|q(_?d)?_?\d*)$|_(j\d+|q\d*)$",
     re.IGNORECASE,
 )
 
@@ -222,8 +225,10 @@ def number_of_nameless(column: str) -> str:
 
 
 def is_time(column: str) -> bool:
-    """Whether a column is called as stamps are; ``t_deg`` is an axis."""
-    return not _TIMES.isdisjoint(words(column)) and not unit_of(column)
+    """Whether a column is called as stamps are; ``t_deg`` is an axis, and ``O_T_EE`` a matrix."""
+    parts, named = words(column), words(leaf(column))
+    t = "t" in (*named[:1], *named[-1:])
+    return (t or not (_TIMES - {"t"}).isdisjoint(parts)) and not unit_of(column)
 
 
 def time_unit_of(column: str) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, TimeArray
 from ..errors import ConfigError
 from ..logs import bags
-from ..logs.columns import DAYS, LOG_TIME, NAMES, SPLIT_STAMPS, Table, Where, holders
+from ..logs.columns import LOG_TIME, NAMES, SPLIT_STAMPS, Table, Where, holders
 from ..logs.manifest import CommandEntry, Manifest, SourceEntry
 from ..logs.reading import read_source
 from ..logs.recordings import PATH, TRANSFORMS, CommandedPath, begin_of, trajectory_in
@@ -138,7 +138,7 @@ class Reader:
     """
 
     def __init__(self, name: str, entry: SourceEntry, commanded: dict[str, float]) -> None:
-        if entry.time.rate or entry.time.counter or entry.time.ending == DAYS:
+        if entry.time.rate or entry.time.counter or entry.time.ending == "_days":
             where = f"sensors.{name}" if name else "command"
             raise ConfigError(
                 f"{where}: time: a running robot's messages need stamps, or '{LOG_TIME}', when they are received"

@@ -28,11 +28,13 @@ from . import dates
 Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
 Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
 
-DAYS, TICKS = "_days", "_ticks"  # units of stamps that a program counts from a day of its own on
-# Their length [s], 1970-01-01 by the two programs, and above which number they are the second one's.
-_SINCE = {
-    DAYS: (86400.0, 25_569.0, 719_529.0, 3e5),  # Excel, MATLAB's datenum
-    TICKS: (1e-7, 116_444_736e9, 621_355_968e9, 3.5e17),  # FILETIME of Windows and TwinCAT, .NET's DateTime
+# Units of stamps beside those of names: their length [s], 1970-01-01 by two programs that count from a day of their
+# own, and above which number they are the second one's.
+SINCE = {
+    "_min": (60.0, 0.0, 0.0, np.inf),
+    "_h": (3600.0, 0.0, 0.0, np.inf),
+    "_days": (86400.0, 25_569.0, 719_529.0, 3e5),  # Excel, MATLAB's datenum
+    "_ticks": (1e-7, 116_444_736e9, 621_355_968e9, 3.5e17),  # FILETIME of Windows and TwinCAT, .NET's DateTime
 }
 LOG_TIME = "log_time"  # when a row was recorded
 NAMES = "name"  # the list beside another one that says what its elements are
@@ -116,9 +118,9 @@ class Table:
         if (dated := self._dates(name, column)) is not None:
             return self._within_reach(name, self._of_clock(name, dated[0])), dated[1]
         self._refuse_words(name, self._plain_column(name))
-        if unit in _SINCE:
+        if unit in SINCE:
             number, note = self.plain(name)
-            size, since, another, between = _SINCE[unit]
+            size, since, another, between = SINCE[unit]
             since = another if np.nanmedian(number) > between else since
             return self._within_reach(name, units.nanoseconds((number - since) * size)), note
         exponent = 9 - 3 * units.TIMES.index(unit or self._ending(name, units.TIMES, "s"))

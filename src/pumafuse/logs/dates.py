@@ -21,7 +21,7 @@ ELAPSED = (
     r"(?:[.,](?P<fraction>\d{1,9}))? ?(?P<half>[AP]M)?$"
 )
 # Other ways to write a time, and what stands for them here. With points the day comes first everywhere. MATLAB writes
-# 1.5 sec.
+# 1.5 sec, Excel minutes and seconds, 12:34.5.
 _REWRITTEN = (
     (r"^(\d\d?[./]\d\d?[./])(\d\d)(,?[ T])", r"\120\2\3"),  # a year of this century
     (r"^(\d\d?)\.(\d)\.", r"\1.0\2."),
@@ -29,6 +29,7 @@ _REWRITTEN = (
     (r"^(\d\d)\.(\d\d)\.(\d{4}),?[ T]", r"\3-\2-\1 "),
     (r"^(\d{4})[/-](\d\d)[/-](\d\d)[ T/_,-]", r"\1-\2-\3 "),
     (r"^(\d{1,9}(?:\.\d{1,9})?) SEC$", r"0:00:\1"),
+    (r"^(\d\d:\d\d[.,]\d{1,9})$", r"0:\1"),
     (r"(\b\d\d?:\d\d:\d\d):(\d{3,9})( ?[AP]M)?$", r"\1.\2\3"),
 )
 _SLASHED = r"^(?P<first>\d\d?)/(?P<second>\d\d?)/(?P<year>\d{4}),?[ T]+(?P<time>\d.*)$"

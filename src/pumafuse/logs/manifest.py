@@ -21,7 +21,7 @@ from ..space.kinematics import Chain
 from ..space.rotations import CONVENTIONS, TURNING
 from ..toml import NotNegative, Positive
 from ..units import ANGLES, POSITIONS, TIMES, Kind, ending, from_si, kind_of, refuse_name
-from .columns import DAYS, TICKS, Table, leaf
+from .columns import SINCE, Table, leaf
 from .frames import CARTESIAN, Frame
 from .stamps import drop_wraps, spread
 
@@ -460,7 +460,7 @@ def _time(table: Any, where: str, path: str) -> dict[str, Any]:
         case [str() as seconds, str() as nanoseconds] if seconds and nanoseconds:
             return {"column": seconds, "nanoseconds": nanoseconds}
         case {"column": str() as column, **more} if column and more.keys() <= _OF_TIME:
-            _check_unit(more, (*TIMES, DAYS, TICKS), where, path)
+            _check_unit(more, (*TIMES, *SINCE), where, path)
             return {"column": column, **more}
         case {"rate_hz": float() | int() as rate, **more} if rate and more.keys() <= {"column"}:
             return {"rate_hz": rate, **more}
