@@ -1008,7 +1008,7 @@ def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
         *("moment[1]", "pwm.3", "delta_x_mm", "sd_x_mm", "rel_yaw_deg", "T [°C]", "success_rate", "delta_q_reset[0]"),
         *("Motor/MotorFbTor#0", "MotorCmdKp#0", "kd_2", "actual_cur", "cur_3", "current_joint2"),
         *("Z2_CurrentFeedback", "measured_current_y", "target_tensions[2]", "cable_tension_4"),
-        *("u_px", "target_x_pixels", "K_Nm_per_rad", "spring [N/mm]", "encoder counts per deg"),
+        *("u_px", "u_ref_px", "target_x_pixels", "x [px]", "K_Nm_per_rad", "spring [N/mm]", "encoder counts per deg"),
     ],
 )
 def test_what_is_no_position_is_left_out(column: str) -> None:
@@ -1020,7 +1020,7 @@ def test_what_is_no_position_is_left_out(column: str) -> None:
     [
         *("q_d_0", "qd_0", "current_position.x", "current_x_mm", "ax1", "v_x"),
         *("az_deg", "az [deg]", "ay_cmd_rad", "load_x_mm", "index_mcp_deg", "vx_mm.1"),
-        *("current_x", "cur_y", "cur_pos_1", "currentAngle", "current_yaw", "curr_pos2", "CurrAngle"),
+        *("px", "cmd_px", "current_x", "cur_y", "cur_pos_1", "currentAngle", "current_yaw", "curr_pos2", "CurrAngle"),
     ],
 )
 def test_what_may_be_a_position_is_not(column: str) -> None:

@@ -562,9 +562,8 @@ def _numeric_paths(table: Table) -> Iterator[str]:
     """Paths of all numbers in the first cells of a table, and columns of text, which may be numbers, too."""
     for name, column in table.columns.items():
         first = column.drop_null()[:1]
-        if not len(first) and (
-            names.number_of_nameless(name) or not names.words(name)
-        ):  # a separator at the end of each line
+        has_no_name = not names.words(name) or names.number_of_nameless(name)
+        if not len(first) and has_no_name:  # a separator at the end of each line
             continue
         if not len(first) or pa.types.is_string(first.type):
             yield name

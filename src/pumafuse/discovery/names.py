@@ -66,7 +66,7 @@ _QUANTITIES = words_in(
     " accelerometer ddq qdd qacc jerk effort efforts torque torques torq trq tor tq tau moment moments force forces"
     " tension tensions wrench thrust thrusts momentum current currents cur curr amp amps amperes voltage volt volts"
     " power pwm duty load pressure temperature temperatures temp covariance quaternion quat std sd sigma var variance"
-    " error err errs yawspeed rollspeed pitchspeed rpm rps mps kmh kpa psi pct percent px pixel pixels"
+    " error err errs yawspeed rollspeed pitchspeed rpm rps mps kmh kpa psi pct percent pixel pixels"
 )
 _NO_POSITIONS = _QUANTITIES | words_in(
     "kp ki kd mode scaling bits quality confidence orientation rotation twist index id seq sequence count status valid"
@@ -84,6 +84,7 @@ _WHOLE = {
     **dict.fromkeys(words_in("vx vy vz vrx vry vrz ax ay az"), "a rate"),
     **dict.fromkeys(words_in("qx qy qz qw"), "turning"),
 }
+_IN_IMAGES = words_in("u v x y")  # beside which px is a unit, and no place along x
 _TRANSLATIONS = {"tx": "x", "ty": "y", "tz": "z"}
 _NOW = words_in("current cur curr")  # of motors, but of the present beside
 _MEASURED = _ROLES["sensor"] - _NOW  # what is measured is a motor's current: CurrentFeedback
@@ -111,7 +112,8 @@ _DESIRED = re.compile(r"(.+)_d(|[\d_[].*)")  # q_d[0], q_d_0, q_d1, x_d_mm; of q
 _DEGREES = re.compile(r"°(?! *[CF/])")  # neither of temperatures nor of rates
 _PER = re.compile(r"([ _]per[ _]|[\[(][^\])]*/)(mm|cm|m|um|deg|rad|mrad)[\])]?$", re.IGNORECASE)  # K [Nm/rad]
 _OTHER_UNIT = re.compile(
-    r"[\[(] *([kM]?Pa|m?bar|psi|rpm|k?N|N[. *]?m|m[AV]|k?Hz|%|[^\W\d]*/(?:s|sec|min)(?:\^?2|²)?) *[\])]$", re.IGNORECASE
+    r"[\[(] *([kM]?Pa|m?bar|psi|rpm|k?N|N[. *]?m|m[AV]|k?Hz|%|px|[^\W\d]*/(?:s|sec|min)(?:\^?2|²)?) *[\])]$",
+    re.IGNORECASE,
 )
 _IN_BRACKETS = re.compile(r" [\[(] *([^\W\d][^\])]*?)\W*[\])]$")  # counts [counts?]; no label of a list
 _BRACKETED = re.compile(rf"[\[(] *(mm|cm|m|um|in|deg|rad|mrad) *[\])]|{_DEGREES.pattern}")
@@ -264,6 +266,8 @@ def no_position(column: str) -> str | None:
     is_told = kind is not None or _BRACKETED.search(column) is not None
     if not is_told and role_words(column) and any(word.rstrip(_DIGITS) == "qd" for word in parts):
         return "velocity"  # as UR calls it: target_qd_0 beside target_q_0
+    if parts[-1:] == ["px"] and not _IN_IMAGES.isdisjoint(parts):
+        return "in px"
     if whole := None if is_told else next((_WHOLE[word] for word in parts if word in _WHOLE), None):
         return whole
     parts = [word.rstrip(_DIGITS) for word in parts]

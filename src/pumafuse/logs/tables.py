@@ -82,7 +82,7 @@ _LABELLED = re.compile(
 _DATED = re.compile(rf"(?:\d{{4}}-\d\d-\d\d[T ])?(?:{_PLAIN})")  # in front of the first label
 _ECHO = "%time,"  # begins the header that `rostopic echo -p` writes
 _TRANSFORMS = b"%time,field.transforms0."  # of /tf: a line has all transforms of a message, as many as it likes
-FIRST = "column 1"  # what the first column is called, if it has no name
+_FIRST = "column 1"  # what the first column is called, if it has no name
 JSON_LINES = (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz")
 _DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\r\n]|$)"  # between separators
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
@@ -721,7 +721,7 @@ def _is_headless(lines: Sequence[str], first: int, separator: str) -> bool:
 
 
 def _column(index: int) -> str:
-    return FIRST.replace("1", str(index + 1))
+    return _FIRST.replace("1", str(index + 1))
 
 
 def _is_text(row: Sequence[str]) -> bool:
