@@ -81,7 +81,11 @@ def check_follows(found: Survey, folder: Path) -> tuple[pf.Run, pf.FusionConfig]
 
 @pytest.mark.parametrize(
     ("names", "order"),
-    [(("q_w", "q_x", "q_y", "q_z"), "wxyz"), (("flangeQuatX", "flangeQuatY", "flangeQuatZ", "flangeQuatW"), "xyzw")],
+    [
+        (("q_w", "q_x", "q_y", "q_z"), "wxyz"),
+        (("flangeQuatX", "flangeQuatY", "flangeQuatZ", "flangeQuatW"), "xyzw"),
+        (("rot_i", "rot_j", "rot_k", "rot_w"), "xyzw"),
+    ],
 )
 def test_quaternions_are_known_by_their_names(names: Sequence[str], order: str, tmp_path: Path) -> None:
     """In whatever order they stand, and of whatever sign: the tool turns as scipy has it."""

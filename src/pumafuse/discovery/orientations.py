@@ -34,9 +34,10 @@ _BETTER = 0.05  # share of the turning that the right order explains more than t
 _FRONT, _BACK = r"^(?P<head>|.*[^A-Za-z]|.*[a-z](?=[A-Z]))", r"(?P<end>[\])]?)(?P<tail>|[^A-Za-z0-9].*)$"
 QUATERNION = re.compile(
     rf"{_FRONT}(?P<word>(?i:q|quat|quaternion|orientation|orient|ori|rotation|rot|attitude))"
-    rf"(?P<join>[_. \[(]?)(?P<part>[xyzwXYZW0-4]){_BACK}"
+    rf"(?P<join>[_. \[(]?)(?P<part>[wxyzijkWXYZIJK0-4]){_BACK}"
 )
 _NAMED, _NUMBERED = "wxyz", ("0123", "1234")  # parts of a quaternion, in the order of letters
+_UNITS = dict(zip("ijk", "xyz", strict=True))  # parts of a quaternion by its units
 _ANGLE = re.compile(rf"{_FRONT}(?P<part>(?i:r[xyz]|roll|pitch|yaw|[abcwprxyz])){_BACK}")
 _EULER = {("a", "b", "c"): "kuka", ("w", "p", "r"): "fanuc", ("roll", "pitch", "yaw"): "rpy"}
 _NAMED_EULER = {"kuka": "KUKA's angles about z, y, x", "fanuc": "FANUC's angles about x, y, z that stay"}
@@ -107,7 +108,8 @@ def _groups(form: re.Pattern[str], paths: Iterable[str], keys: Sequence[str]) ->
     for path in paths:
         if (match := form.match(path)) is not None:
             tail = match["tail"].removesuffix(ending(match["tail"]) or "")
-            groups.setdefault((*(match[key] for key in keys), tail), {}).setdefault(match["part"].lower(), path)
+            part = match["part"].lower()
+            groups.setdefault((*(match[key] for key in keys), tail), {}).setdefault(_UNITS.get(part, part), path)
     yield from groups.values()
 
 
