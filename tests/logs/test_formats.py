@@ -225,6 +225,12 @@ def test_rows_that_are_signals_are_columns(kind: str, tmp_path: Path) -> None:
         assert np.array_equal(run.command.values[axis], value)
 
 
+def test_few_long_rows_in_which_nothing_changes_are_refused_and_not_turned(tmp_path: Path) -> None:
+    """As those of an array that was never filled, without a warning of the numerics."""
+    np.savetxt(tmp_path / "log.csv", np.zeros((6, 400)), "%.3f", delimiter=",")
+    assert "no columns of positions" in one_line(RunError, lambda: survey(tmp_path / "log.csv"))
+
+
 @pytest.mark.parametrize("name", ["arm", "arm.xls"])
 def test_a_text_of_numbers_is_a_table_whatever_it_is_called(name: str, tmp_path: Path) -> None:
     """As a file, and as the only one of a folder; prose and bytes are none."""

@@ -547,7 +547,7 @@ def _roughness(value: FloatArray) -> float:
     """Of the rows of an array, half the mean square of steps in it over the variance: 1 of numbers without order."""
     with np.errstate(invalid="ignore", divide="ignore"):
         each = np.nanmean(np.diff(value) ** 2, axis=1) / (2.0 * np.nanvar(value, axis=1))
-    return float(np.nanmedian(each))
+    return float(np.nanmedian(each)) if np.isfinite(each).any() else math.inf
 
 
 def _transforms_apart(text: bytes) -> bytes:
