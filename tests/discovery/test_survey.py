@@ -669,9 +669,10 @@ def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
     assert found.roles.command.why == "others follow it"
 
 
-def test_what_moves_half_as_far_follows_no_commands_that_only_run_ahead(tmp_path: Path) -> None:
-    """Two points of one body, in a unit that both say: that one runs ahead makes it no command."""
-    text = refusal(tmp_path, {"t": T, **xyz(U, "tip_{}_mm"), **xyz(0.6 * Z, "wrist_{}_mm")})
+@pytest.mark.parametrize("unit", ["_mm", ""])
+def test_what_moves_half_as_far_follows_no_commands_that_only_run_ahead(unit: str, tmp_path: Path) -> None:
+    """Two points of one body, in a unit that both say or that of one table: one that runs ahead is no command."""
+    text = refusal(tmp_path, {"t": T, **xyz(U, f"tip_{{}}{unit}"), **xyz(0.6 * Z, f"wrist_{{}}{unit}")})
     assert "which numbers are the commands?" in text
 
 
@@ -2076,6 +2077,33 @@ def test_inputs_that_nothing_follows_are_no_commands_where_a_plan_is_followed(lo
     assert any("other commands than" in question for question in asked(found))
     write(log / "plan.csv", {"t_s": T, "input x": U[:, 0], "input y": U[:, 1]})
     assert set(survey(log).run.axes) == {"x", "y"}
+
+
+def test_what_a_controller_puts_out_is_no_command_beside_a_set_point(tmp_path: Path) -> None:
+    """Also where it runs ahead of what is measured, and the set point hardly does."""
+    t, u, _ = recorded_at_once()
+    columns = {"t_s": t, "lift_setpoint": u[:, 0], "lift_present": path(t - 0.001)[:, 0]}
+    found = surveyed(tmp_path, columns | {"lift_control_output": 40.0 * path(t + 0.3)[:, 0]})
+    assert [signal.column for signal in found.roles.command.axes["lift"]] == ["lift_setpoint"]
+
+
+@pytest.mark.parametrize("late", [0.12, 0.004])
+def test_what_moves_at_once_with_the_commands_is_them_again_where_a_sensor_is_late(late: float, tmp_path: Path) -> None:
+    """What was sent, with jitter; where the sensor that is called so moves at once, too, it may be another one."""
+    t = 0.02 * np.arange(900)
+    u, jitter = path(t)[:, :2], np.random.default_rng(6).normal(0.0, 2e-3, (len(t), 2))
+    pairs = {"wanted_{}": u, "dithered_{}": u + jitter, "encoder_{}": path(t - late)[:, :2]}
+    found = surveyed(tmp_path, {"t_s": t} | {name.format(n): x[:, n] for name, x in pairs.items() for n in (0, 1)})
+    assert [sensor.name for sensor in found.roles.sensors] == (["encoder"] if late > 0.1 else ["measured", "encoder"])
+
+
+def test_a_count_of_microseconds_beside_zeros_is_no_count_of_seconds(tmp_path: Path) -> None:
+    """A table without a header, in which the second column is no nanoseconds: it hardly ever is anything."""
+    t, u, z = recorded_at_once()
+    columns = [81_000_000 + np.rint(1e6 * t), np.where(t > t[0], 0, 70_200_000), 1e3 * u[:, 0], 1e3 * z[:, 0]]
+    np.savetxt(tmp_path / "log.csv", np.column_stack(columns), "%d,%d,%.4f,%.4f")
+    (part,) = parts_of(tmp_path / "log.csv")
+    assert part.clock is not None and (part.clock.time.nanoseconds, part.clock.time.unit) == ("", "us")
 
 
 def test_a_clock_of_zeros_at_first_does_not_begin_anew(tmp_path: Path) -> None:

@@ -786,7 +786,7 @@ def _nameless_clock(table: Table, stroke: float) -> Clock | None:
         numbers = table.plain(first)[0]
         other_values = table.plain(others[0])[0] if others else np.full(len(numbers), np.nan)
         whole = (numbers % 1.0 == 0.0) & (other_values % 1.0 == 0.0) & (other_values >= 0.0) & (other_values < 1e9)
-        if whole.all() and other_values.max(initial=0.0) > 1e6:
+        if whole.all() and np.median(other_values) > 1e6:
             return Clock.of(table, Time(first, nanoseconds=others[0]), "seconds and nanoseconds")
     except RunError:
         return None

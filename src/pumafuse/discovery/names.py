@@ -40,8 +40,8 @@ _ROLES: dict[Role, frozenset[str]] = {
 # In the name of a topic or file these are something else.
 _OF_COLUMNS = words_in("set sp pv process fb current cur curr present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
-_SEEN = words_in("target targets tgt tar")  # commands, but of a sensor beside words of what cameras look at, and by
-_DRIVES = words_in("control ctrl input inputs controle")  # commands, or what a controller puts into motors or rotors
+SEEN = words_in("target targets tgt tar")  # commands, but of a sensor beside words of what cameras look at, and by
+DRIVES = words_in("control ctrl input inputs controle")  # commands, or what a controller puts into motors or rotors
 _PATHS = words_in("traj trajectory")  # of columns, commands where no other word says what they are
 _MARKERS = words_in("marker markers fiducial fiducials tag tags aruco charuco apriltag apriltags checkerboard")
 _OF_PLACES = _MARKERS | words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in a column's
@@ -180,16 +180,10 @@ def role_of(name: str) -> Role | None:
     return _role([word for word in words(name) if word not in _OF_COLUMNS], _OF_PLACES)
 
 
-def may_be_seen(name: str) -> bool:
-    """Whether a name calls its numbers commands by nothing but a word for what a camera looks at, too."""
-    stems = {word.rstrip(_DIGITS) for word in words(name)} & _ROLES["command"]
-    return bool(stems) and stems <= _SEEN
-
-
-def may_drive(columns: Iterable[str]) -> bool:
-    """Whether columns are called commands by nothing but a word for what drives a plant, too."""
-    stems = {word.rstrip(_DIGITS) for column in columns for word in words(leaf(column))} & _ROLES["command"]
-    return bool(stems) and stems <= _DRIVES
+def says_only(vocabulary: frozenset[str], columns: Iterable[str]) -> bool:
+    """Whether names call their numbers commands by nothing but words of ``SEEN`` or of ``DRIVES``."""
+    stems = {word.rstrip(_DIGITS) for column in columns for word in words(column)} & _ROLES["command"]
+    return bool(stems) and stems <= vocabulary
 
 
 def role_words(column: str) -> list[str]:
@@ -412,7 +406,7 @@ def identifier(name: str) -> str:
 def _role(parts: list[str], more: frozenset[str]) -> Role | None:
     plainly = {word.rstrip(_DIGITS) for word in parts}
     if not plainly.isdisjoint(_MARKERS | _DEVICES):  # camera_target is what a camera looks at
-        plainly -= _SEEN
+        plainly -= SEEN
     for role, vocabulary in _ROLES.items():
         if not vocabulary.isdisjoint(plainly):
             return role

@@ -190,7 +190,8 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             continue
         matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
         if stream.role is None and axes:
-            late, otherwise = _follows(command, matched)
+            called = [other for other in streams if other.role == "sensor" and other.part is stream.part]
+            late, otherwise = _follows(command, matched, may_be_at_once=not _followers(command, called)[0])
             matched = replace(matched, role="sensor" if late else None, why=f"{_FOLLOWS} {late}")
             says = f"neither its name nor its motion says what it is: {otherwise}"
             why_not = f"{says}; if it measures their axes, say so in run.toml"
@@ -603,8 +604,8 @@ def _set_seen_targets(streams: Sequence[Stream]) -> list[Stream]:
     """Streams in which one called target is a sensor where it follows another stream that has no role by name."""
     looked_at = list[Stream]()
     for stream in streams:
-        columns = [signal.column for signals in stream.axes.values() for signal in signals]
-        seen = stream.role == "command" and any(map(names.may_be_seen, [stream.part.stem, *columns]))
+        called = [stream.part.stem, *(signal.column for signals in stream.axes.values() for signal in signals)]
+        seen = stream.role == "command" and any(names.says_only(names.SEEN, [name]) for name in called)
         unnamed = [stream for stream in streams if seen and stream.role is None]
         fewest = 0.5 * len(stream.axes) if len(stream.axes) > len(CARTESIAN) else 0.0  # in space one, or its speed
         led = [nameless for nameless in unnamed if _followers(nameless, [replace(stream, role=None)])[0] > fewest]
@@ -624,12 +625,13 @@ def _unused(name: str, taken: Set[str]) -> str:
 def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
     """The commands, and how they are known: by name, and of several by what follows them; without names by that.
 
-    Inputs that nothing follows drive a plant, where others lead without a name.
+    Inputs drive a plant beside other commands, and where nothing follows them and others lead without a name.
     """
-    called = [stream for stream in streams if stream.role == "command"]
-    driving = [stream for stream in called if names.may_drive(some[0].name for some in stream.axes.values())]
-    if len(called) == 1 and not driving:
+    inputs = [stream for stream in streams if stream.role == "command"]
+    called = [cmd for cmd in inputs if not names.says_only(names.DRIVES, (some[0].name for some in cmd.axes.values()))]
+    if len(called) == 1:
         return called[0], called[0].why
+    is_input, called = not called, called or inputs
     # A reference that runs ahead, or that stands beside one other alone, is a set point, as control engineers call it.
     beside = [stream for stream in streams if stream.role != "reference"]
     if not called and len(streams) == 2 and len(beside) == 1:
@@ -640,7 +642,7 @@ def _command(streams: Sequence[Stream]) -> tuple[Stream, str] | None:
     best = max(candidates, key=lambda candidate: followers[candidate.name], default=None)
     if best is None or (not called and not followers[best.name][0]):
         return None
-    if called and len(driving) == len(called) and not followers[best.name][0]:
+    if called and is_input and not followers[best.name][0]:
         return _command([stream for stream in streams if stream.role != "command"]) or (best, best.why)
     return best, best.why or _LEADS
 
@@ -665,7 +667,8 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float,
             alike = [relation for relation in relations if abs(relation.correlation) >= SAME]
             at_once = max(_AT_ONCE, 0.5 * period_of(other.source))
             behind = [relation for relation in alike if at_once < relation.lag < latest]
-            if leader.role != "command" and not (leader.guessed or other.guessed):  # units are said: it goes as far
+            # Units are said, or those of one table: it goes as far.
+            if leader.role != "command" and (leader.part is other.part or not (leader.guessed or other.guessed)):
                 behind = list(filter(_as_far, behind))
             if 2 * len(behind) >= len(alike):
                 count += sum(abs(relation.correlation) for relation in behind)
@@ -674,14 +677,15 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> tuple[float, float,
     return round(count, 1), round(scaled), late
 
 
-def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
+def _follows(command: Stream, stream: Stream, *, may_be_at_once: bool) -> tuple[str, str]:
     """By how much a stream that nothing names follows the commands, in words; empty if it does not, and why not."""
     if all(_rises_evenly(value) for value in stream.source.values.values()):
         return "", "it rises evenly, as a clock does"
     command = _set_units_by_range(command, {*command.axes}) if stream.guessed else _set_units_by_travel(command, stream)
     relations = _relations(command, _set_units_by_travel(stream, command))
     alike = [relation for relation in relations if relation.correlation >= SAME]
-    behind = [relation for relation in alike if -_AT_ONCE < relation.lag < LATEST]
+    soonest = -_AT_ONCE if may_be_at_once else 0.5 * period_of(stream.source)  # else it is the commands again
+    behind = [relation for relation in alike if soonest < relation.lag < LATEST]
     gains, fewest = [relation.slope for relation in behind], len(relations) / 2
     fewest = 0.0 if _is_namesake(command, stream) else fewest
     called = [(axis, signal) for axis, some in stream.axes.items() for signal in some]
@@ -691,7 +695,7 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
     if len(behind) > fewest and as_far and max(gains) < _GAINS * min(gains):
         return f"{float(np.median([relation.lag for relation in behind])) * 1e3:.0f} ms late", ""
     speeds = speeds_follow(command.source, stream.source)
-    if speeds is not None and speeds.correlation >= SAME and -_AT_ONCE < speeds.lag < LATEST:
+    if speeds is not None and speeds.correlation >= SAME and soonest < speeds.lag < LATEST:
         return f"{speeds.lag * 1e3:.0f} ms late, by its speed", ""
     most, least = (end((relation.correlation for relation in relations), default=0.0) for end in (max, min))
     if not alike and least <= -SAME:
@@ -700,7 +704,7 @@ def _follows(command: Stream, stream: Stream) -> tuple[str, str]:
         return "", f"it does not follow the commands (correlation {most:+.2f} at most)"
     if len(behind) < len(alike):
         early = float(np.median([-relation.lag for relation in alike if relation not in behind]))
-        when = f"{early * 1e3:.0f} ms before" if early > 0.0 else f"{-early:.1f} s behind"
+        when = f"{early * 1e3:.0f} ms before" if early > _AT_ONCE else f"{-early:.3f} s behind"
         return "", f"it does not follow the commands: it moves {when} them"
     few = f"it follows the commands on {len(behind)} of {len(relations)} axes"
     return "", few if len(behind) <= fewest else f"{few}, but by {min(gains):.3g} to {max(gains):.3g} times as far"
